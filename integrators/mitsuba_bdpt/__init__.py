@@ -1,0 +1,41 @@
+"""Bidirectional path tracing for Mitsuba 3.
+
+``import mitsuba_bdpt`` chooses the LLVM library that Dr.Jit loads (see `llvm`) and registers the
+integrator plugin ``bdpt`` for the current variant and all later ones. Import it before ``mitsuba``
+and ``drjit``: which LLVM they use is settled when they are first imported.
+"""
+
+import sys as _sys
+from pathlib import Path as _Path
+
+from . import llvm as _llvm
+from ._version import __version__
+from .llvm import LLVMNotFoundError
+
+__all__ = ["LLVMNotFoundError", "__version__", "llvm_choice"]
+
+llvm_choice: _llvm.Choice | None = None
+"""The LLVM library in use and why it was chosen."""
+
+failure: ImportError | None = None
+"""Why this package cannot be used. Only its own command sees it set; elsewhere it is raised."""
+
+
+def _runs_own_command(arguments: list[str]) -> bool:
+    """Whether this process is ``python -m mitsuba_bdpt`` or the script ``mitsuba-bdpt``."""
+    module = "-m" in arguments and arguments[arguments.index("-m") :][1:2] == [__name__]
+    return module or any(_Path(argument).stem == "mitsuba-bdpt" for argument in arguments[:2])
+
+
+try:
+    llvm_choice = _llvm.prepare()
+    if (_Path(__file__).parent / "integrator.py").exists():  # TEMPORARY until the core exists
+        from .integrator import register as _register
+
+        _register()
+except ImportError as _error:
+    # Python imports the package before its __main__. The command must outlive the failure, for
+    # `doctor` is there to explain it; __main__ reports it for every other command.
+    if not _runs_own_command(_sys.orig_argv):
+        raise
+    failure = _error

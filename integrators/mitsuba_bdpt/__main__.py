@@ -1,0 +1,129 @@
+"""The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
+
+``render`` renders a scene file; ``doctor`` explains what the installation found and whether it
+works. The rest of the package is imported inside `main`, because `doctor` has to run where it
+cannot be imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mitsuba_bdpt
+
+PropertyValue = bool | int | float | str
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line `arguments` (default: the process's own) and return its exit status."""
+    options = build_parser().parse_args(arguments)
+    if options.command == "doctor":
+        from . import doctor
+
+        return doctor.run(options.variant)
+    if mitsuba_bdpt.failure is not None:
+        print(f"error: {mitsuba_bdpt.failure}", file=sys.stderr)
+        return 1
+    from . import render
+
+    return render.run(options)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3."
+    )
+    parser.add_argument("--version", action="version", version=mitsuba_bdpt.__version__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    help_text = "say what is installed and render a tiny image to prove that it works"
+    doctor = commands.add_parser("doctor", help=help_text, description=help_text)
+    doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
+
+    help_text = "render a Mitsuba scene file to an EXR and a PNG image"
+    add_render_arguments(commands.add_parser("render", help=help_text, description=help_text))
+    return parser
+
+
+def add_render_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``render``; letters and ``-D``, ``-s``, ``-m`` as in Mitsuba."""
+    add = parser.add_argument
+    add("scene", type=Path, help="scene file in Mitsuba's XML format")
+    text = "EXR file to write, a PNG of the same name comes beside it; default: renders/SCENE.exr"
+    add("-o", "--output", type=Path, help=text)
+    add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
+    add("--spp", type=number(int, 1), help="samples per pixel; default: the scene's")
+    text = "stop after the pass in which this time is over; without --spp, only the time limits"
+    add("--time", type=number(float, 0), metavar="SECONDS", help=text)
+    text = "replace the scene's integrator, keeping max_depth, rr_depth and hide_emitters"
+    add("--integrator", metavar="TYPE", help=text)
+    add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
+    text = "value of a parameter $KEY of the scene; may be repeated"
+    add(
+        "-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text
+    )
+    text = "property of the integrator, such as skip=none; may be repeated"
+    add(
+        "-P",
+        dest="properties",
+        type=property_,
+        action="append",
+        default=[],
+        metavar="K=V",
+        help=text,
+    )
+    text = "index of the sensor to render; default: %(default)s"
+    add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
+    text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
+    add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
+
+
+def number(kind: type, minimum: float, maximum: float = math.inf) -> Callable[[str], int | float]:
+    """An argparse type: a finite `kind` between `minimum` and `maximum`."""
+
+    def parse(text: str) -> int | float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not (minimum <= value <= maximum and math.isfinite(value)):
+            limit = "" if maximum == math.inf else f" and at most {maximum:g}"
+            name = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(
+                f"got {text!r}, which must be {name} of at least {minimum:g}{limit}"
+            )
+        return value
+
+    return parse
+
+
+def definition(text: str) -> tuple[str, str]:
+    """Split ``KEY=VALUE``."""
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form KEY=VALUE")
+    return key, value
+
+
+def property_(text: str) -> tuple[str, PropertyValue]:
+    """Split ``KEY=VALUE`` and read the value as a Boolean, a whole number, a number or a string."""
+    key, value = definition(text)
+    if value in ("true", "false"):
+        return key, value == "true"
+    for kind in (int, float):
+        try:
+            return key, kind(value)
+        except ValueError:
+            continue
+    return key, value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

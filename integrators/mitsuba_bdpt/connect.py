@@ -1,0 +1,322 @@
+"""One function per class of strategies: the path it builds, its contribution and its weight.
+
+All return a `Contribution`: the full *unweighted* estimate f / p of the strategy, divided by the
+class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone. Densities and cosines are geometric, throughputs contain
+everything up to and including the edge to the vertex. Equation numbers: Georgiev 2012, see `mis`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import bsdf, mis, rays
+from .points import Purpose
+from .subpath import Vertex, newest_coefficient
+
+
+@dataclass
+class Contribution:
+    """``value`` unweighted estimate, ``weight`` in [0, 1], numbers of light vertices ``s`` and
+    camera vertices ``t``, ``active``."""
+
+    value: object
+    weight: object
+    s: object
+    t: object
+    active: object
+
+    def weighted(self):
+        """What the strategy adds to the image."""
+        return dr.select(self.active, self.value * self.weight, 0)
+
+
+@dataclass
+class LightPath:
+    """Connectible vertices of a lane's light subpath in local memory, ``count`` of them.
+
+    ``throughput`` is that of the vertex; ``s`` the number of light vertices up to and including it.
+    """
+
+    si: object
+    throughput: object
+    partial: object
+    anchor: object
+    s: object
+    count: object
+
+
+def allocate_light_path(size: int) -> LightPath:
+    """Local memory for ``size`` vertices; no field is a Bool (these abort LLVM code generation)."""
+    return LightPath(
+        si=dr.alloc_local(mi.SurfaceInteraction3f, size),
+        throughput=dr.alloc_local(mi.Spectrum, size),
+        partial=dr.alloc_local(mi.Vector2f, size),
+        anchor=dr.alloc_local(mi.Float, size),
+        s=dr.alloc_local(mi.UInt32, size),
+        count=mi.UInt32(0),
+    )
+
+
+def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
+    """Keep a light vertex that inner connections can use."""
+    keep = vertex.hit & (vertex.edges <= kernel.last_stored) & bsdf.connectible(vertex.bsdf)
+    slot = path.count
+    path.si.write(vertex.si, slot, keep)
+    path.throughput.write(mi.Spectrum(vertex.throughput), slot, keep)
+    path.partial.write(mi.Vector2f(vertex.partial.d_vcm, vertex.partial.d_vc), slot, keep)
+    path.anchor.write(vertex.anchor.offset, slot, keep)
+    path.s.write(vertex.edges + 1, slot, keep)
+    path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
+
+
+def read_light_vertex(path: LightPath, slot) -> Vertex:
+    """The stored vertex ``slot``."""
+    si = path.si[slot]
+    partial = path.partial[slot]
+    s = path.s[slot]
+    return Vertex(
+        si=si,
+        bsdf=si.bsdf(),
+        anchor=rays.Anchor(si.p, si.n, path.anchor[slot]),
+        throughput=path.throughput[slot],
+        partial=mis.Partial(partial.x, partial.y),
+        edges=s - 1,
+        previous=None,
+        seen=None,
+        hit=mi.Bool(True),
+        active=mi.Bool(True),
+    )
+
+
+def hit_emitter(kernel, z: Vertex) -> Contribution:
+    """s = 0: the camera subpath has hit an emitter (eq. 44)."""
+    h, emitters = kernel.heuristic, kernel.emitters
+    t = z.edges + 1
+    active = mi.Bool(z.active)
+    if kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
+        active &= z.hit | z.seen
+    radiance = emitters.emitted(z.si, active)
+    active &= dr.max(mi.unpolarized_spectrum(radiance)) != 0
+    connect, first, second = emitters.hit_densities(z.si, z.previous, active)
+    directly = z.edges == 1
+    newest = dr.select(directly, kernel.coefficient_endpoints, 1) * dr.select(
+        directly, first, connect
+    )
+    older = dr.select(kernel.within_store(z.edges), first * second, 0)
+    camera_side = h.combine(
+        h.scale(z.partial.d_vcm, newest),
+        h.scale(z.partial.d_vc, older),
+    )
+    weight = h.weight(1, mi.Float(0), camera_side)
+    return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active)
+
+
+def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
+    """s = 1: an emitter is sampled for the camera vertex (eqs. 42, 43)."""
+    h = kernel.heuristic
+    k = z.edges + 1
+    active = z.hit & (k <= kernel.max_depth) & bsdf.connectible(z.bsdf)
+    u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
+    e = kernel.emitters.sample_direct(z.si, u, active)
+    active &= e.pdf > 0
+    wo = z.si.to_local(e.d)
+    f = bsdf.evaluate(z.bsdf, z.si, wo, active)
+    value = z.throughput * f.value * e.weight
+    active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
+
+    light_side = h.start(dr.select(e.delta, 0, f.pdf_fwd / e.pdf))
+    older = dr.select(kernel.within_store(k), z.partial.d_vc, 0)
+    newest = dr.select(kernel.within_store(k), newest_coefficient(kernel, kernel.camera_side, z.edges), 0)
+    camera_side = mis.alternatives(
+        h, mis.Partial(z.partial.d_vcm, older), newest, f.pdf_rev,
+        e.emission_ratio * bsdf.geometric_cos(z.si, wo),
+    )
+    weight = h.weight(1, light_side, camera_side)
+
+    to_infinity = rays.spawn(z.anchor, e.d, z.si)
+    to_point = rays.segment(z.anchor, e.anchor, z.si)
+    ray = dr.select(e.infinite, to_infinity, to_point)
+    counters.shadow_s1 += _one(active)
+    active &= ~rays.occluded(kernel.scene, ray, active)
+    return Contribution(value, weight, mi.UInt32(1), z.edges + 1, active)
+
+
+def join_endpoints(kernel, emission, stream, counters, active):
+    """(1,1): a sampled emitter point seen directly by the sensor.
+
+    Returns the `Contribution` and the film position.
+    """
+    h = kernel.heuristic
+    u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS)
+    finite = kernel.camera.join(emission.si.p, u_lens)
+    join = dr.select(emission.infinite, kernel.camera.join_direction(emission.d, u_lens), finite)
+    active &= join.valid
+    if kernel.camera.delta:
+        active &= ~emission.delta  # measure zero: `path` sees nothing either
+    radiance = kernel.emitters.radiance_towards(emission, join.d, active)
+    cos = dr.select(
+        emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d))
+    )
+    geometry = cos / join.dist2
+    value = radiance * (
+        geometry * join.importance / (emission.pdf_first * kernel.count_light))
+    active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
+    # s = 0: the camera hits the same point.
+    ratio = join.importance * geometry / emission.pdf_first
+    light_side = h.start(dr.select(emission.delta, 0, ratio))
+    weight = h.weight(kernel.coefficient_endpoints, light_side, mi.Float(0))
+
+    ray = rays.segment(emission.anchor, join.anchor, emission.si)
+    # From the sensor into the distance, for light from infinity.
+    away = rays.spawn(join.anchor, -join.d, emission.si)
+    ray = dr.select(emission.infinite, away, ray)
+    counters.shadow_t1 += _one(active)
+    active &= ~rays.occluded(kernel.scene, ray, active)
+    return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active), join.position
+
+
+def splat(kernel, y: Vertex, stream, counters):
+    """t = 1: a light vertex seen by the sensor (eqs. 46, 47).
+
+    Returns the `Contribution` and the film position.
+    """
+    h, scene = kernel.heuristic, kernel.scene
+    active = y.hit & bsdf.connectible(y.bsdf)
+    u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, y.edges)
+    join = kernel.camera.join(y.si.p, u_lens)
+    active &= join.valid
+    if kernel.plan.hide_emitters:
+        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)
+    wo = y.si.to_local(join.d)
+    f = bsdf.evaluate_adjoint(y.bsdf, y.si, wo, active)
+    to_area = bsdf.geometric_cos(y.si, wo) / join.dist2
+    estimate = y.throughput * f.value * (join.importance / join.dist2)
+    value = estimate * dr.rcp(kernel.count_light)
+    active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
+
+    newest = newest_coefficient(kernel, kernel.light_side, y.edges)
+    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev, join.importance * to_area)
+    weight = h.weight(kernel.coefficient_splat, light_side, mi.Float(0))
+
+    u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
+    active, survival = _roulette(kernel, Contribution(value, weight, None, None, active).weighted(), u, active, counters)
+    counters.shadow_t1 += _one(active)
+    ray = rays.segment(y.anchor, join.anchor, y.si)
+    if kernel.plan.hide_emitters:
+        pi, _ = rays.intersect_past_emitters(scene, ray, active, coherent=False)
+        active &= ~pi.is_valid()
+    else:
+        active &= ~rays.occluded(scene, ray, active)
+    c = Contribution(value / survival, weight, y.edges + 1, mi.UInt32(1), active)
+    return c, join.position
+
+
+def inner(kernel, z: Vertex, y: Vertex, counters) -> Contribution:
+    """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41)."""
+    h = kernel.heuristic
+    k = z.edges + y.edges + 1
+    active = z.hit & (k <= kernel.last_inner)
+    between = y.si.p - z.si.p
+    dist2 = dr.squared_norm(between)
+    active &= dist2 > 0
+    d = between * dr.rsqrt(dist2)
+    wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
+    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
+    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active)
+    cos_z, cos_y = bsdf.geometric_cos(z.si, wo_z), bsdf.geometric_cos(y.si, wo_y)
+    value = (z.throughput * f_z.value) * (f_y.value * y.throughput) / dist2
+    counters.evaluated += _one(active)
+    nonzero = active & (dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0)
+    counters.zero += _one(active & ~nonzero)
+
+    light_side = mis.alternatives(
+        h, y.partial, newest_coefficient(kernel, kernel.light_side, y.edges), f_y.pdf_rev,
+        f_z.pdf_fwd * cos_y / dist2)
+    camera_side = mis.alternatives(
+        h, z.partial, newest_coefficient(kernel, kernel.camera_side, z.edges), f_z.pdf_rev,
+        f_y.pdf_fwd * cos_z / dist2)
+    weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
+    return Contribution(value, weight, y.edges + 1, z.edges + 1, nonzero)
+
+
+def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
+    """Join ``z`` with every stored light vertex, a visibility ray each.
+
+    ``deposit(contribution, total)`` adds a contribution to a running total and returns it.
+    """
+
+    def body(slot, total, counters):
+        y = read_light_vertex(path, slot)
+        c = inner(kernel, z, y, counters)
+        counters.shadow_inner += _one(c.active)
+        ray = rays.segment(z.anchor, y.anchor, z.si)
+        c.active = c.active & ~rays.occluded(kernel.scene, ray, c.active)
+        total = deposit(c, total)
+        return slot + 1, total, counters
+
+    end = dr.select(z.hit & bsdf.connectible(z.bsdf), path.count, 0)
+    _, total, counters = dr.while_loop(
+        (mi.UInt32(0), dr.zeros(mi.Spectrum), counters),
+        lambda slot, total, counters: slot < end,
+        body,
+        label="inner connections",
+    )
+    return total, counters
+
+
+def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
+    """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
+
+    The draw is a running one over all candidates; the estimate is that of all of them.
+    """
+
+    def body(slot, chosen, total, target, stream, counters):
+        y = read_light_vertex(path, slot)
+        c = inner(kernel, z, y, counters)
+        value = c.weighted()
+        size = _size(value)
+        total = total + size
+        u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
+        take = u * total < size
+        chosen = dr.select(take, value / size, chosen)
+        target = dr.select(take, y.anchor, target)
+        return slot + 1, chosen, total, target, stream, counters
+
+    end = dr.select(z.hit & bsdf.connectible(z.bsdf), path.count, 0)
+    start = rays.Anchor(dr.zeros(mi.Point3f), dr.zeros(mi.Normal3f), mi.Float(0))
+    _, chosen, total, target, stream, counters = dr.while_loop(
+        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), start, stream, counters),
+        lambda slot, chosen, total, target, stream, counters: slot < end,
+        body,
+        label="choose an inner connection",
+    )
+    value = chosen * total
+    active = total > 0
+    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
+    active, survival = _roulette(kernel, value, u, active, counters)
+    counters.shadow_inner += _one(active)
+    ray = rays.segment(z.anchor, target, z.si)
+    active &= ~rays.occluded(kernel.scene, ray, active)
+    return dr.select(active, value / survival, 0), stream, counters
+
+
+def _roulette(kernel, value, u, active, counters):
+    """Unbiased roulette on a weighted contribution before its visibility is tested."""
+    if not kernel.plan.roulette:
+        return active, mi.Float(1)
+    survival = dr.minimum(_size(value) * kernel.inverse_threshold, 1)
+    survived = u < survival
+    counters.rouletted += _one(active & ~survived)
+    return active & survived, survival
+
+
+def _size(value):
+    """A measure of a contribution's size; any will do as long as it is positive where f is."""
+    return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
+
+
+def _one(mask):
+    return dr.select(mask, mi.UInt32(1), mi.UInt32(0))

@@ -1,0 +1,423 @@
+"""Light endpoints: the only file that knows kinds of emitters.
+
+Mitsuba's emitters offer no density of ``sample_ray``, throw in ``pdf_position`` and are wrong in
+places (a rotated ``envmap`` emits from the wrong disk), so emission is sampled here, by formulas of
+our own on top of the calls that are right: ``sample_direction``, ``pdf_direction``, ``eval`` and
+the shapes' ``sample_position``.
+
+Densities of an emission are two factors, in this order:
+
+* ``pdf_first`` of y_0: area measure on a surface; 1 for a point light (times its selection);
+  solid angle of the direction for an emitter at infinity (1 for a directional one).
+* ``pdf_second`` of y_1 given y_0: solid angle; for an emitter at infinity the area density on the
+  disk perpendicular to the direction that covers the scene, 1 / (pi R^2).
+
+Next-event estimation has its own density of y_0, which depends on the vertex that is lit (cones of
+spheres, d^2/cos, environments).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import rays
+
+AREA, POINT, SPOT, INFINITE, DIRECTIONAL = range(5)
+
+_KINDS = {
+    "AreaLight": AREA,
+    "PointLight": POINT,
+    "SpotLight": SPOT,
+    "DirectionalEmitter": DIRECTIONAL,
+    "ConstantBackgroundEmitter": INFINITE,
+    "EnvironmentMapEmitter": INFINITE,
+}
+
+
+@dataclass
+class Emission:
+    """Start of a light subpath; all fields have the width of the lanes.
+
+    ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start
+    of the ray; ``p``, ``n`` position and geometric normal of y_0 (``n`` zero unless on a surface);
+    ``cos`` geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the module;
+    ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``index`` of the emitter;
+    ``si`` the emitting point for Mitsuba's calls.
+    """
+
+    weight: object
+    d: object
+    anchor: rays.Anchor
+    cos: object
+    pdf_first: object
+    pdf_second: object
+    infinite: object
+    delta: object
+    index: object
+    si: object
+
+
+@dataclass
+class Direct:
+    """A sample of next-event estimation: y_0 for a given camera vertex.
+
+    ``weight`` radiance / ``pdf``; ``pdf`` solid angle at the camera vertex with the selection, or
+    the selection alone where ``delta``; ``d`` unit direction to the emitter; ``ray`` the visibility
+    ray's far end is ``anchor`` (unused where ``infinite``); ``emission_ratio`` is
+    pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
+    geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
+    """
+
+    weight: object
+    pdf: object
+    d: object
+    anchor: rays.Anchor
+    infinite: object
+    delta: object
+    emission_ratio: object
+
+
+class Emitters:
+    """The scene's emitters as tables that a kernel can index.
+
+    Built anew for each render, so that edits of the scene count. Raises ``NotImplementedError`` for
+    kinds that cannot take part yet.
+    """
+
+    def __init__(self, scene):
+        self.scene = scene
+        emitters = scene.emitters()
+        kinds = [_kind(e) for e in emitters]
+        self.kinds = frozenset(kinds)
+        self.count = len(kinds)
+        self.hittable = bool(self.kinds & {AREA, INFINITE})
+        self.delta = bool(self.kinds - {AREA, INFINITE})
+        if not kinds:
+            return
+        self._kind = mi.UInt32(kinds)
+        self._pointers = scene.emitters_dr()
+        sampling_weight = self._pointers.sampling_weight()
+        pmf = sampling_weight / dr.sum(sampling_weight)
+        area = mi.Float(
+            [dr.slice(e.get_shape().surface_area()) if k == AREA else 1.0
+             for e, k in zip(emitters, kinds, strict=True)]
+        )
+        frames = [_frame(e, k) for e, k in zip(emitters, kinds, strict=True)]
+        columns = list(zip(*frames, strict=True))
+        bounds = scene.bbox()
+        sphere = bounds.bounding_sphere() if bounds.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
+        # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
+        radius = max(float(sphere.radius) * (1 + 1e-4), 1e-30)
+        self._pmf = pmf
+        self._inv_area = dr.rcp(area)
+        self._table = [mi.Float([float(x) for x in column]) for column in columns]
+        self._inverse = _inverse_table(self._pointers)
+        self.center = mi.Point3f(sphere.center)
+        self.radius = mi.Float(radius)
+        dr.make_opaque(self._kind, self._pmf, self._inv_area, self._table, self._inverse,
+                       self.center, self.radius)
+
+    # -- tables -----------------------------------------------------------------------------
+
+    def _index_of(self, emitter, active):
+        return dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)
+
+    def _pointer(self, index, active):
+        return dr.gather(mi.EmitterPtr, self._pointers, index, active)
+
+    def _is(self, index, active, *kinds):
+        """Mask of the emitters of ``kinds``; decided from the scene alone where possible."""
+        if not self.kinds & set(kinds):
+            return mi.Bool(False)
+        if self.kinds <= set(kinds):
+            return mi.Bool(active)
+        kind = dr.gather(mi.UInt32, self._kind, index, active)
+        found = mi.Bool(False)
+        for k in kinds:
+            found |= kind == k
+        return active & found
+
+    def _select(self, u, active):
+        """Choose an emitter; returns index, probability and the reused part of ``u``."""
+        if self.count == 1:
+            return mi.UInt32(0), mi.Float(1), u
+        index, _, u = self.scene.sample_emitter(u, active)
+        return index, dr.gather(mi.Float, self._pmf, index, active), u
+
+    def _disk_density(self):
+        return dr.rcp(dr.pi * dr.square(self.radius))
+
+    def _direction_density(self, index, active):
+        """Solid-angle density of the emission from point and spot lights."""
+        return dr.gather(mi.Float, self._table[12], index, active)
+
+    # -- emission ---------------------------------------------------------------------------
+
+    def sample_emission(self, u_point, u_direction, like, active) -> Emission:
+        """Sample y_0 and the direction to y_1.
+
+        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction; ``like`` carries time
+        and wavelengths.
+        """
+        index, pmf, u_x = self._select(u_point.x, active)
+        u_point = mi.Point2f(u_x, u_point.y)
+        emitter = self._pointer(index, active)
+        e = None
+        for kinds, sampler in (
+            ((AREA,), self._emit_area),
+            ((POINT, SPOT), self._emit_position),
+            ((INFINITE, DIRECTIONAL), self._emit_infinite),
+        ):
+            if not self.kinds & set(kinds):
+                continue
+            mask = self._is(index, active, *kinds)
+            of_kind = sampler(emitter, index, u_point, u_direction, like, mask)
+            e = of_kind if e is None else dr.select(mask, of_kind, e)
+        e.pdf_first *= pmf
+        e.weight = dr.select(pmf > 0, e.weight / pmf, 0)
+        return e
+
+    def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+        shape = emitter.get_shape()
+        ps = shape.sample_position(like.time, u_point, active)
+        local = mi.warp.square_to_cosine_hemisphere(u_direction)
+        si = mi.SurfaceInteraction3f(ps, like.wavelengths)
+        si.t = mi.Float(0)
+        si.shape = shape
+        si.wi = local
+        d = si.to_world(local)
+        pdf_first = dr.gather(mi.Float, self._inv_area, index, active)
+        pdf_second = mi.warp.square_to_cosine_hemisphere_pdf(local)
+        n = self.geometric_normal(ps, index, u_point, active)
+        cos = dr.abs(dr.dot(n, d))
+        radiance = emitter.eval(si, active)
+        return Emission(
+            weight=dr.select(pdf_second > 0, radiance * (cos / (pdf_first * pdf_second)), 0),
+            d=d,
+            anchor=rays.sampled_anchor(ps.p, n, ps.p),
+            cos=cos,
+            pdf_first=pdf_first,
+            pdf_second=pdf_second,
+            infinite=mi.Bool(False),
+            delta=mi.Bool(False),
+            index=index,
+            si=si,
+        )
+
+    def geometric_normal(self, ps, index, u_point, active):
+        """Geometric normal at a sampled point (up to its sign)."""
+        return ps.n
+
+    def _emit_position(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+        column = [dr.gather(mi.Float, c, index, active) for c in self._table]
+        p = mi.Point3f(*column[9:12])
+        cos_cutoff = column[13]
+        local = mi.warp.square_to_uniform_cone(u_direction, cos_cutoff)
+        d = (mi.Vector3f(*column[0:3]) * local.x + mi.Vector3f(*column[3:6]) * local.y
+             + mi.Vector3f(*column[6:9]) * local.z)
+        intensity = self._intensity(emitter, p, d, like, active)
+        pdf_second = column[12]
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.t, si.p, si.time, si.wavelengths = mi.Float(0), p, like.time, like.wavelengths
+        return Emission(
+            weight=intensity / pdf_second,
+            d=d,
+            anchor=rays.free_anchor(p),
+            cos=mi.Float(1),
+            pdf_first=mi.Float(1),
+            pdf_second=pdf_second,
+            infinite=mi.Bool(False),
+            delta=mi.Bool(True),
+            index=index,
+            si=si,
+        )
+
+    def _intensity(self, emitter, p, d, like, active):
+        """Intensity of a point or spot light at ``p`` into direction ``d``, by its own calls."""
+        far = 1 + dr.max(dr.abs(p))  # keeps the probe's relative rounding small away from 0
+        it = dr.zeros(mi.Interaction3f)
+        it.p, it.time, it.wavelengths = p + d * far, like.time, like.wavelengths
+        ds, weight = emitter.sample_direction(it, mi.Point2f(0.5), active)
+        return weight * dr.square(ds.dist)
+
+    def _emit_infinite(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+        it = dr.zeros(mi.Interaction3f)
+        it.p, it.time, it.wavelengths = mi.Point3f(self.center), like.time, like.wavelengths
+        ds, weight = emitter.sample_direction(it, u_direction, active)
+        directional = self._is(index, active, DIRECTIONAL)
+        d = -ds.d
+        disk = mi.warp.square_to_uniform_disk_concentric(u_point)
+        frame = mi.Frame3f(d)
+        p = self.center + self.radius * (frame.s * disk.x + frame.t * disk.y - d)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi, si.p, si.time, si.wavelengths = d, p, like.time, like.wavelengths
+        pdf_second = self._disk_density()
+        return Emission(
+            weight=dr.select(ds.pdf > 0, weight / pdf_second, 0),
+            d=d,
+            anchor=rays.free_anchor(p),
+            cos=mi.Float(1),
+            pdf_first=dr.select(directional, 1, ds.pdf),
+            pdf_second=pdf_second,
+            infinite=mi.Bool(True),
+            delta=directional,
+            index=index,
+            si=si,
+        )
+
+    def connection_density(self, emission: Emission, si, active):
+        """Density of next-event estimation making y_0 of ``emission`` from its first hit ``si``.
+
+        In the measure of ``pdf_first``, times the squared length of the edge (1 at infinity): on
+        surfaces that is the solid-angle density at the hit times the geometric cosine at y_0.
+        """
+        emitter = self._pointer(emission.index, active)
+        pmf = self._probability(emission.index, active)
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p, ds.n, ds.uv, ds.time = (
+            emission.si.p, emission.anchor.n, emission.si.uv, emission.si.time)
+        ds.d = -emission.d
+        ds.dist = dr.norm(emission.si.p - si.p)
+        ds.emitter = emitter
+        smooth = active & ~emission.delta
+        pdf = emitter.pdf_direction(mi.Interaction3f(si), ds, smooth)
+        finite = dr.select(emission.infinite, pdf, pdf * emission.cos)
+        delta = dr.select(emission.infinite, 1, dr.square(ds.dist))
+        return pmf * dr.select(emission.delta, delta, finite)
+
+    def radiance_towards(self, emission: Emission, d, active):
+        """What y_0 sends into direction ``d``: radiance, intensity (point) or irradiance (delta
+        direction), for y_0 joined with the sensor."""
+        emitter = self._pointer(emission.index, active)
+        value = dr.zeros(mi.Spectrum)
+        if AREA in self.kinds:
+            mask = self._is(emission.index, active, AREA)
+            si = mi.SurfaceInteraction3f(emission.si)
+            si.wi = si.to_local(d)
+            value = dr.select(mask, emitter.eval(si, mask), value)
+        if self.kinds & {POINT, SPOT}:
+            mask = self._is(emission.index, active, POINT, SPOT)
+            value = dr.select(
+                mask, self._intensity(emitter, emission.si.p, d, emission.si, mask), value)
+        if INFINITE in self.kinds:
+            mask = self._is(emission.index, active, INFINITE)
+            si = mi.SurfaceInteraction3f(emission.si)
+            si.t = mi.Float(dr.inf)
+            value = dr.select(mask, emitter.eval(si, mask), value)
+        if DIRECTIONAL in self.kinds:
+            mask = self._is(emission.index, active, DIRECTIONAL)
+            # weight = E / (pdf_first pdf_second) with the selection
+            density = emission.pdf_first * emission.pdf_second
+            value = dr.select(mask, emission.weight * density, value)
+        return value
+
+    # -- next-event estimation --------------------------------------------------------------
+
+    def sample_direct(self, si, u, active) -> Direct:
+        """Sample y_0 for the camera vertex ``si`` with ``u`` in [0, 1)^2 (reused for selection)."""
+        index, pmf, u_x = self._select(u.x, active)
+        u = mi.Point2f(u_x, u.y)
+        emitter = self._pointer(index, active)
+        ds, weight = emitter.sample_direction(si, u, active)
+        area = self._is(index, active, AREA)
+        infinite = self._is(index, active, INFINITE, DIRECTIONAL)
+        delta = self._is(index, active, POINT, SPOT, DIRECTIONAL)
+        on_surface = area
+        n = dr.select(on_surface, self.geometric_normal(ds, index, u, area), 0)
+        cos_shading = dr.dot(ds.n, -ds.d)
+        cos = dr.abs(dr.dot(n, ds.d))
+        # Mitsuba divides by the shading normal's cosine; the measure is the geometric one.
+        to_geometric = dr.select(area & (cos != dr.abs(cos_shading)), dr.abs(cos_shading) / cos, 1)
+        pdf = dr.select(delta, 1, ds.pdf * to_geometric) * pmf
+        weight = dr.select(ds.pdf > 0, weight / (to_geometric * pmf), 0)
+        ratio = mi.Float(0)
+        if AREA in self.kinds:
+            inv_area = dr.gather(mi.Float, self._inv_area, index, area)
+            emitted = pmf * inv_area * dr.maximum(cos_shading, 0) * dr.inv_pi
+            ratio = dr.select(area, emitted / (pdf * cos), ratio)
+        if self.kinds & {POINT, SPOT}:
+            here = self._is(index, active, POINT, SPOT)
+            emitted = self._direction_density(index, here) / dr.square(ds.dist)
+            ratio = dr.select(here, emitted, ratio)
+        ratio = dr.select(infinite, self._disk_density(), ratio)
+        anchor = rays.sampled_anchor(ds.p, n, si.p)
+        return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio)
+
+    # -- hits by camera subpaths ------------------------------------------------------------
+
+    def emitted(self, si, active):
+        """Radiance of the emitter hit (or missed into) at ``si`` towards ``si.wi``."""
+        emitter = si.emitter(self.scene)
+        return emitter.eval(si, active)
+
+    def hit_densities(self, si, previous, active):
+        """Densities with which light-side strategies make the hit emitter point.
+
+        ``previous`` is the camera vertex before (position). Returns ``(connect, first, second)``:
+        next-event estimation from ``previous``, and the two factors of emission towards it; area
+        measure on surfaces, solid angle (and disk area) at infinity, selection included.
+        """
+        emitter = si.emitter(self.scene)
+        active = active & (emitter != dr.zeros(mi.EmitterPtr))
+        pmf = self._probability(self._index_of(emitter, active), active)
+        it = dr.zeros(mi.Interaction3f)
+        it.p, it.time, it.wavelengths = previous, si.time, si.wavelengths
+        ds = mi.DirectionSample3f(self.scene, si, it)
+        ds.n = mi.Normal3f(si.n)
+        pdf = pmf * emitter.pdf_direction(it, ds, active)
+        connect, first, second = mi.Float(pdf), mi.Float(pdf), self._disk_density()
+        if AREA in self.kinds:
+            on_surface = si.is_valid()
+            index = self._index_of(emitter, active & on_surface)
+            inv_area = dr.gather(mi.Float, self._inv_area, index, active & on_surface)
+            to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
+            cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
+            connect = dr.select(on_surface, pdf * to_area, connect)
+            first = dr.select(on_surface, pmf * inv_area, first)
+            second = dr.select(on_surface, cos_second, second)
+        return connect, first, second
+
+    def _probability(self, index, active):
+        if self.count == 1:
+            return mi.Float(1)
+        return dr.gather(mi.Float, self._pmf, index, active)
+
+
+def _kind(emitter) -> int:
+    name = emitter.class_name()
+    if name not in _KINDS:
+        raise NotImplementedError(
+            f"emitter '{emitter.id()}' of class {name} is not supported by the bdpt integrator yet; "
+            f"supported are {', '.join(sorted(_KINDS))}. Replace it, or use integrator type 'path'."
+        )
+    return _KINDS[name]
+
+
+def _frame(emitter, kind):
+    """Axes, position, emission density (per solid angle) and cosine of the cutoff of a point or
+    spot light; constants for the others."""
+    if kind not in (POINT, SPOT):
+        return (1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 1)
+    params = mi.traverse(emitter)
+    if kind == POINT:
+        p = dr.slice(mi.Point3f(params["position"]))
+        return (1, 0, 0, 0, 1, 0, 0, 0, 1, *p, 1 / (4 * dr.pi), -1)
+    to_world = params["to_world"]
+    axes = [dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
+            for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    p = dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
+    cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
+    density = 1 / (2 * dr.pi * (1 - cos_cutoff))
+    return (*axes[0], *axes[1], *axes[2], *p, density, cos_cutoff)
+
+
+def _inverse_table(pointers):
+    """Emitter index by the number that Dr.Jit gives to a pointer."""
+    ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()
+    table = [0] * (int(ids.max()) + 1)
+    for index, number in enumerate(ids):
+        table[int(number)] = index
+    return mi.UInt32(table)

@@ -1,0 +1,128 @@
+"""Two raw accumulators, and how they become the film.
+
+Camera samples go into one block with Mitsuba's filter weights W, splats (t = 1) into another. The
+weight that a splat must be divided by is analytic, W' = spp * integral of the filter over the region
+that camera samples cover; it enters the film as W * splat / W', so that `Film.develop` does the
+right thing for every filter, crop window and border. Putting both kinds into one block, as Mitsuba's
+``ptracer`` does, is biased for every filter but the box: E[1/W] > 1/E[W].
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .strategies import strategies, strategy_count, strategy_index, strategy_names
+
+
+class Accumulator:
+    """Collects the samples of one render.
+
+    ``film`` Mitsuba's film; ``border`` how many pixels camera samples reach beyond the crop window;
+    ``depth`` the largest path length of the strategy images, 0 for none.
+    """
+
+    def __init__(self, film, border: int, depth: int):
+        self.film = film
+        self.border = border
+        self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        self.depth = depth
+        self.size = [int(x) for x in film.crop_size()]
+        self.offset = [int(x) for x in film.crop_offset()]
+        self.rfilter = film.rfilter()
+        film.prepare(strategy_names(depth))
+        self.camera = self._block(5 if self.alpha else 4)
+        self.light = self._block(3)
+        # One strip of rows per strategy, far enough apart for the filter.
+        self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
+        self.strategies = self._block(6, strategy_count(depth) * self._stride) if depth else None
+        self._sums = None
+
+    def _block(self, channels: int, height: int | None = None):
+        return mi.ImageBlock(
+            [self.size[0], height or self.size[1]], self.offset, channels, rfilter=self.rfilter,
+            border=False, normalize=False, coalesce=False,
+        )
+
+    def put_camera(self, position, rgb, alpha, active):
+        """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
+        values = [rgb.x, rgb.y, rgb.z, *([alpha] if self.alpha else []), mi.Float(1)]
+        self.camera.put(position, values, active)
+
+    def put_light(self, position, rgb, active):
+        """Add a splat at a continuous film position."""
+        self.light.put(position, [rgb.x, rgb.y, rgb.z], active)
+
+    def put_strategy(self, position, weighted, unweighted, s, t, active):
+        """Add to the technique images of the strategy (s, t)."""
+        row = mi.Float(strategy_index(s, t) * self._stride)
+        below = mi.Point2f(position.x, position.y + row)
+        values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
+        self.strategies.put(below, values, active)
+
+    def evaluate(self, *others):
+        """Run what was recorded since the last call as one kernel, ``others`` with it."""
+        dr.eval([b.tensor() for b in self._blocks()], *others)
+
+    def _blocks(self):
+        return [b for b in (self.camera, self.light, self.strategies) if b is not None]
+
+    def close_pass(self):
+        """Move the pass's sums into double precision."""
+        blocks = self._blocks()
+        sums = [mi.Float64(b.tensor().array) for b in blocks]
+        if self._sums is not None:
+            sums = [a + b for a, b in zip(self._sums, sums, strict=True)]
+        dr.eval(sums)
+        self._sums = sums
+        for b in blocks:
+            b.clear()
+
+    def mean(self, spp: int) -> float:
+        """Mean of the image so far (largest channel), for the scale of roulette."""
+        camera, light = (
+            np.array(s).reshape(-1, b.channel_count()) for s, b in
+            zip(self._sums[:2], (self.camera, self.light), strict=True)
+        )
+        weight = max(camera[:, -1].sum(), 1e-30)
+        splat_weight = max(self._splat_weight(spp).sum(), 1e-30)
+        return float((camera[:, :3].sum(0) / weight + light[:, :3].sum(0) / splat_weight).max())
+
+    def _splat_weight(self, spp: int):
+        """W', shape (height, width)."""
+        x, y = (self._covered(n) for n in self.size)
+        return spp * y[:, None] * x[None, :]
+
+    def _covered(self, n: int):
+        """Integral of the one-dimensional filter about each pixel over the camera samples' region."""
+        if self.rfilter.is_box_filter():
+            return np.ones(n)  # camera samples are put at the pixel itself: each weighs 1
+        radius, steps = self.rfilter.radius(), 4096
+        edges = np.linspace(-radius, radius, 2 * steps + 1)
+        middle = (edges[1:] + edges[:-1]) / 2
+        density = np.array(self.rfilter.eval(mi.Float(middle)), dtype=np.float64)
+        cumulative = np.concatenate([[0], np.cumsum(density * np.diff(edges))])
+        centre = np.arange(n) + 0.5
+        high = np.interp(n + self.border - centre, edges, cumulative)
+        return high - np.interp(-self.border - centre, edges, cumulative)
+
+    def finish(self, spp: int):
+        """Store the result of ``spp`` samples per pixel in the film."""
+        w, h = self.size
+        if spp == 0:
+            return
+        camera, light = (
+            np.array(s).reshape(h, w, -1) for s in self._sums[:2]
+        )
+        to_film = camera[..., -1:] / self._splat_weight(spp)[..., None]
+        camera[..., :3] += light * to_film
+        layers = [camera]
+        if self.depth:
+            tall = np.array(self._sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
+            for index, (_, _, t) in enumerate(strategies(self.depth)):
+                layers.append(tall[index] * (to_film if t == 1 else 1))
+        values = np.concatenate(layers, axis=-1).astype(np.float32)
+        block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
+        self.film.put_block(block)
+

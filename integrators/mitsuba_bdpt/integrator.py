@@ -1,0 +1,489 @@
+"""The integrator plugin ``bdpt``: parameters, passes, statistics."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import mis, points
+from .emitters import Emitters
+from .film import Accumulator
+from .kernel import CONNECTIONS as CONNECTION_COUNTS
+from .kernel import RAYS, Batch, Kernel, trace
+from .plan import CONNECTIONS, LIGHT_PATHS, SKIP, UNLIMITED, Settings, plan, scene_bsdfs
+from .sensors import Camera
+from .strategies import strategy_count, strategy_names
+
+# Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
+# a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
+PASS_SAMPLES = 1 << 22
+
+# With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
+PASS_SAMPLES_SAMPLER = 1 << 20
+
+# What strategy images may take, in bytes, before the render is refused.
+STRATEGY_MEMORY = 2 << 30
+
+
+@dataclass(frozen=True)
+class PassReport:
+    """Progress after a pass: samples per pixel, seconds and rays so far."""
+
+    spp_done: int
+    spp_total: int
+    seconds: float
+    rays: int
+
+
+DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
+
+Every path of k edges can be made in k + 1 ways (s, t) with s light vertices and t >= 1 camera
+vertices (E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation", 1997, chapter 10).
+All of them are combined by multiple importance sampling.
+
+.. pluginparameters::
+
+ * - max_depth
+   - |int|
+   - Longest path in edges, as in ``path``: 1 is directly visible emitters, -1 (default) unlimited.
+ * - rr_depth
+   - |int|
+   - Russian roulette starts at this depth, as in ``path``. (Default: 5)
+ * - hide_emitters
+   - |bool|
+   - Hide directly visible emitters, as in ``path``. (Default: false)
+ * - heuristic
+   - |string|
+   - ``balance`` (default), ``power``, ``maximum`` or ``uniform``.
+ * - skip
+   - |string|
+   - ``auto`` (default) and ``impossible`` leave out what the scene cannot use, draw one connection
+     per camera vertex and drop small contributions by unbiased roulette; ``none`` does everything.
+ * - light_paths
+   - |string| or |float|
+   - Light subpaths per camera subpath: ``auto`` (default: 1/4, or 1 with ``skip=none``), 0, 1,
+     1/2, 1/4, 1/8 or 1/16. One light subpath serves camera subpaths of different pixels.
+ * - connections
+   - |string|
+   - Inner connections per camera vertex: ``all``, ``one`` (drawn by its unshadowed contribution),
+     ``none``, or ``auto`` (default: ``one``, or ``all`` with ``skip=none``).
+ * - points
+   - |string|
+   - ``sobol`` (default): Owen-scrambled Sobol' points for the first dimensions; ``sampler``: the
+     scene's sampler for them; ``independent``.
+ * - stored_vertices
+   - |int|
+   - Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. (Default: 64)
+ * - strategy_images
+   - |bool|
+   - Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` for each strategy; needs a
+     finite ``max_depth``. (Default: false)
+ * - spp_per_pass
+   - |int|
+   - Samples per pixel in one pass; 0 (default) chooses.
+ * - timeout
+   - |float|
+   - Stop after the pass in which so many seconds were exceeded; -1 (default): never.
+
+Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
+that is called with a `PassReport` after each pass.
+
+Not supported, and refused in words: scalar and polarized variants, participating media,
+derivatives, films for spectra (``specfilm``), sensors other than ``perspective`` and ``thinlens``,
+emitters other than ``area``, ``point``, ``spot``, ``directional``, ``constant``, ``envmap``.
+"""
+
+
+def _integer(props, name, default, low):
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != int(value):
+        raise TypeError(f"bdpt: {name}={value!r} must be an integer")
+    if value < low:
+        raise ValueError(f"bdpt: {name}={value!r} must be {low} or greater")
+    return int(value)
+
+
+def _boolean(props, name):
+    value = props.get(name, False)
+    if not isinstance(value, bool):
+        raise TypeError(f"bdpt: {name}={value!r} must be a boolean (true or false)")
+    return value
+
+
+def _choice(props, name, choices):
+    value = props.get(name, choices[0])
+    if value not in choices:
+        raise ValueError(f"bdpt: {name}={value!r} is not known; use one of {', '.join(choices)}")
+    return value
+
+
+def _light_paths(props):
+    value = props.get("light_paths", "auto")
+    if value == "auto":
+        return value
+    try:
+        if isinstance(value, str):
+            top, _, bottom = value.partition("/")
+            number = float(top) / float(bottom or 1)
+        else:
+            number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        number = None
+    if number not in LIGHT_PATHS:
+        raise ValueError(
+            f"bdpt: light_paths={value!r} is not possible; use auto, 0, 1, 1/2, 1/4, 1/8 or 1/16")
+    return number
+
+
+def read_settings(props) -> Settings:
+    """Read and check the plugin's parameters; raises ``TypeError`` and ``ValueError``."""
+    max_depth = _integer(props, "max_depth", -1, -1)
+    timeout = props.get("timeout", -1.0)
+    if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or timeout != timeout:
+        raise TypeError(f"bdpt: timeout={timeout!r} must be a number of seconds, or -1 for none")
+    settings = Settings(
+        max_depth=UNLIMITED if max_depth < 0 else max_depth,
+        rr_depth=_integer(props, "rr_depth", 5, 1),
+        hide_emitters=_boolean(props, "hide_emitters"),
+        heuristic=_choice(props, "heuristic", mis.HEURISTICS),
+        skip=_choice(props, "skip", SKIP),
+        light_paths=_light_paths(props),
+        connections=_choice(props, "connections", CONNECTIONS),
+        points=_choice(props, "points", points.POINTS),
+        stored_vertices=_integer(props, "stored_vertices", 64, 1),
+        strategy_images=_boolean(props, "strategy_images"),
+        spp_per_pass=_integer(props, "spp_per_pass", 0, 0),
+        timeout=float(timeout),
+    )
+    if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
+        raise ValueError(
+            f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
+            "set max_depth, for example to 5")
+    return settings
+
+
+def check_variant():
+    """Raise ``NotImplementedError`` for variants that the method cannot serve."""
+    variant = mi.variant()
+    if not variant.startswith(("llvm", "cuda")):
+        raise NotImplementedError(
+            f"bdpt: the variant {variant} is scalar; use a vectorised one, for example "
+            "mi.set_variant('llvm_ad_rgb')")
+    if mi.is_polarized:
+        raise NotImplementedError(
+            f"bdpt: the variant {variant} is polarized, which is not supported; use "
+            f"{variant.replace('_polarized', '')}")
+
+
+def check_scene(scene):
+    """Raise ``NotImplementedError`` for what the method cannot render."""
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            raise NotImplementedError(
+                f"bdpt: shape '{shape.id()}' bounds a participating medium, which is not supported; "
+                "use integrator type 'volpath'")
+
+
+def pass_sizes(pixels: int, spp: int, settings: Settings) -> list[int]:
+    """Samples per pixel of each pass, in order; their sum is ``spp``.
+
+    A first pass of one sample gives roulette the scale of the image.
+    """
+    limit = PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
+    size = settings.spp_per_pass or max(limit // max(pixels, 1), 1)
+    sizes = []
+    if settings.points == "sampler":
+        # Stratified samplers number the samples of a pixel; passes must cut them evenly.
+        size = next(n for n in range(min(size, spp), 0, -1) if spp % n == 0)
+    elif settings.skip != "none" and spp > 1:
+        sizes, spp = [1], spp - 1
+    return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
+
+
+def batches(camera: Camera, first_sample: int, samples: int, settings: Settings):
+    """Cut a pass into bands of rows that one kernel launch can take."""
+    limit = PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
+    width, height = (int(x) for x in camera.region)
+    rows = height if settings.spp_per_pass == 0 and width * height * samples <= limit else max(
+        1, min(height, 4 * limit // max(width * samples, 1)))
+    return [
+        Batch(y * width, min(rows, height - y) * width, first_sample, samples)
+        for y in range(0, height, rows)
+    ]
+
+
+class Render:
+    """One render: its scene, plan, accumulators and progress. Lives for one call."""
+
+    def __init__(self, scene, sensor, settings: Settings, seed):
+        check_variant()
+        check_scene(scene)
+        self.started = time.perf_counter()
+        self.scene, self.sensor, self.settings = scene, sensor, settings
+        self.film = sensor.film()
+        if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
+            raise NotImplementedError(
+                f"bdpt: film '{self.film.id()}' of class {self.film.class_name()} is not supported; "
+                "use hdrfilm")
+        self.camera = Camera(sensor)
+        self.emitters = Emitters(scene)
+        self.plan = plan(scene, self.emitters, self.camera, settings)
+        self.seed = mi.UInt32(seed)
+        dr.make_opaque(self.seed)
+        depth = settings.max_depth if settings.strategy_images else 0
+        _check_strategy_memory(depth, self.film)
+        self.accumulator = Accumulator(self.film, self.camera.border, depth)
+        self.kernel = Kernel(
+            scene, self.camera, self.emitters, self.plan, settings,
+            mis.Heuristic(settings.heuristic))
+        self.passes, self.compiled, self.cached, self.compile_seconds = [], 0, 0, 0.0
+
+    def run(self, spp: int, on_pass):
+        """Trace ``spp`` samples per pixel, fewer under ``timeout`` or when interrupted."""
+        pixels = int(self.camera.region[0]) * int(self.camera.region[1])
+        sizes = pass_sizes(pixels, spp, self.settings)
+        try:
+            for number, size in enumerate(sizes):
+                self._pass(number, size, spp)
+                if on_pass is not None:
+                    on_pass(self.report(spp))
+                if 0 <= self.settings.timeout <= time.perf_counter() - self.started:
+                    break
+        finally:
+            self.accumulator.finish(sum(self.passes))
+
+    def _pass(self, number: int, size: int, spp: int):
+        done = sum(self.passes)
+        for batch in batches(self.camera, done, size, self.settings):
+            self.kernel.points = self._points(number, batch, spp)
+            trace(self.kernel, self.accumulator, batch, spp)
+            self._launch()
+        self.accumulator.close_pass()
+        self.passes.append(size)
+        if number == 0 and self.plan.roulette:
+            self.kernel.set_threshold(self.accumulator.mean(size))
+
+    def _points(self, number, batch, spp):
+        sampler = None
+        if self.settings.points == "sampler":
+            sampler = self.sensor.sampler().clone()
+            sampler.set_sample_count(spp)
+            sampler.set_samples_per_wavefront(batch.samples)
+            sampler.seed(
+                mi.sample_tea_32(self.seed, mi.UInt32(batch.first_pixel))[0],
+                batch.pixels * batch.samples)
+            for _ in range(number):
+                sampler.advance()
+        return points.Points(self.settings.points, self.seed, sampler)
+
+    def _launch(self):
+        """Evaluate what was recorded, and note how it was compiled."""
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            self.accumulator.evaluate(self.kernel.counts)
+            dr.sync_thread()
+            history = dr.kernel_history()
+        for entry in history:
+            hit = entry.get("cache_hit", False)
+            self.cached += hit
+            self.compiled += not hit
+            seconds = entry.get("codegen_time", 0) + entry.get("backend_time", 0)
+            self.compile_seconds += float(seconds) / 1000
+
+    def report(self, spp: int) -> PassReport:
+        """Progress so far, for ``on_pass``."""
+        counts = self.kernel.counts.numpy()
+        return PassReport(
+            sum(self.passes), spp, time.perf_counter() - self.started,
+            int(counts[: len(RAYS)].sum()))
+
+    def statistics(self) -> dict:
+        """The render in numbers; plain values only."""
+        counts = [int(x) for x in self.kernel.counts.numpy()]
+        rays = dict(zip(RAYS, counts, strict=False))
+        connections = dict(zip(CONNECTION_COUNTS, counts[len(RAYS):], strict=False))
+        connections["traced"] = rays["shadow_inner"]
+        total = time.perf_counter() - self.started
+        return {
+            "seconds": {
+                "compile": self.compile_seconds, "pilot": 0.0,
+                "render": total - self.compile_seconds, "total": total,
+            },
+            "rays": rays,
+            "connections": connections,
+            "skipped": list(self.plan.skipped),
+            "decisions": [],
+            "passes": list(self.passes),
+            "non_finite": counts[-1],
+            "kernels": {"compiled": self.compiled, "cached": self.cached},
+            "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
+        }
+
+
+def _check_strategy_memory(depth: int, film):
+    w, h = (int(x) for x in film.crop_size())
+    # Six channels in single precision (with a copy per thread, taken as one more) and double sums.
+    needed = strategy_count(depth) * w * h * 6 * (4 + 4 + 16)
+    if needed > STRATEGY_MEMORY:
+        raise ValueError(
+            f"bdpt: strategy_images at {w}x{h} with max_depth={depth} needs about "
+            f"{needed / 2**30:.1f} GiB, more than {STRATEGY_MEMORY / 2**30:.0f} GiB; use a smaller "
+            "film or max_depth")
+
+
+def _make_class():
+    class BDPTIntegrator(mi.SamplingIntegrator):
+        __doc__ = DOCUMENTATION
+
+        def __init__(self, props):
+            check_variant()
+            settings = read_settings(props)
+            super().__init__(props)
+            self.settings = settings
+            self.statistics = {}
+            self.on_pass = None
+
+        @property
+        def max_depth(self):
+            depth = self.settings.max_depth
+            return -1 if depth == UNLIMITED else depth
+
+        @property
+        def rr_depth(self):
+            return self.settings.rr_depth
+
+        def aov_names(self):
+            if not self.settings.strategy_images:
+                return []
+            return strategy_names(self.settings.max_depth)
+
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            """Render ``scene``; see ``mi.Integrator.render`` for the arguments."""
+            sensor = _resolve(scene, sensor)
+            spp = _samples(sensor, spp, self.settings)
+            render = Render(scene, sensor, self.settings, seed)
+            try:
+                render.run(spp, self.on_pass)
+            finally:
+                self.statistics = render.statistics()
+            _log(self.statistics)
+            film = sensor.film()
+            if not develop:
+                film.schedule_storage()
+                result = mi.TensorXf()
+            else:
+                result = film.develop()
+                dr.schedule(result)
+            if evaluate:
+                dr.eval()
+                dr.sync_thread()
+            return result
+
+        def render_forward(self, *args, **kwargs):
+            raise NotImplementedError(NO_DERIVATIVES)
+
+        def render_backward(self, *args, **kwargs):
+            raise NotImplementedError(NO_DERIVATIVES)
+
+        def explain(self, scene, sensor=0, spp=None):
+            """What will be done for ``scene`` and what is skipped, and why, as text."""
+            return explain(scene, _resolve(scene, sensor), self.settings)
+
+        def to_string(self):
+            values = asdict(self.settings) | {"max_depth": self.max_depth}
+            lines = "".join(f"  {k} = {v},\n" for k, v in values.items())
+            return f"BDPTIntegrator[\n{lines}]"
+
+    return BDPTIntegrator
+
+
+NO_DERIVATIVES = (
+    "bdpt: derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
+    "and render_backward")
+
+
+def explain(scene, sensor, settings: Settings) -> str:
+    """Text about the strategies in use for ``scene`` and those that are skipped."""
+    check_variant()
+    check_scene(scene)
+    emitters, camera = Emitters(scene), Camera(sensor)
+    p = plan(scene, emitters, camera, settings)
+    used = [name for name, on in (
+        ("s=0 (camera subpath hits an emitter)", p.hit),
+        ("s=1 (next-event estimation)", p.direct),
+        ("t=1 (light vertex seen by the sensor)", p.splat),
+        ("(1,1) (emitter point seen by the sensor)", p.endpoints),
+        (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
+    ) if on]
+    lines = [f"heuristic {settings.heuristic}, one light subpath per {p.served} camera subpaths"
+             if p.light else f"heuristic {settings.heuristic}, no light subpaths"]
+    lines += [f"used: {name}" for name in used]
+    lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
+    lines += [f"lost: {text}" for text in lost_paths(scene, emitters, p)]
+    return "\n".join(lines)
+
+
+def lost_paths(scene, emitters: Emitters, p) -> list[str]:
+    """Paths that no strategy in use can make."""
+    deltas = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in scene_bsdfs(scene))
+    lost = []
+    if not deltas:
+        return lost
+    if emitters.delta and not (p.splat and p.connections != "none"):
+        lost.append("light of delta emitters that meets a delta surface first, as far as it needs "
+                    "t=1 or inner connections")
+    if emitters.delta:
+        lost.append("light of delta emitters seen through delta surfaces only on both sides of a "
+                    "single diffuse vertex (s=2 and t=2 cannot be joined across a delta vertex)")
+    return lost
+
+
+def _resolve(scene, sensor):
+    if not isinstance(sensor, int):
+        return sensor
+    sensors = scene.sensors()
+    if not sensors:
+        raise ValueError("bdpt: the scene has no sensor; add one, for example of type perspective")
+    if not 0 <= sensor < len(sensors):
+        raise ValueError(
+            f"bdpt: sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
+    return sensors[sensor]
+
+
+def _samples(sensor, spp, settings) -> int:
+    if spp < 0:
+        raise ValueError(f"bdpt: spp={spp} must be 0 (the sampler's sample_count) or greater")
+    if settings.points != "sampler":
+        return int(spp or sensor.sampler().sample_count())
+    sampler = sensor.sampler().clone()
+    if spp:
+        sampler.set_sample_count(spp)  # stratified samplers round it
+    return int(sampler.sample_count())
+
+
+def _log(statistics: dict):
+    seconds = statistics["seconds"]
+    mi.Log(mi.LogLevel.Info, "bdpt: %d spp in %.2f s (compile %.2f s); %s" % (
+        sum(statistics["passes"]), seconds["total"], seconds["compile"],
+        json.dumps(statistics["rays"])))
+
+
+_classes = {}
+
+
+def register():
+    """Register the plugin ``bdpt`` for the current variant and for all that are set later."""
+
+    def register_variant(old=None, new=None):
+        variant = mi.variant()
+        if variant is None or variant in _classes:
+            return
+        # Class bodies differ per variant: the base class object does.
+        _classes[variant] = _make_class()
+        mi.register_integrator("bdpt", lambda props, v=variant: _classes[v](props))
+
+    mi.detail.add_variant_callback(register_variant)
+    register_variant()

@@ -1,0 +1,321 @@
+"""One pass as one kernel.
+
+A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
+subpaths that it serves, in S distant pixels; all strategies of a pair are evaluated by that lane.
+Nothing per lane lives in global memory: the footprint does not grow with samples or image size.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import bsdf, connect, mis, rays
+from .plan import UNLIMITED, scene_bsdfs
+from .points import Purpose
+from .subpath import Side, Walk, random_walk
+
+RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
+CONNECTIONS = ("evaluated", "zero", "rouletted")
+
+
+@dataclass
+class Counters:
+    """What a lane has done; ``UInt32`` each."""
+
+    camera: object
+    light: object
+    shadow_s1: object
+    shadow_t1: object
+    shadow_inner: object
+    evaluated: object
+    zero: object
+    rouletted: object
+    non_finite: object
+
+
+@dataclass
+class Shared:
+    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves."""
+
+    time: object
+    wavelengths: object
+    weight: object
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The samples of one pass: pixels ``first_pixel`` and on, ``pixels`` of them (row by row in
+    the film region), samples ``first_sample`` and on, ``samples`` of each pixel."""
+
+    first_pixel: int
+    pixels: int
+    first_sample: int
+    samples: int
+
+
+class Kernel:
+    """Everything that a pass needs besides its batch. Holds the scene for one render only."""
+
+    def __init__(self, scene, camera, emitters, plan, settings, heuristic):
+        self.scene, self.camera, self.emitters, self.plan = scene, camera, emitters, plan
+        self.heuristic = heuristic
+        self.full_pdf = bsdf.needs_full_pdf(scene_bsdfs(scene))
+        depth = min(settings.max_depth, UNLIMITED)
+        reach = min(depth, settings.stored_vertices)
+        self.store_size = max(reach - 2, 1)
+        self.strategy_images = settings.strategy_images
+        count = 1 / plan.served if plan.light else 0.0
+        inner = 1.0 if plan.connections != "none" else 0.0
+        u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
+        self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
+        self._reach = u32(reach)
+        self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)
+        self.last_light = u32(max(reach - 1 if plan.splat else reach - 2, 0))
+        self.served = u32(plan.served)
+        self.count_light = f32(count)
+        self.coefficient_splat = f32(count * plan.splat_coefficient if plan.splat else 0)
+        self.coefficient_endpoints = f32(count if plan.endpoints else 0)
+        self.coefficient_inner = f32(inner)
+        self.inverse_threshold = f32(dr.inf)
+        self.camera_side = Side("camera", False, self.max_depth, self.coefficient_splat)
+        self.counts = dr.zeros(mi.UInt64, len(RAYS) + len(CONNECTIONS) + 1)
+        self.points = None
+
+    def within_store(self, k):
+        """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
+        return k <= self._reach
+
+    def set_threshold(self, mean: float):
+        """Contributions below a tenth of the image's mean play roulette (a power of two, so that
+        the order of atomic sums rarely changes a decision)."""
+        rounded = 2.0 ** round(_log2(0.1 * mean)) if mean > 0 else 0.0
+        self.inverse_threshold = dr.opaque(mi.Float, 1 / rounded if rounded > 0 else dr.inf)
+
+    def to_rgb(self, value, wavelengths):
+        """Linear sRGB of a spectrum."""
+        value = mi.unpolarized_spectrum(value)
+        if mi.is_spectral:
+            return mi.spectrum_to_srgb(value, wavelengths)
+        if mi.is_monochromatic:
+            return mi.Color3f(value.x)
+        return mi.Color3f(value)
+
+
+def trace(kernel: Kernel, film, batch: Batch, spp: int):
+    """Trace one batch and add it to ``film`` (an `Accumulator`); ``spp`` is the render's total,
+    which places the batch in the image's point sequence. Side effects only, evaluated later."""
+    total = batch.pixels * batch.samples
+    lanes = -(-total // kernel.plan.served)
+    # The count of light subpaths is exact also where S does not divide the batch.
+    kernel.count_light = dr.opaque(mi.Float, lanes / total)
+    lane = dr.arange(mi.UInt32, lanes)
+    place = _Places(kernel, batch, spp, lanes, total)
+    counters = Counters(*(mi.UInt32(0) for _ in range(len(RAYS) + len(CONNECTIONS) + 1)))
+
+    stream = kernel.points.stream("light", place.index(lane), lane)
+    shared = _shared(kernel, stream)
+    path = connect.allocate_light_path(kernel.store_size)
+    if kernel.plan.light:
+        path, counters = _light_subpath(kernel, film, stream, shared, path, counters)
+
+    def body(served, path, counters):
+        slot = lane + served * dr.opaque(mi.UInt32, lanes)
+        active = slot < dr.opaque(mi.UInt32, total)
+        counters = _camera_subpath(kernel, film, place, slot, shared, path, counters, active)
+        return served + 1, path, counters
+
+    if kernel.plan.served == 1:
+        _, path, counters = body(mi.UInt32(0), path, counters)
+    else:
+        _, path, counters = dr.while_loop(
+            (mi.UInt32(0), path, counters),
+            lambda served, path, counters: served < kernel.served,
+            body,
+            label="camera subpaths of one light subpath",
+        )
+    _record(kernel, counters)
+
+
+class _Places:
+    """Where a camera sample of the batch lies: pixel, and index in the image's sequence."""
+
+    def __init__(self, kernel, batch: Batch, spp: int, lanes: int, total: int):
+        self._camera = kernel.camera
+        self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
+        self._samples = dr.opaque(mi.UInt32, batch.samples)
+        self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
+        self._spp = dr.opaque(mi.UInt64, spp)
+
+    def _split(self, slot):
+        pixel = slot // self._samples
+        return pixel + self._first_pixel, slot - pixel * self._samples + self._first_sample
+
+    def index(self, slot):
+        pixel, sample = self._split(slot)
+        return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)
+
+    def pixel(self, slot):
+        pixel, _ = self._split(slot)
+        return self._camera.pixel(pixel)
+
+
+def _shared(kernel, stream) -> Shared:
+    sensor, points = kernel.camera.sensor, kernel.points
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        u = points.draw_1d("light", stream, Purpose.TIME)
+        time += u * sensor.shutter_open_time()
+    if not mi.is_spectral:
+        return Shared(time, mi.Color0f(), mi.Spectrum(1))
+    u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
+    wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
+    return Shared(time, wavelengths, weight)
+
+
+def _light_subpath(kernel, film, stream, shared, path, counters):
+    points, h, emitters = kernel.points, kernel.heuristic, kernel.emitters
+    e = emitters.sample_emission(
+        points.draw_2d("light", stream, Purpose.EMISSION_POINT),
+        points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
+        shared, mi.Bool(True),
+    )
+    if kernel.plan.endpoints:
+        c, position = connect.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
+        _deposit_splat(kernel, film, c, position, shared, counters)
+    active = (dr.max(mi.unpolarized_spectrum(e.weight)) > 0) & (kernel.last_light >= 1)
+    inverse = dr.rcp(e.pdf_first * e.pdf_second)
+    ray = rays.spawn(e.anchor, e.d, shared)
+    walk = Walk(
+        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
+        ray=ray,
+        previous=mi.Point3f(e.si.p),
+        throughput=mi.Spectrum(e.weight),
+        partial=mis.Partial(
+            h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse))),
+        reference=dr.max(mi.unpolarized_spectrum(e.weight)),
+        eta=mi.Float(1),
+        edges=mi.UInt32(1),
+        infinite=mi.Bool(e.infinite),
+        seen=mi.Bool(False),
+        active=active,
+    )
+    side = Side(
+        "light", True, kernel.last_light, mi.Float(1),
+        complete=lambda si, first: emitters.connection_density(e, si, first),
+    )
+    kernel.light_side = side
+
+    def visit(vertex, stream, state):
+        path, counters = state
+        if kernel.plan.splat:
+            c, position = connect.splat(kernel, vertex, stream, counters)
+            _deposit_splat(kernel, film, c, position, shared, counters)
+        if kernel.plan.connections != "none":
+            connect.store_light_vertex(kernel, vertex, path)
+        return path, counters
+
+    (path, counters), _, traced, _ = random_walk(
+        kernel, side, walk, stream, visit, (path, counters))
+    counters.light += traced
+    return path, counters
+
+
+def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
+    points, plan = kernel.points, kernel.plan
+    stream = points.stream("camera", place.index(slot), slot)
+    u_film = points.draw_2d("camera", stream, Purpose.FILM)
+    u_lens = mi.Point2f(0.5)
+    if kernel.camera.lens:
+        u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
+    start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
+    active = active & (kernel.max_depth >= 1)
+    ray = start.ray
+    if plan.hide_emitters:
+        pi, ray = rays.intersect_past_emitters(kernel.scene, ray, active, coherent=True)
+    else:
+        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    walk = Walk(
+        pi=pi,
+        ray=ray,
+        previous=start.p,
+        throughput=mi.Spectrum(start.weight),
+        partial=mis.Partial(kernel.heuristic.start(dr.rcp(start.pdf_w)), mi.Float(0)),
+        reference=mi.Float(1),
+        eta=mi.Float(1),
+        edges=mi.UInt32(1),
+        infinite=mi.Bool(False),
+        seen=mi.Bool(False),
+        active=active,
+    )
+
+    def add(c, total):
+        if kernel.strategy_images:
+            _deposit_strategy(kernel, film, c, start.pixel, shared)
+        return total + c.weighted()
+
+    def visit(z, stream, state):
+        radiance, path, counters = state
+        if plan.hit:
+            radiance = add(connect.hit_emitter(kernel, z), radiance)
+        if plan.direct:
+            radiance = add(connect.next_event(kernel, z, stream, counters), radiance)
+        if plan.connections == "all":
+            total, counters = connect.connect_all(kernel, z, path, counters, add)
+            radiance += total
+        elif plan.connections == "one":
+            total, stream_, counters = connect.connect_one(kernel, z, path, stream, counters)
+            stream.rng = stream_.rng
+            radiance += total
+        return radiance, path, counters
+
+    state = (dr.zeros(mi.Spectrum), path, counters)
+    (radiance, path, counters), seen, traced, _ = random_walk(
+        kernel, kernel.camera_side, walk, stream, visit, state)
+    counters.camera += traced
+    rgb = kernel.to_rgb(radiance, shared.wavelengths)
+    finite = dr.all(dr.isfinite(rgb))
+    counters.non_finite += dr.select(active & ~finite, mi.UInt32(1), mi.UInt32(0))
+    opaque = seen
+    if not plan.hide_emitters and kernel.scene.environment() is not None:
+        opaque = mi.Bool(True)  # `path`: a visible environment covers the image
+    film.put_camera(
+        start.pixel, dr.select(finite, rgb, 0), dr.select(opaque, mi.Float(1), mi.Float(0)),
+        active if kernel.plan.served > 1 else mi.Bool(True))
+    return counters
+
+
+def _deposit_splat(kernel, film, c, position, shared, counters):
+    """Add a contribution with t = 1; without finite value it counts as zero."""
+    value = kernel.to_rgb(c.weighted() * shared.weight, shared.wavelengths)
+    finite = dr.all(dr.isfinite(value))
+    counters.non_finite += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
+    film.put_light(position, value, c.active & finite)
+    if kernel.strategy_images:
+        unweighted = kernel.to_rgb(c.value * shared.weight, shared.wavelengths)
+        film.put_strategy(position, value, unweighted, c.s, c.t, c.active & finite)
+
+
+def _deposit_strategy(kernel, film, c, position, shared):
+    weighted = kernel.to_rgb(c.weighted(), shared.wavelengths)
+    unweighted = kernel.to_rgb(c.value, shared.wavelengths)
+    finite = dr.all(dr.isfinite(weighted))
+    film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
+
+
+def _record(kernel, counters: Counters):
+    """Add the lanes' counters to the render's."""
+    for i, value in enumerate(vars(counters).values()):
+        dr.scatter_add(kernel.counts, mi.UInt64(value), mi.UInt32(i))
+
+
+def _opaque(kind):
+    return lambda value: dr.opaque(kind, value)
+
+
+def _log2(x: float) -> float:
+    from math import log2
+
+    return log2(x)

@@ -1,0 +1,220 @@
+"""Which LLVM library Dr.Jit shall load.
+
+Dr.Jit compiles kernels with whatever libLLVM it finds, and reads ``DRJIT_LIBLLVM_PATH`` once, when
+it is first imported. With Mitsuba 3.9, LLVM 14 is refused and 15 and 16 abort the process on
+machines with AVX-512, so a library is chosen here before ``drjit`` is imported:
+
+1. the one the user named in ``DRJIT_LIBLLVM_PATH``, as it is;
+2. the one the wheel ``karellen-llvm-core`` put into the Python environment;
+3. the newest on the system whose version is known to work.
+
+``choose`` is a function of a `Machine` record alone; only `prepare` touches the process.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+WHEEL = "karellen-llvm-core"
+KNOWN_GOOD = (19, 22, 23)
+"""Major versions that passed this package's tests."""
+
+_LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
+
+
+class LLVMNotFoundError(ImportError):
+    """No LLVM library that Dr.Jit can safely use; the message says what mends it."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The LLVM library in use. `version` is its major version, None where it is unknown."""
+
+    path: Path | None
+    origin: str
+    why: str
+    version: int | None
+
+    def __str__(self) -> str:
+        version = f"LLVM {self.version}" if self.version else "LLVM of unknown version"
+        return f"{version}, {self.path or 'loaded before'} ({self.why})"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """All that the choice depends on."""
+
+    env: Mapping[str, str]
+    wheel: tuple[Path, ...]
+    """Libraries of the installed wheel."""
+    system: tuple[Path, ...]
+    """Other LLVM libraries that exist."""
+    system_name: str = "Linux"
+    architecture: str = "x86_64"
+
+    @classmethod
+    def here(cls) -> Machine:
+        """The machine this process runs on."""
+        return cls(
+            env=os.environ,
+            wheel=tuple(wheel_libraries(Path(sys.prefix))),
+            system=tuple(system_libraries(library_directories(Path(sys.prefix)))),
+            system_name=platform.system(),
+            architecture=platform.machine(),
+        )
+
+
+def choose(machine: Machine) -> Choice:
+    """Return the library to load on `machine`, or raise `LLVMNotFoundError`."""
+    named = machine.env.get(VARIABLE)
+    if named:
+        path = Path(named)
+        if not path.is_file():
+            raise LLVMNotFoundError(
+                f"{VARIABLE}={named!r} names no file. Unset {VARIABLE} to let mitsuba_bdpt choose, "
+                "or set it to the path of a libLLVM shared library."
+            )
+        return Choice(path, "variable", f"named by {VARIABLE}", major_version(path))
+    for path in machine.wheel:
+        if major_version(path) in KNOWN_GOOD:
+            return Choice(path, "wheel", f"installed by {WHEEL}", major_version(path))
+    usable = [path for path in machine.system if major_version(path) in KNOWN_GOOD]
+    if usable:
+        # Ties keep the order of the search.
+        path = max(usable, key=lambda path: major_version(path) or 0)
+        return Choice(path, "system", "found on the system, known to work", major_version(path))
+    raise LLVMNotFoundError(
+        f"No usable LLVM library: {_describe(machine.wheel + machine.system)}. "
+        f"Versions known to work: {_versions()}. {remedy(machine)}"
+    )
+
+
+def check_loaded(version: tuple[int, ...]) -> Choice:
+    """Judge the LLVM `version` of a Dr.Jit that was imported before this package.
+
+    `version` is what ``drjit.detail.llvm_version()`` returns: negative numbers stand for none.
+    """
+    how = (
+        "Import mitsuba_bdpt before drjit and mitsuba, or set "
+        f"{VARIABLE} to a newer library before Python starts (set later it has no effect)."
+    )
+    if version[0] < 0:
+        raise LLVMNotFoundError(f"drjit was imported first and found no usable LLVM. {how}")
+    if version[0] < min(KNOWN_GOOD):
+        number = ".".join(map(str, version))
+        raise LLVMNotFoundError(
+            f"drjit was imported first and loaded LLVM {number}, which is too old: versions below "
+            f"{min(KNOWN_GOOD)} can abort the process. {how}"
+        )
+    return Choice(None, "drjit", "loaded by drjit, which was imported first", version[0])
+
+
+def prepare() -> Choice:
+    """Choose for this process and tell Dr.Jit; check instead where Dr.Jit is already imported."""
+    drjit = sys.modules.get("drjit")
+    if drjit is None:
+        choice = choose(Machine.here())
+        os.environ[VARIABLE] = str(choice.path)
+        return choice
+    mitsuba = sys.modules.get("mitsuba")
+    if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
+        return Choice(None, "none", "the current variant runs on CUDA", None)
+    return check_loaded(drjit.detail.llvm_version())
+
+
+def major_version(path: Path) -> int | None:
+    """The major version that the name of an LLVM library, or of its directory, tells."""
+    for name in dict.fromkeys((path, path.resolve())):
+        match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d{2,})|libLLVM\.(\d{2,})", name.name)
+        match = match or re.search(r"/llvm[@/-]?(\d{2,})", name.parent.as_posix())
+        if match:
+            return int(next(group for group in match.groups() if group))
+    return None
+
+
+def wheel_libraries(prefix: Path) -> list[Path]:
+    """The libLLVM files that the wheel lists as installed and that exist."""
+    try:
+        files = importlib.metadata.distribution(WHEEL).files or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
+    listed = [Path(str(file.locate())) for file in files if _LIBRARY.fullmatch(file.name)]
+    # An installer may leave its list of files out; the library lies in lib/ all the same.
+    return _existing([*listed, *sorted((prefix / "lib").glob("libLLVM.so.*"))])
+
+
+def system_libraries(directories: Iterable[Path]) -> list[Path]:
+    """The libLLVM files in `directories`, every file once."""
+    found = []
+    for directory in directories:
+        names = sorted(directory.glob("libLLVM*")) if directory.is_dir() else []
+        found += [path for path in names if _LIBRARY.fullmatch(path.name)]
+    return _existing(found)
+
+
+def library_directories(prefix: Path) -> list[Path]:
+    """The places where Linux distributions, conda and Homebrew keep libLLVM."""
+    fixed = [prefix / "lib"]
+    fixed += [Path(f"/usr/lib/{machine}-linux-gnu") for machine in ("x86_64", "aarch64")]
+    fixed += [Path("/usr/lib64"), Path("/usr/lib"), Path("/usr/local/lib")]
+    patterns = ["usr/lib/llvm*/lib", "usr/lib64/llvm*/lib*", "usr/lib/llvm/*/lib*"]
+    patterns += ["opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib"]
+    globbed = [path for pattern in patterns for path in sorted(Path("/").glob(pattern))]
+    return fixed + globbed + _linker_directories()
+
+
+def remedy(machine: Machine) -> str:
+    """The one command that brings a usable LLVM to `machine`."""
+    if machine.system_name == "Linux" and machine.architecture == "x86_64":
+        command = f"python -m pip install '{WHEEL}==23.1.*'"
+    elif machine.system_name == "Darwin":
+        command = "brew install llvm@19"
+    elif machine.system_name == "Linux":
+        command = "apt install libllvm19"
+    else:
+        return f"Install LLVM 19 and set {VARIABLE} to the path of its shared library."
+    return f"Mend it with: {command}"
+
+
+def _linker_directories() -> list[Path]:
+    """Directories where the dynamic linker knows an LLVM; none where ``ldconfig`` is missing."""
+    for program in ("ldconfig", "/sbin/ldconfig"):
+        try:
+            done = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10)
+        except (OSError, subprocess.TimeoutExpired):
+            continue
+        paths = re.findall(r"libLLVM\S* .*=> (\S+)", done.stdout)
+        return [Path(path).parent for path in dict.fromkeys(paths)]
+    return []
+
+
+def _existing(paths: Iterable[Path]) -> list[Path]:
+    """The files among `paths`, links to the same file once."""
+    return list(dict.fromkeys(path.resolve() for path in paths if path.is_file()))
+
+
+def _versions() -> str:
+    return ", ".join(map(str, KNOWN_GOOD))
+
+
+def _describe(paths: Iterable[Path]) -> str:
+    """Name the libraries that were found and why none of them is taken."""
+    texts = []
+    for path in paths:
+        version = major_version(path)
+        if version is None:
+            texts.append(f"{path} (version unknown; to try it, set {VARIABLE})")
+        elif version < min(KNOWN_GOOD):
+            texts.append(f"{path} (LLVM {version}, too old)")
+        else:
+            texts.append(f"{path} (LLVM {version}, untested; to try it, set {VARIABLE})")
+    return "found only " + "; ".join(texts) if texts else "none was found"

@@ -1,0 +1,138 @@
+"""Multiple importance sampling of all strategies (s, t) by recursive partial sums.
+
+Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland
+University, 2012, without merging; equation numbers below are the report's. Each subpath carries
+two floats, ``d_vcm`` and ``d_vc``, from which the weight of any strategy follows at once:
+
+* ``d_vcm`` stands for the *newest* alternative strategy: the one that makes the subpath's last
+  vertex from the other side. It has to be multiplied by the density with which that happens.
+* ``d_vc`` stands for all older alternatives. It has to be multiplied by that same density and by
+  the reverse density (solid angle) of the vertex before the last.
+
+What differs from the report: (1) each strategy class has a coefficient kappa with which it enters
+every weight, w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know yet which class its
+newest alternative will belong to, so the coefficient joins when a strategy is evaluated or when
+the term is folded into ``d_vc``, never when it is stored. (2) Sums are kept in linear units and
+combined by the heuristic (``a + b``, ``hypot``, ``max`` or a count); squares are never stored, so
+ratios of densities over 60 orders of magnitude stay finite. (3) The density of next-event
+estimation may depend on the vertex that is lit; see ``emitters``.
+
+Everything here is arithmetic on floats of any width; it knows no scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+
+HEURISTICS = ("balance", "power", "maximum", "uniform")
+
+# A strategy beyond this ratio has a weight below 1e-37, the smallest that float32 tells from zero;
+# without the bound, infinity times a following reverse density of zero would be NaN.
+SATURATION = 1e37
+
+
+@dataclass
+class Partial:
+    """Partial sums of one subpath; see the module's description."""
+
+    d_vcm: object
+    d_vc: object
+
+
+class Heuristic:
+    """How alternatives are combined: ``balance``, ``power`` (exponent 2), ``maximum``, ``uniform``.
+
+    Raises ``ValueError`` for any other name.
+    """
+
+    def __init__(self, name: str):
+        if name not in HEURISTICS:
+            raise ValueError(f"heuristic={name!r} is not known; use one of {', '.join(HEURISTICS)}")
+        self.name = name
+
+    def scale(self, x, factor):
+        """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
+        if self.name == "uniform":  # counts strategies: only whether a density is zero matters
+            return dr.select(factor > 0, x, 0)
+        return dr.minimum(x * factor, SATURATION)
+
+    def combine(self, a, b):
+        """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
+        if self.name == "power":
+            total = dr.hypot(a, b)
+        elif self.name == "maximum":
+            total = dr.maximum(a, b)
+        else:
+            total = a + b
+        return dr.minimum(total, SATURATION)
+
+    def start(self, inverse_density):
+        """Partial sum of one strategy whose ratio is ``inverse_density`` so far."""
+        if self.name == "uniform":
+            return dr.select(inverse_density > 0, 1.0, 0.0)
+        return dr.minimum(inverse_density, SATURATION)
+
+    def weight(self, coefficient, light_side, camera_side):
+        """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
+
+        ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
+        alternatives with fewer and with more light vertices (eqs. 37 and 38).
+        """
+        others = self.combine(light_side, camera_side)
+        if self.name == "maximum":
+            return dr.select(coefficient >= others, 1.0, 0.0)
+        if self.name == "uniform":
+            return dr.rcp(1 + others)
+        ratio = others / coefficient
+        return dr.rcp(1 + (dr.square(ratio) if self.name == "power" else ratio))
+
+
+def arrive(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
+    """Convert to the area measure at a new vertex (eqs. 31-34).
+
+    ``dist2`` squared length of the edge (1 where the edge keeps another measure: the first edge
+    from an emitter at infinity), ``cos`` absolute geometric cosine at the new vertex.
+    """
+    return Partial(
+        d_vcm=heuristic.scale(partial.d_vcm, dist2 / cos),
+        d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
+    )
+
+
+def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partial:
+    """Fold the newest alternative and take a sampled direction (eqs. 35, 36, 53, 54).
+
+    ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
+    ``pdf_fwd`` and ``pdf_rev`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``.
+    """
+    older = heuristic.combine(
+        heuristic.scale(partial.d_vcm, coefficient),
+        heuristic.scale(partial.d_vc, step.pdf_rev),
+    )
+    # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its forward and
+    # reverse probabilities cancel.
+    kept = dr.select(
+        step.delta,
+        heuristic.scale(partial.d_vc, step.cos_out),
+        heuristic.scale(older, step.cos_out / step.pdf_fwd),
+    )
+    return Partial(
+        d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd))),
+        d_vc=kept,
+    )
+
+
+def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev, density):
+    """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40-47).
+
+    ``coefficient`` of the newest alternative's class; ``pdf_rev`` solid-angle density of sampling
+    the vertex before the last from the last; ``density`` of making the last vertex from the other
+    side, in the measure in which ``d_vcm`` is stored (area, or solid angle at infinity).
+    """
+    total = heuristic.combine(
+        heuristic.scale(partial.d_vcm, coefficient),
+        heuristic.scale(partial.d_vc, pdf_rev),
+    )
+    return heuristic.scale(total, density)

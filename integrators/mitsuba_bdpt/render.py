@@ -1,0 +1,277 @@
+"""``python -m mitsuba_bdpt render``: from a scene file to an EXR and a PNG."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import re
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+
+import mitsuba_bdpt
+
+KEPT = ("max_depth", "rr_depth", "hide_emitters")
+"""What an integrator that replaces the scene's takes over: the same paths are to be found."""
+
+UNLIMITED_SPP = 1 << 16
+"""Samples per pixel where only the time limits them."""
+
+MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
+INTERRUPTED = 130
+"""The exit status of a process that SIGINT has ended."""
+
+
+@dataclass
+class Outcome:
+    """What a finished or interrupted rendering leaves besides the film."""
+
+    seconds: float
+    spp: int
+    interrupted: bool = False
+    statistics: dict = field(default_factory=dict)
+
+
+def run(options: Namespace) -> int:
+    """Render as the command line `options` say and return the exit status."""
+    try:
+        output = options.output or Path("renders") / f"{options.scene.stem}.exr"
+        prepare_output(output)
+        scene, integrator = load(options)
+        sensor = choose_sensor(scene, options.sensor)
+        spp = options.spp or (UNLIMITED_SPP if options.time else sensor.sampler().sample_count())
+        outcome = render(scene, integrator, options, spp)
+        if outcome.interrupted and not outcome.spp:
+            print("interrupted before the first pass was over; no image written", file=sys.stderr)
+            return INTERRUPTED
+        attributes = {"bdptSettings": settings(options, spp), "bdptStatistics": report(outcome)}
+        write_images(sensor.film(), output, attributes, options.exposure)
+    except KeyboardInterrupt:
+        print("interrupted; no image written", file=sys.stderr)
+        return INTERRUPTED
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(summary(output, outcome, sensor.film().crop_size()))
+    return INTERRUPTED if outcome.interrupted else 0
+
+
+def prepare_output(output: Path) -> None:
+    """Refuse an `output` that cannot be written in the end; create its directory."""
+    if output.suffix.lower() != ".exr":
+        raise ValueError(
+            f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."
+        )
+    for path in (output, output.with_suffix(".png")):
+        if not path.exists():
+            continue
+        kind = path.suffix.lower()
+        with path.open("rb") as file:
+            start = file.read(4)
+        if start and start != MAGIC[kind]:
+            raise ValueError(
+                f"output={str(output)!r} would overwrite {str(path)!r}, which exists and is not "
+                f"{kind[1:].upper()}. Move it away, or name another output."
+            )
+    output.parent.mkdir(parents=True, exist_ok=True)
+
+
+def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+    """Load the scene and the integrator to render it with."""
+    if options.variant not in mi.variants():
+        known = ", ".join(mi.variants())
+        raise ValueError(f"variant={options.variant!r} is not one of Mitsuba's: {known}.")
+    if not options.scene.is_file():
+        raise ValueError(f"scene={str(options.scene)!r} is not a file.")
+    mi.set_variant(options.variant)
+    mi.file_resolver().prepend(str(options.scene.resolve().parent))
+    overrides = dict(options.properties)
+    if options.time:
+        overrides["timeout"] = options.time
+
+    config = mi.parser.ParserConfig(options.variant)
+    state = mi.parser.parse_file(config, str(options.scene), **dict(options.defines))
+    # Nodes are in the order of the file: an integrator comes before those nested in it.
+    kind = mi.ObjectType.Integrator
+    node = next((node for node in state.nodes if node.type == kind), None)
+    if node is not None:
+        node.props = integrator_properties(node.props, options.integrator, overrides)
+    mi.parser.transform_all(config, state)
+    scene = mi.parser.instantiate(config, state)
+    if node is not None:
+        return scene, scene.integrator()
+    return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+
+
+def integrator_properties(
+    given: mi.Properties, kind: str | None, overrides: Mapping[str, bool | int | float | str]
+) -> mi.Properties:
+    """The `given` properties with `overrides`, for an integrator of another `kind` if it is set."""
+    if kind is None or kind == given.plugin_name():
+        properties = mi.Properties(given)
+    else:
+        properties = mi.Properties(kind)
+        properties.set_id(given.id())
+        for key in KEPT:
+            if key in given:
+                properties[key] = given[key]
+                # Not every integrator has all of them; that is no mistake of the user's.
+                properties.mark_queried(key)
+    for key, value in overrides.items():
+        properties[key] = value
+    return properties
+
+
+def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
+    """The sensor with this `index`."""
+    sensors = scene.sensors()
+    if not sensors:
+        raise ValueError("The scene has no sensor; add one to the scene file.")
+    if index >= len(sensors):
+        raise ValueError(f"sensor={index} is not in the scene; the last one is {len(sensors) - 1}.")
+    return sensors[index]
+
+
+def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
+    """Render into the sensor's film, drawing progress on a terminal."""
+    started, interrupted = time.perf_counter(), False
+    with progress_bar() as bar:
+        draw = show_pass(bar, options.time)
+        if hasattr(integrator, "on_pass"):
+            integrator.on_pass = draw
+        try:
+            integrator.render(
+                scene, options.sensor, options.seed, spp, develop=False, evaluate=True
+            )
+            dr.sync_thread()
+        except KeyboardInterrupt:
+            interrupted = True
+    statistics = getattr(integrator, "statistics", None) or {}
+    if "passes" in statistics:
+        spp = int(sum(statistics["passes"]))
+    elif interrupted:
+        # Mitsuba's own integrators leave nothing behind.
+        spp = 0
+    return Outcome(time.perf_counter() - started, spp, interrupted, statistics)
+
+
+def progress_bar() -> Progress:
+    """A bar on standard error, silent where that is not a terminal."""
+    console = Console(stderr=True)
+    columns = (SpinnerColumn(), BarColumn(), TextColumn("{task.description}"))
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def show_pass(bar: Progress, limit: float | None) -> Callable[[object], None]:
+    """Start a task on `bar`; the result is to be called with a report after every pass."""
+    task = bar.add_task("rendering", total=None)
+
+    def draw(report) -> None:
+        done = report.spp_done / report.spp_total
+        left = report.seconds * (1 / max(done, 1e-9) - 1)
+        if limit:
+            left = max(0.0, min(left, limit - report.seconds))
+            done = max(done, min(1.0, report.seconds / limit))
+        rate = readable(report.rays / max(report.seconds, 1e-9))
+        total = "" if limit and report.spp_total == UNLIMITED_SPP else f"/{report.spp_total}"
+        text = f"{report.spp_done}{total} spp, {rate} rays/s, {left:.0f} s left"
+        bar.update(task, total=1.0, completed=done, description=text)
+
+    return draw
+
+
+def settings(options: Namespace, spp: int) -> str:
+    """The command line as JSON, for the header of the image."""
+    values = {key: str(v) if isinstance(v, Path) else v for key, v in vars(options).items()}
+    values |= {"spp": spp, "defines": dict(options.defines)}
+    values["properties"] = dict(options.properties)
+    return json.dumps(values)
+
+
+def report(outcome: Outcome) -> str:
+    """What was rendered, and with what, as JSON for the header of the image."""
+    own = {
+        "wall_seconds": round(outcome.seconds, 3),
+        "spp": outcome.spp,
+        "interrupted": outcome.interrupted,
+        "versions": versions(),
+    }
+    # A value that JSON does not know must not cost a finished image.
+    return json.dumps(own | outcome.statistics, default=str)
+
+
+def versions() -> dict[str, str]:
+    """Versions of what has made the image."""
+    found = {"mitsuba-bdpt": mitsuba_bdpt.__version__}
+    found |= {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")}
+    if "llvm" in mi.variant():
+        found["LLVM"] = ".".join(map(str, dr.detail.llvm_version()))
+    return found
+
+
+def write_images(
+    film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float
+) -> None:
+    """Write the film as an EXR with these header `attributes`, and as a PNG beside it."""
+    bitmap = film.bitmap()
+    component = re.search(r"component_format = (\w+)", str(film))
+    kinds = {"float16": mi.Struct.Type.Float16, "uint32": mi.Struct.Type.UInt32}
+    kind = kinds.get(component[1] if component else "", mi.Struct.Type.Float32)
+    image = bitmap.convert(bitmap.pixel_format(), kind, srgb_gamma=False)
+    for key, value in attributes.items():
+        image.metadata()[key] = value
+    write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
+    write_whole(developed(bitmap, exposure), output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
+
+
+def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
+    """The picture for a screen: exposure, clipping to [0, 1] and the sRGB curve."""
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        bitmap = next(part for name, part in bitmap.split() if name == "<root>")
+    rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    bright = mi.Bitmap(mi.TensorXf(rgb) * 2.0**exposure, mi.Bitmap.PixelFormat.RGB)
+    return bright.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+
+
+def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
+    """Write to a temporary name first: whoever looks at `path` never sees half a file."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        bitmap.write(str(temporary), file_format)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def summary(output: Path, outcome: Outcome, size: Iterable[int]) -> str:
+    """The closing line."""
+    width, height = size
+    parts = [
+        f"{output}: {outcome.seconds:.1f} s",
+        f"{outcome.spp} spp ({readable(outcome.spp * width * height)} samples)",
+    ]
+    rays = outcome.statistics.get("rays")
+    if rays:
+        kinds = ", ".join(f"{kind} {readable(count)}" for kind, count in rays.items())
+        parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
+    parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
+    if outcome.interrupted:
+        parts.append("interrupted")
+    return "; ".join(parts)
+
+
+def readable(number: float) -> str:
+    """A number to three digits with a unit prefix."""
+    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if number >= limit:
+            return f"{number / limit:.3g}{unit}"
+    return f"{number:.3g}"

@@ -1,0 +1,160 @@
+"""Owen-scrambled two-dimensional Sobol' points for use inside a symbolic Dr.Jit kernel.
+
+Everything here is a pure function of 32-bit unsigned arrays: no tables, no memory access, no
+state. A high-dimensional sample is made by *padding*: one :func:`scrambled_pair` (or
+:func:`scrambled_single`) per one or two dimensions, all with the same ``index`` and each with its
+own ``seed``, for which :func:`hash_u32` is the tool.
+
+Why not what Mitsuba ships: ``mi.radical_inverse_2`` and ``mi.sobol_2`` do run in a kernel, but
+their ``scramble`` argument is only xor-ed onto the digits (a random digital shift). That keeps
+the net, but gives neither the O(n^-1.5 log n) root mean square error of Owen's scrambling, nor
+the shuffled order that padding needs. ``mi.sample_tea_32`` would do as a hash of seeds; at its
+default four rounds it costs several times what :func:`hash_u32` does.
+
+Sources
+-------
+* Owen, "Randomly Permuted (t,m,s)-Nets and (t,s)-Sequences", 1995: nested uniform scrambling.
+* Laine and Karras, "Stratified Sampling for Stochastic Transparency", EGSR 2011: a hash in which
+  every bit depends on the lower bits only is a nested scramble of the reversed digits.
+* Burley, "Practical Hash-based Owen Scrambling", JCGT 9(4), 2020: shuffling the index by the same
+  hash, and padding.
+* Vegdahl, "Building a Better LK Hash", 2021,
+  https://psychopath.io/post/2021_01_30_building_a_better_lk_hash: the hash and its constants.
+* Ahmed, "An Implementation Algorithm of 2D Sobol Sequence Fast, Elegant, and Compact", EGSR 2024:
+  the second dimension in log2(32) = 5 steps.
+* Wellons, https://github.com/skeeto/hash-prospector: the integer mix of :func:`hash_u32`.
+
+Digits
+------
+Binary digits are kept least significant bit first: bit k of a *digit word* is the coefficient of
+2^-(k+1). In that form the digit word of the van der Corput point is the index itself, and the
+hash applies as it stands, so that one bit reversal per stage is enough (four in a pair, of which
+that of the index is common to all pairs of one index).
+
+The Dr.Jit types are looked up when a function runs, hence under the variant then set; any JIT
+variant will do (the scalar ones have no arrays and are not supported).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+
+if TYPE_CHECKING:
+    UInt32Like = mi.UInt32 | int
+
+__all__ = ["hash_u32", "scrambled_pair", "scrambled_single", "split_index"]
+
+
+def hash_u32(x: UInt32Like, y: UInt32Like) -> mi.UInt32:
+    """Hash of two 32-bit words, to make a seed out of, say, a pixel's seed and a dimension.
+
+    ``x`` and ``y`` are arrays of equal width, or of width 1, or Python integers; the result has
+    the broadcast width and covers all of [0, 2^32). For a fixed ``x`` it is a bijection of ``y``
+    (different dimensions never share a seed) and for a fixed ``y`` one of ``x``. Not symmetric.
+    """
+    return _mix(_mix(mi.UInt32(x) + 0x9E3779B9) ^ (mi.UInt32(y) * 0x9E3779B1))
+
+
+def scrambled_pair(index: UInt32Like, seed: UInt32Like) -> tuple[mi.Float, mi.Float]:
+    """Point ``index`` of the shuffled, Owen-scrambled (0,2)-sequence in base 2 named by ``seed``.
+
+    ``index`` and ``seed`` are arrays of equal width, or of width 1, or Python integers, each in
+    [0, 2^32) (see :func:`split_index` for longer sequences). Any seeds will do, consecutive ones
+    too: they are hashed here. Returns two arrays of the broadcast width, multiples of 2^-24 in
+    [0, 1), at most 1 - 2^-24, which float32 holds exactly.
+
+    For a given seed the points of every aligned block of 2^m indices, m <= 24, form a (0,m,2)-net
+    (finer intervals than 2^-24 are cut off), whatever the seed. Over the seeds each point is
+    uniform in the square, and the points of two seeds at the same index are independent, as far
+    as hashes go. Over the indices of one pair of seeds it is otherwise: neighbours in index are
+    opposite in the first digit under every seed. A mean over products of functions of two seeds
+    thus has more variance than with independent draws: 1.58 times for the product of one
+    coordinate of each, at most 2 for any functions of one coordinate of each, and 4 for the
+    product of the first digits of all four. Functions of one seed converge an order faster.
+    """
+    shuffle_seed, seed_x, seed_y = _seeds(seed)
+    digits = _shuffle(index, shuffle_seed)
+    return _unit(_scramble(digits, seed_x)), _unit(_scramble(_second(digits), seed_y))
+
+
+def scrambled_single(index: UInt32Like, seed: UInt32Like) -> mi.Float:
+    """First coordinate of :func:`scrambled_pair`, without the cost of the second.
+
+    Arguments, range and width as there. Every aligned block of 2^m indices, m <= 24, has exactly
+    one value in each interval of length 2^-m.
+    """
+    shuffle_seed, seed_x, _ = _seeds(seed)
+    return _unit(_scramble(_shuffle(index, shuffle_seed), seed_x))
+
+
+def split_index(index64: mi.UInt64 | int, seed: UInt32Like) -> tuple[mi.UInt32, mi.UInt32]:
+    """Split a 64-bit index into a 32-bit ``(index, seed)`` for the functions above.
+
+    The low word is the index and the high word is folded into the seed: each run of 2^32 points
+    is a sequence of its own, independent of the others. While the high word is 0 the seed is
+    returned as it came, so that short sequences do not depend on which form of index was used.
+    """
+    index64 = mi.UInt64(index64)
+    high = mi.UInt32(index64 >> 32)
+    # _mix(0) == 0, and _mix is a bijection: no two high words share a seed.
+    return mi.UInt32(index64), mi.UInt32(seed) ^ _mix(high)
+
+
+def _mix(x: mi.UInt32) -> mi.UInt32:
+    """Bijective 32-bit mix with 0 -> 0 (hash-prospector, two multiplications, bias 0.107)."""
+    x = (x ^ (x >> 16)) * 0x21F0AAAD
+    x = (x ^ (x >> 15)) * 0xD35A2D97
+    return x ^ (x >> 15)
+
+
+def _seeds(seed: UInt32Like) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
+    """Seeds of the three permutation trees of a pair: shuffle, first and second coordinate.
+
+    The first is a full mix of ``seed``, a bijection; one round more makes each of the others.
+    The low bits decide the leading digits: with shifts of 11 and 22 the low ten bits of the
+    three are exactly independent and uniform over a uniform ``seed``.
+    """
+    first = _mix(mi.UInt32(seed) + 0x9E3779B9)
+    return first, (first ^ (first >> 11)) * 0x2C1B3C6D, (first ^ (first >> 22)) * 0x297A2D39
+
+
+def _scramble(digits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+    """Owen-scramble a digit word: bit k changes as a hash of bits 0 to k - 1 and ``seed`` says.
+
+    Vegdahl's form of the Laine-Karras hash. Sums, products and ``x ^= x * even`` all carry from
+    lower bits to higher ones only, and each is a bijection.
+    """
+    digits = digits ^ (digits * 0x3D20ADEA)
+    digits = (digits + seed) * ((seed >> 16) | 1)
+    digits = digits ^ (digits * 0x05526C56)
+    return digits ^ (digits * 0x53A22864)
+
+
+def _shuffle(index: UInt32Like, seed: mi.UInt32) -> mi.UInt32:
+    """Nested uniform shuffle of the index: aligned power-of-two blocks go to such blocks."""
+    return dr.brev(_scramble(dr.brev(mi.UInt32(index)), seed))
+
+
+def _second(digits: mi.UInt32) -> mi.UInt32:
+    """Digit word of the second Sobol' coordinate from that of the first (= the index).
+
+    Digit k is the sum mod 2 of C(j, k) times digit j of the index, and C(j, k) is odd exactly
+    when the bits of k are among those of j (Lucas). The sum over supersets factors into one step
+    per bit of the positions, which is Ahmed's doubling of the Pascal matrix.
+    """
+    digits = digits ^ (digits >> 16)
+    digits = digits ^ ((digits >> 8) & 0x00FF00FF)
+    digits = digits ^ ((digits >> 4) & 0x0F0F0F0F)
+    digits = digits ^ ((digits >> 2) & 0x33333333)
+    return digits ^ ((digits >> 1) & 0x55555555)
+
+
+def _unit(digits: mi.UInt32) -> mi.Float:
+    """Digit word to a float in [0, 1), of the first 24 digits.
+
+    The detour by a signed integer saves the longer conversion from unsigned; 24 bits fit either.
+    """
+    return mi.Float(mi.Int32(dr.brev(digits) >> 8)) * (2.0**-24)

@@ -1,0 +1,175 @@
+"""One random walk for both subpaths; which side it serves is data.
+
+A walk knows no strategy: at each vertex it calls ``visit``, which may build paths from it.
+Vertices are numbered as in the field: y_0 / z_0 is the endpoint, ``edges`` the index of the vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from . import bsdf, mis, rays
+from .points import Purpose
+
+
+@dataclass
+class Walk:
+    """State of a subpath between two vertices.
+
+    ``pi``, ``ray`` the next hit and the ray that finds it; ``previous`` position of the last vertex
+    (for a camera subpath the pinhole or lens point, not the near plane where ``ray`` starts);
+    ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
+    measure before that edge; ``reference`` the throughput that roulette compares with; ``eta``
+    product of relative indices of refraction; ``edges`` number of edges up to the next vertex;
+    ``infinite``: the first edge comes from infinity; ``seen``: an event other than null happened.
+    """
+
+    pi: object
+    ray: object
+    previous: object
+    throughput: object
+    partial: mis.Partial
+    reference: object
+    eta: object
+    edges: object
+    infinite: object
+    seen: object
+    active: object
+
+
+@dataclass
+class Vertex:
+    """A vertex that a walk has reached; ``partial`` is in the area measure (camera subpaths that
+    left the scene: solid angle). ``anchor`` starts rays; ``hit`` is false in the surroundings."""
+
+    si: object
+    bsdf: object
+    anchor: rays.Anchor
+    throughput: object
+    partial: mis.Partial
+    edges: object
+    previous: object
+    seen: object
+    hit: object
+    active: object
+
+
+@dataclass(frozen=True)
+class Side:
+    """What distinguishes the two kinds of subpath.
+
+    ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
+    alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera
+    side). ``complete``: called with the first vertex of a light subpath, returns the density of
+    next-event estimation that completes ``d_vcm`` there.
+    """
+
+    name: str
+    adjoint: bool
+    last_edge: object
+    coefficient: object
+    complete: object = None
+
+
+def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
+    """Follow ``walk`` to its end; returns ``(state, seen, rays, stream)``.
+
+    ``visit(vertex, stream, state)`` returns the new state; ``rays`` counts closest-hit rays per
+    lane; ``seen`` says whether an event other than null happened.
+    """
+
+    def body(walk, stream, state, traced):
+        vertex = _arrive(kernel, side, walk)
+        state = visit(vertex, stream, state)
+        walk = _leave(kernel, side, walk, vertex, stream)
+        traced += dr.select(walk.active, mi.UInt32(1), mi.UInt32(0))
+        return walk, stream, state, traced
+
+    traced = dr.select(walk.active, mi.UInt32(1), mi.UInt32(0))
+    walk, stream, state, traced = dr.while_loop(
+        (walk, stream, state, traced),
+        lambda walk, stream, state, traced: walk.active,
+        body,
+        label=f"{side.name} subpath",
+    )
+    return state, walk.seen, traced, stream
+
+
+def newest_coefficient(kernel, side: Side, edges):
+    """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1 (s = 0 differs,
+    see `connect.hit_emitter`)."""
+    return dr.select(edges == 1, side.coefficient, kernel.coefficient_inner)
+
+
+def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
+    """The vertex at the end of the walk's edge; densities go over to the area measure."""
+    h = kernel.heuristic
+    si = walk.pi.compute_surface_interaction(walk.ray, mi.RayFlags.All, walk.active)
+    hit = walk.active & si.is_valid()
+    cos = dr.abs(dr.dot(si.n, walk.ray.d))
+    dist2 = dr.squared_norm(si.p - walk.previous)
+    partial = walk.partial
+    if side.complete is not None:
+        first = hit & (walk.edges == 1)
+        density = dr.select(first, side.complete(si, first), 1)
+        partial = mis.Partial(h.scale(partial.d_vcm, density), partial.d_vc)
+        dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
+    # A hit at exactly zero cosine has probability zero; its densities would be infinite.
+    hit &= cos > 0
+    in_area = mis.arrive(h, partial, dist2, cos)
+    partial = dr.select(hit, in_area, partial)
+    return Vertex(
+        si=si,
+        bsdf=si.bsdf(),
+        anchor=rays.surface_anchor(si, walk.ray),
+        throughput=walk.throughput,
+        partial=partial,
+        edges=walk.edges,
+        previous=walk.previous,
+        seen=walk.seen,
+        hit=hit,
+        active=walk.active,
+    )
+
+
+def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
+    """Sample the next edge and trace it."""
+    points, h = kernel.points, kernel.heuristic
+    si = vertex.si
+    active = vertex.hit & (walk.edges < side.last_edge)
+    u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
+    u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
+    take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
+    step = take(vertex.bsdf, si, u1, u2, active, kernel.full_pdf)
+    coefficient = newest_coefficient(kernel, side, walk.edges)
+    partial = mis.scatter(h, vertex.partial, coefficient, step)
+
+    throughput = walk.throughput * step.weight
+    eta = walk.eta * step.eta
+    brightest = dr.max(mi.unpolarized_spectrum(throughput))
+    active &= brightest > 0
+    # Roulette as in `path`; the weights ignore it (it is not part of any density).
+    survive = dr.minimum(brightest / walk.reference * (1 if side.adjoint else dr.square(eta)), 0.95)
+    u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.edges)
+    playing = walk.edges >= kernel.rr_depth
+    throughput = dr.select(playing, throughput / survive, throughput)
+    active &= ~playing | (u < survive)
+
+    ray = rays.spawn(vertex.anchor, si.to_world(step.wo), walk.ray)
+    ray = dr.select(active, ray, mi.Ray3f(walk.ray))
+    return Walk(
+        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
+        ray=ray,
+        previous=mi.Point3f(si.p),
+        throughput=throughput,
+        partial=partial,
+        reference=walk.reference,
+        eta=eta,
+        edges=walk.edges + 1,
+        infinite=mi.Bool(False),
+        seen=walk.seen | (active & ~step.null),
+        active=active,
+    )

@@ -1,0 +1,173 @@
+"""Makes the meshes of the scenes: `python scripts/make_meshes.py [folder]`.
+
+Every mesh is computed from the few numbers below and written as a small binary PLY. Coordinates are
+rounded to 1e-5, so that the files come out the same, byte for byte, on every machine.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+FOLDER = Path(__file__).resolve().parents[1] / "scenes" / "meshes"
+DECIMALS = 5
+
+# The egg of veach_bidir: (height, radius), measured on B. Bitterli's re-model (CC0).
+EGG_BOTTOM, EGG_TOP = 1.907, 3.417
+EGG_AXIS = (-2.377, -0.788)  # x, z
+EGG = np.array(
+    [
+        (1.91, 0.108), (1.94, 0.239), (1.99, 0.342), (2.07, 0.420), (2.16, 0.474), (2.27, 0.509),
+        (2.39, 0.526), (2.51, 0.527), (2.63, 0.516), (2.75, 0.495), (2.86, 0.466), (2.97, 0.432),
+        (3.06, 0.393), (3.14, 0.350), (3.21, 0.305), (3.28, 0.257), (3.33, 0.209), (3.37, 0.160),
+        (3.40, 0.095),
+    ]
+)  # fmt: skip
+
+LAMP_AXIS = (-2.4816, 2.5894)  # x, z of the floor lamp of veach_bidir
+SPOT_AXIS = np.array((0.070, -0.432, 0.899))  # the way its wall spot points
+SPOT_CENTRE = np.array((-2.659, 4.911, -3.368))
+SPOT_RADIUS, SPOT_LENGTH = 0.298, 0.98
+
+# The cut-glass lamp of lamp_behind_glass: (height, radius) of its edges around the lamp's middle.
+CUT_GLASS = np.array(
+    [(-0.28, 0.0), (-0.21, 0.12), (-0.09, 0.205), (0.04, 0.215), (0.15, 0.15), (0.21, 0.08), (0.225, 0.0)]
+)
+CUT_GLASS_SIDES = 12
+
+
+def egg_profile(rows):
+    """Height, radius and outward normal (in the plane of the profile) of the egg at `rows` + 1 angles.
+
+    A cosine series for the distance from the middle, as a function of the angle from the upper pole,
+    is smooth at both poles; eight terms meet the measured radii to within 4 mm (13 mm at the foot).
+    """
+    middle = 0.5 * (EGG_BOTTOM + EGG_TOP)
+    points = np.vstack([EGG, [(EGG_BOTTOM, 0.0), (EGG_TOP, 0.0)]])
+    height, radius = points[:, 0] - middle, points[:, 1]
+    order = np.arange(8)
+    terms = np.cos(order * np.arctan2(radius, height)[:, None])
+    series = np.linalg.lstsq(terms, np.hypot(radius, height), rcond=None)[0]
+
+    angle = np.linspace(0.0, np.pi, rows + 1)
+    distance = np.cos(order * angle[:, None]) @ series
+    slope = -(order * np.sin(order * angle[:, None])) @ series
+    sin, cos = np.sin(angle), np.cos(angle)
+    normal_r, normal_y = distance * sin - slope * cos, distance * cos + slope * sin
+    length = np.hypot(normal_r, normal_y)
+    radius = distance * sin
+    radius[[0, -1]] = 0.0
+    return middle + distance * cos, radius, normal_r / length, normal_y / length
+
+
+def revolve(height, radius, normal_r, normal_y, sides):
+    """Surface around the y axis. The profile runs from top to bottom for outward faces.
+
+    Returns vertices, normals (both (n, 3)) and triangles; a profile end on the axis becomes a fan.
+    """
+    turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    ring = np.stack([np.sin(turn), np.zeros(sides), np.cos(turn)], axis=1)
+    up = np.array((0.0, 1.0, 0.0))
+    vertices, normals, first = [], [], []
+    for y, r, n_r, n_y in zip(height, radius, normal_r, normal_y, strict=True):
+        first.append(len(vertices))
+        around = ring[:1] if r == 0.0 and abs(n_r) < 1e-9 else ring  # a pole needs one vertex only
+        vertices.extend(r * around + y * up)
+        normals.extend(n_r * around + n_y * up)
+    first.append(len(vertices))
+
+    faces = []
+    for row in range(len(height) - 1):
+        upper, lower = first[row], first[row + 1]
+        upper_step = 1 if lower - upper > 1 else 0
+        lower_step = 1 if first[row + 2] - lower > 1 else 0
+        for i in range(sides):
+            j = (i + 1) % sides
+            a, b = upper + upper_step * i, upper + upper_step * j
+            c, d = lower + lower_step * i, lower + lower_step * j
+            if lower_step and radius[row + 1] > 0.0:
+                faces.append((a, c, d))
+            if upper_step and radius[row] > 0.0:
+                faces.append((a, d, b))
+    return np.array(vertices), np.array(normals), np.array(faces, dtype=np.int32)
+
+
+def egg():
+    vertices, normals, faces = revolve(*egg_profile(rows=40), sides=64)
+    return vertices + (EGG_AXIS[0], 0.0, EGG_AXIS[1]), normals, faces
+
+
+def lamp_base():
+    """Spherical cap, radius .995 at y = 0, height .30."""
+    radius, height = 0.995, 0.30
+    sphere = (radius**2 + height**2) / (2.0 * height)
+    angle = np.linspace(0.0, np.arcsin(radius / sphere), 9)
+    sin, cos = np.sin(angle), np.cos(angle)
+    y = sphere * cos - (sphere - height)
+    vertices, normals, faces = revolve(y, sphere * sin, sin, cos, sides=48)
+    return vertices + (LAMP_AXIS[0], 0.0, LAMP_AXIS[1]), normals, faces
+
+
+def lamp_head():
+    """Cone, apex at y = 5.736, rim of radius 1.172 at y = 6.439; normals point outward, downward."""
+    bottom, top, rim = 5.736, 6.439, 1.172
+    part = np.linspace(1.0, 0.0, 4)
+    slant = np.hypot(top - bottom, rim)
+    normal_r, normal_y = np.full(4, (top - bottom) / slant), np.full(4, -rim / slant)
+    vertices, normals, faces = revolve(bottom + part * (top - bottom), part * rim, normal_r, normal_y, sides=64)
+    return vertices + (LAMP_AXIS[0], 0.0, LAMP_AXIS[1]), normals, faces
+
+
+def spot_cap():
+    """Half sphere that closes the rear of the wall spot's tube."""
+    angle = np.linspace(0.0, 0.5 * np.pi, 9)
+    sin, cos = np.sin(angle), np.cos(angle)
+    vertices, normals, faces = revolve(SPOT_RADIUS * cos, SPOT_RADIUS * sin, sin, cos, sides=32)
+    back = -SPOT_AXIS / np.linalg.norm(SPOT_AXIS)  # where the half sphere's own y axis goes
+    side = np.cross(back, (1.0, 0.0, 0.0))
+    side /= np.linalg.norm(side)
+    to_world = np.stack([np.cross(back, side), back, side], axis=1)
+    rear = SPOT_CENTRE + 0.5 * SPOT_LENGTH * back
+    return vertices @ to_world.T + rear, normals @ to_world.T, faces
+
+
+def cut_glass():
+    """Body with flat facets: no normals, so that refraction follows the geometry exactly."""
+    height, radius = CUT_GLASS[::-1].T
+    nothing = np.zeros(len(height))
+    vertices, _, faces = revolve(height, radius, nothing, nothing, sides=CUT_GLASS_SIDES)
+    return vertices, None, faces
+
+
+def write_ply(path, vertices, normals, faces):
+    """Binary little-endian PLY with float32 vertices and, unless None, normals."""
+    names = ["x", "y", "z"] + ([] if normals is None else ["nx", "ny", "nz"])
+    data = vertices if normals is None else np.hstack([vertices, normals])
+    data = np.round(data, DECIMALS) + 0.0  # + 0.0 turns -0.0 into 0.0
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(data)}"]
+    header += [f"property float {name}" for name in names]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    rows["count"], rows["index"] = 3, faces
+    path.write_bytes("\n".join([*header, ""]).encode("ascii") + data.astype("<f4").tobytes() + rows.tobytes())
+
+
+MESHES = {
+    "veach_bidir_egg": egg,
+    "veach_bidir_lamp_base": lamp_base,
+    "veach_bidir_lamp_head": lamp_head,
+    "veach_bidir_spot_cap": spot_cap,
+    "cut_glass": cut_glass,
+}
+
+
+def make_all(folder=FOLDER):
+    """Writes every mesh of MESHES into `folder`."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, make in MESHES.items():
+        write_ply(folder / f"{name}.ply", *make())
+
+
+if __name__ == "__main__":
+    make_all(*sys.argv[1:2])

@@ -1,0 +1,96 @@
+"""Tests of ``python -m mitsuba_bdpt doctor``: it must say what is wrong, and never die of it."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from mitsuba_bdpt import doctor, llvm
+
+
+def command(*arguments, **env):
+    """Run the package's own command with `arguments` in a new process."""
+    return subprocess.run(
+        [sys.executable, "-m", "mitsuba_bdpt", *arguments],
+        capture_output=True,
+        text=True,
+        env=os.environ | env,
+    )
+
+
+def child(returncode, stdout="", stderr=""):
+    """A stand-in for ``subprocess.run`` whose process ends like this."""
+    return lambda *args, **kwargs: subprocess.CompletedProcess(args, returncode, stdout, stderr)
+
+
+def test_healthy_installation():
+    """The real command: renders with bdpt, names the LLVM and its origin, returns 0."""
+    done = command("doctor")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "FAIL" not in done.stdout and "mitsuba_bdpt works." in done.stdout
+    for text in ("mitsuba             3.9", "drjit", "OpenEXR", "llvm_ad_rgb", "LLVM"):
+        assert text in done.stdout
+
+
+def test_runs_where_the_package_cannot_be_imported():
+    done = command("doctor", **{llvm.VARIABLE: "/no/such.so"})
+    assert done.returncode == 1
+    assert "FAIL  LLVM                DRJIT_LIBLLVM_PATH='/no/such.so' names no file" in done.stdout
+    assert done.stderr == ""
+
+
+def test_installed_script_survives_a_failing_import_too():
+    script = os.path.join(os.path.dirname(sys.executable), "mitsuba-bdpt")
+    env = os.environ | {llvm.VARIABLE: "/no/such.so"}
+    done = subprocess.run([script, "doctor"], capture_output=True, text=True, env=env)
+    assert done.returncode == 1 and "names no file" in done.stdout and done.stderr == ""
+
+
+def test_other_commands_report_the_failure_without_a_traceback():
+    done = command("render", "scene.xml", **{llvm.VARIABLE: "/no/such.so"})
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: DRJIT_LIBLLVM_PATH=") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="signals that kill a child are POSIX's")
+def test_crash_of_the_child_is_put_into_words():
+    findings = doctor.render_in_child(
+        "llvm_ad_rgb",
+        child(-signal.SIGABRT, '{"variants": ["llvm_ad_rgb"]}\n', "LLVM ERROR: Cannot select\n"),
+    )
+    assert [finding.state for finding in findings] == ["ok", "FAIL"]
+    assert "killed by SIGABRT (LLVM ERROR: Cannot select)" in findings[1].text
+    assert "Mend it with" in findings[1].text or "Unset" in findings[1].text
+
+
+def test_error_of_the_child_is_repeated():
+    findings = doctor.render_in_child("x", child(1, "", "Traceback\nImportError: no x\n"))
+    assert findings == [doctor.Finding("FAIL", "test image", "ImportError: no x")]
+
+
+@pytest.mark.parametrize("mean", ["0.0", "NaN", "1e9"])
+def test_wrong_image_is_a_failure(mean):
+    findings = doctor.render_in_child("llvm_ad_rgb", child(0, f'{{"llvm": "23", "mean": {mean}}}'))
+    assert findings[-1].state == "FAIL" and "its mean is" in findings[-1].text
+
+
+def test_hanging_child_is_a_failure():
+    def hang(command, **kwargs):
+        raise subprocess.TimeoutExpired(command, kwargs["timeout"])
+
+    (finding,) = doctor.render_in_child("llvm_ad_rgb", hang)
+    assert finding.state == "FAIL" and "not finished" in finding.text
+
+
+def test_missing_package_is_named_with_its_remedy(monkeypatch):
+    monkeypatch.setattr(doctor, "PACKAGES", ("surely-not-installed",))
+    finding = doctor.versions()[-1]
+    assert finding.state == "FAIL" and "pip install surely-not-installed" in finding.text
+
+
+def test_unwritable_kernel_cache_is_a_note(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    finding = doctor.kernel_cache()
+    assert finding.state == "note" and "Set DRJIT_CACHE_DIR" in finding.text

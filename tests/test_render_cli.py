@@ -1,0 +1,277 @@
+"""Tests of ``python -m mitsuba_bdpt render``.
+
+Images are tiny, and most are made by Mitsuba's ``path`` or by `Passes`, an integrator of this file
+that paints the film one colour: what is tested is the command, not the light.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+from mitsuba_bdpt import render
+from mitsuba_bdpt.__main__ import build_parser, main
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
+
+SCENE = """
+<scene version="3.0.0">
+    <default name="integrator" value="path"/>
+    <default name="format" value="float32"/>
+    <default name="light" value="2"/>
+    <integrator type="$integrator">
+        <integer name="max_depth" value="3"/>
+        <boolean name="hide_emitters" value="false"/>
+    </integrator>
+    <sensor type="perspective">
+        <sampler type="independent"><integer name="sample_count" value="4"/></sampler>
+        <film type="hdrfilm">
+            <integer name="width" value="6"/><integer name="height" value="4"/>
+            <string name="component_format" value="$format"/>
+        </film>
+    </sensor>
+    <emitter type="constant"><rgb name="radiance" value="$light"/></emitter>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    """A scene file in an empty working directory: an environment of radiance 2, nothing else."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "plain.xml"
+    path.write_text(SCENE)
+    return path
+
+
+def read(path):
+    """Pixels (RGB) and header of an EXR file."""
+    file = OpenEXR.File(str(path), separate_channels=True)
+    channels = file.channels()
+    return np.stack([channels[name].pixels for name in "RGB"], axis=-1), file.header()
+
+
+class Passes(mi.SamplingIntegrator):
+    """Two passes of 3 and 2 spp with reports; ``stop_after`` interrupts after so many of them."""
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.settings = {key: props[key] for key in props.keys()}  # noqa: SIM118 (not a dict)
+        self.stop_after = props.get("stop_after", 2)
+        self.on_pass = None
+        self.statistics = {}
+        self.calls = []
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        assert not develop
+        passes, film = [], scene.sensors()[sensor].film()
+        film.prepare([])
+        for spp_of_pass in (3, 2)[: self.stop_after]:
+            passes.append(spp_of_pass)
+            rays = 1000 * len(passes)
+            self.on_pass(SimpleNamespace(spp_done=sum(passes), spp_total=5, seconds=0.1, rays=rays))
+        block = film.create_block()
+        block.put(mi.Point2f(3, 2), [mi.Float(0.5), mi.Float(0.5), mi.Float(0.5), mi.Float(1)])
+        film.put_block(block)
+        self.statistics = {
+            "passes": passes,
+            "rays": {"camera": 1500, "light": 500},
+            "settings": self.settings | {"spp": spp, "seed": seed},
+        }
+        if self.stop_after < 2:
+            raise KeyboardInterrupt
+        return mi.TensorXf()
+
+
+mi.register_integrator("cli_passes", Passes)
+
+
+def test_writes_exr_and_png_with_one_closing_line(scene, capsys):
+    """Environment of radiance 2: every pixel of the EXR is 2, of the PNG white."""
+    assert main(["render", str(scene), "-o", "new/image.exr"]) == 0
+    pixels, header = read("new/image.exr")
+    assert pixels.shape == (4, 6, 3) and pixels.dtype == np.float32
+    np.testing.assert_allclose(pixels, 2.0, rtol=1e-6)
+    assert np.all(np.array(mi.Bitmap("new/image.png")) == 255)
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1 and out.startswith("new/image.exr: ")
+    assert "4 spp (96 samples)" in out and "mitsuba 3.9" in out and "LLVM" in out
+    settings = json.loads(header["bdptSettings"])
+    assert settings["spp"] == 4 and settings["seed"] == 0 and settings["scene"] == str(scene)
+    assert json.loads(header["bdptStatistics"])["versions"]["mitsuba"].startswith("3.9")
+
+
+def test_default_output_and_no_leftovers(scene):
+    assert main(["render", str(scene), "--spp", "1"]) == 0
+    assert sorted(path.name for path in Path("renders").iterdir()) == ["plain.exr", "plain.png"]
+
+
+def test_definitions_seed_spp_and_exposure(scene):
+    """-Dlight=0.25 with one stop more is 0.5 linear, which is 188 in 8-bit sRGB."""
+    arguments = ["-Dlight=0.25", "--spp", "2", "--seed", "7", "--exposure", "1", "-o", "a.exr"]
+    assert main(["render", str(scene), *arguments]) == 0
+    pixels, header = read("a.exr")
+    np.testing.assert_allclose(pixels, 0.25, rtol=1e-6)
+    assert np.all(np.array(mi.Bitmap("a.png")) == 188)
+    settings = json.loads(header["bdptSettings"])
+    assert (settings["spp"], settings["seed"], settings["defines"]) == (2, 7, {"light": "0.25"})
+
+
+def test_film_component_format_is_kept(scene):
+    assert main(["render", str(scene), "-Dformat=float16", "-o", "half.exr"]) == 0
+    assert read("half.exr")[0].dtype == np.float16
+
+
+def test_aovs_are_kept_beside_the_image(scene):
+    scene.write_text(
+        SCENE.replace(
+            '<integrator type="$integrator">',
+            '<integrator type="aov"><string name="aovs" value="dd:depth"/>'
+            '<integrator name="img" type="$integrator">',
+        ).replace("</integrator>", "</integrator></integrator>")
+    )
+    assert main(["render", str(scene), "-o", "aov.exr"]) == 0
+    assert "dd.T" in OpenEXR.File("aov.exr", separate_channels=True).channels()
+    assert np.array(mi.Bitmap("aov.png")).shape == (4, 6, 3)
+
+
+def test_another_integrator_keeps_depth_and_takes_properties(scene):
+    arguments = ["--integrator", "cli_passes", "-P", "stop_after=2", "-P", "mode=one"]
+    arguments += ["-P", "share=0.5", "-P", "fast=true", "--time", "30", "--seed", "3"]
+    assert main(["render", str(scene), *arguments, "-o", "a.exr"]) == 0
+    statistics = json.loads(read("a.exr")[1]["bdptStatistics"])
+    expected = {"max_depth": 3, "hide_emitters": False, "stop_after": 2, "mode": "one"}
+    expected |= {"share": 0.5, "fast": True, "timeout": 30.0}
+    expected |= {"seed": 3, "spp": render.UNLIMITED_SPP}
+    assert statistics["settings"] == expected
+    assert statistics["spp"] == 5, "the passes that were made count, not those asked for"
+
+
+def test_an_integrator_without_max_depth_can_replace_one_with_it(scene):
+    assert main(["render", str(scene), "--integrator", "direct"]) == 0
+
+
+def test_scene_without_integrator_is_rendered_by_bdpt(scene):
+    start, end = SCENE.index("<integrator"), SCENE.index("<sensor")
+    scene.write_text(
+        SCENE.replace(SCENE[start:end], "").replace('<default name="integrator" value="path"/>', "")
+    )
+    assert main(["render", str(scene), "--spp", "1", "-o", "a.exr"]) == 0
+    np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
+
+
+def test_bdpt_reports_its_statistics(scene, capsys):
+    assert main(["render", str(scene), "-Dintegrator=bdpt", "-P", "skip=none", "-o", "a.exr"]) == 0
+    pixels, header = read("a.exr")
+    np.testing.assert_allclose(pixels, 2.0, rtol=1e-5)
+    statistics = json.loads(header["bdptStatistics"])
+    assert statistics["spp"] == sum(statistics["passes"]) == 4
+    assert statistics["rays"]["camera"] == 4 * 6 * 4
+    assert "rays (camera 96" in capsys.readouterr().out
+
+
+def test_interrupted_rendering_writes_what_is_done(scene, capsys):
+    arguments = ["--integrator", "cli_passes", "-P", "stop_after=1", "-o", "a.exr"]
+    assert main(["render", str(scene), *arguments]) == 130
+    assert json.loads(read("a.exr")[1]["bdptStatistics"])["interrupted"] is True
+    out = capsys.readouterr().out
+    assert "3 spp" in out and out.endswith("; interrupted\n")
+
+
+def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
+    arguments = ["--integrator", "cli_passes", "-P", "stop_after=0", "-o", "a.exr"]
+    assert main(["render", str(scene), *arguments]) == 130
+    assert not Path("a.exr").exists()
+    assert "no image written" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-o", "a.png"], "output='a.png' must end in .exr"),
+        (["-o", "a"], "output='a' must end in .exr"),
+        (["-m", "llvm_rgb"], "variant='llvm_rgb' is not one of Mitsuba's: scalar_rgb"),
+        (["-s", "3"], "sensor=3 is not in the scene; the last one is 0"),
+        (["-P", "nonsense=1"], "nonsense"),
+        (["-Dnonsense=1"], "nonsense"),
+        (["--integrator", "no_such_plugin"], "no_such_plugin"),
+    ],
+)
+def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message):
+    assert main(["render", str(scene), *arguments]) == 1
+    captured = capsys.readouterr()
+    assert captured.err.startswith("error: ") and message in captured.err and not captured.out
+
+
+def test_missing_scene_is_reported(scene, capsys):
+    assert main(["render", "missing.xml"]) == 1
+    assert "scene='missing.xml' is not a file" in capsys.readouterr().err
+
+
+def test_scene_without_sensor_is_reported(scene, capsys):
+    start, end = SCENE.index("<sensor"), SCENE.index("</sensor>") + len("</sensor>")
+    text = SCENE.replace(SCENE[start:end], "")
+    scene.write_text(text.replace('<default name="format" value="float32"/>', ""))
+    assert main(["render", str(scene)]) == 1
+    assert "no sensor" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png"])
+def test_a_file_of_another_format_is_not_overwritten(scene, capsys, name):
+    """A name given by mistake must not cost the user the file; a former image may go."""
+    Path(name).write_text("precious")
+    assert main(["render", str(scene), "-o", "a.exr"]) == 1
+    assert Path(name).read_text() == "precious"
+    assert "would overwrite" in capsys.readouterr().err
+    Path(name).unlink()
+    assert [main(["render", str(scene), "-o", "a.exr"]) for _ in range(2)] == [0, 0]
+
+
+def test_a_failing_write_leaves_the_former_image(scene, tmp_path):
+    image = mi.Bitmap(np.zeros((2, 2, 3), dtype=np.float32))
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"former")
+    with pytest.raises(RuntimeError):
+        render.write_whole(image, path, mi.Bitmap.FileFormat.Unknown)
+    assert path.read_bytes() == b"former"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "plain.xml"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--spp", "0"], ["--spp", "1.5"], ["--time", "nan"], ["--time", "-1"], ["--seed", "-1"]]
+    + [["--seed", str(2**32)], ["-D", "x"], ["-P", "=1"], ["--sensor", "x"]],
+)
+def test_bad_values_are_usage_errors(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        build_parser().parse_args(["render", "scene.xml", *arguments])
+    assert caught.value.code == 2 and "which must" in capsys.readouterr().err
+
+
+def test_progress_shows_rate_and_time_left():
+    bar = render.progress_bar()
+    draw = render.show_pass(bar, None)
+    draw(SimpleNamespace(spp_done=1, spp_total=4, seconds=2.0, rays=5_000_000))
+    assert bar.tasks[0].description == "1/4 spp, 2.5 M rays/s, 6 s left"
+    assert bar.tasks[0].completed == 0.25
+
+
+def test_progress_under_a_time_limit():
+    bar = render.progress_bar()
+    report = SimpleNamespace(spp_done=8, spp_total=render.UNLIMITED_SPP, seconds=2.0, rays=2000)
+    render.show_pass(bar, 8.0)(report)
+    assert bar.tasks[0].description == "8 spp, 1 k rays/s, 6 s left"
+    assert bar.tasks[0].completed == 0.25
+
+
+def test_script_is_the_command(scene):
+    """One real process, from another directory."""
+    command = [sys.executable, str(SCRIPT), str(scene), "--spp", "1", "-o", "a.exr"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert Path("a.exr").exists() and Path("a.png").exists()
