@@ -31,16 +31,25 @@ SPOT_RADIUS, SPOT_LENGTH = 0.298, 0.98
 
 # The cut-glass lamp of lamp_behind_glass: (height, radius) of its edges around the lamp's middle.
 CUT_GLASS = np.array(
-    [(-0.28, 0.0), (-0.21, 0.12), (-0.09, 0.205), (0.04, 0.215), (0.15, 0.15), (0.21, 0.08), (0.225, 0.0)]
+    [
+        (-0.28, 0.0),
+        (-0.21, 0.12),
+        (-0.09, 0.205),
+        (0.04, 0.215),
+        (0.15, 0.15),
+        (0.21, 0.08),
+        (0.225, 0.0),
+    ]
 )
 CUT_GLASS_SIDES = 12
 
 
 def egg_profile(rows):
-    """Height, radius and outward normal (in the plane of the profile) of the egg at `rows` + 1 angles.
+    """Height, radius and outward normal (in the profile's plane) of the egg at `rows` + 1 angles.
 
-    A cosine series for the distance from the middle, as a function of the angle from the upper pole,
-    is smooth at both poles; eight terms meet the measured radii to within 4 mm (13 mm at the foot).
+    A cosine series for the distance from the middle, as a function of the angle from the upper
+    pole, is smooth at both poles; eight terms meet the measured radii to within 4 mm (13 mm at
+    the foot).
     """
     middle = 0.5 * (EGG_BOTTOM + EGG_TOP)
     points = np.vstack([EGG, [(EGG_BOTTOM, 0.0), (EGG_TOP, 0.0)]])
@@ -109,12 +118,13 @@ def lamp_base():
 
 
 def lamp_head():
-    """Cone, apex at y = 5.736, rim of radius 1.172 at y = 6.439; normals point outward, downward."""
+    """Cone, apex at y = 5.736, rim of radius 1.172 at y = 6.439; normals point out and down."""
     bottom, top, rim = 5.736, 6.439, 1.172
     part = np.linspace(1.0, 0.0, 4)
     slant = np.hypot(top - bottom, rim)
     normal_r, normal_y = np.full(4, (top - bottom) / slant), np.full(4, -rim / slant)
-    vertices, normals, faces = revolve(bottom + part * (top - bottom), part * rim, normal_r, normal_y, sides=64)
+    y, radius = bottom + part * (top - bottom), part * rim
+    vertices, normals, faces = revolve(y, radius, normal_r, normal_y, sides=64)
     return vertices + (LAMP_AXIS[0], 0.0, LAMP_AXIS[1]), normals, faces
 
 
@@ -149,7 +159,8 @@ def write_ply(path, vertices, normals, faces):
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     rows["count"], rows["index"] = 3, faces
-    path.write_bytes("\n".join([*header, ""]).encode("ascii") + data.astype("<f4").tobytes() + rows.tobytes())
+    text = "\n".join([*header, ""]).encode("ascii")
+    path.write_bytes(text + data.astype("<f4").tobytes() + rows.tobytes())
 
 
 MESHES = {

@@ -29,10 +29,9 @@ def _runs_own_command(arguments: list[str]) -> bool:
 
 try:
     llvm_choice = _llvm.prepare()
-    if (_Path(__file__).parent / "integrator.py").exists():  # TEMPORARY until the core exists
-        from .integrator import register as _register
+    from .integrator import register as _register
 
-        _register()
+    _register()
 except ImportError as _error:
     # Python imports the package before its __main__. The command must outlive the failure, for
     # `doctor` is there to explain it; __main__ reports it for every other command.

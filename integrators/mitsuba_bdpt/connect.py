@@ -48,7 +48,7 @@ class LightPath:
     count: object
 
 
-def allocate_light_path(size: int) -> LightPath:
+def allocate_light_path(size: int, lanes: int) -> LightPath:
     """Local memory for ``size`` vertices; no field is a Bool (these abort LLVM code generation)."""
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
@@ -56,7 +56,8 @@ def allocate_light_path(size: int) -> LightPath:
         partial=dr.alloc_local(mi.Vector2f, size),
         anchor=dr.alloc_local(mi.Float, size),
         s=dr.alloc_local(mi.UInt32, size),
-        count=mi.UInt32(0),
+        # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
+        count=dr.zeros(mi.UInt32, lanes),
     )
 
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from . import rays
 
@@ -115,6 +116,8 @@ class Emitters:
         self._inv_area = dr.rcp(area)
         self._table = [mi.Float([float(x) for x in column]) for column in columns]
         self._inverse = _inverse_table(self._pointers)
+        self._smooth_meshes = _SmoothMeshes.of(emitters)
+        self._inward_spheres = any(frame[14] > 0 for frame in frames)
         self.center = mi.Point3f(sphere.center)
         self.radius = mi.Float(radius)
         dr.make_opaque(self._kind, self._pmf, self._inv_area, self._table, self._inverse,
@@ -208,8 +211,30 @@ class Emitters:
         )
 
     def geometric_normal(self, ps, index, u_point, active):
-        """Geometric normal at a sampled point (up to its sign)."""
-        return ps.n
+        """Geometric normal, up to its sign, at the point that a shape sampled from ``u_point``.
+
+        Meshes report the interpolated vertex normal there; all other shapes the geometric one.
+        """
+        if self._smooth_meshes is None:
+            return ps.n
+        return self._smooth_meshes.normal(ps.n, index, u_point.y, active)
+
+    def _pdf_direction(self, emitter, index, it, ds, active):
+        """Density with which next-event estimation at ``it`` samples ``ds`` (solid angle, without
+        the selection).
+
+        A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon,
+        but its pdf_direction only up to the radius: wrong for points of the sphere itself.
+        """
+        pdf = emitter.pdf_direction(it, ds, active)
+        if not self._inward_spheres:
+            return pdf
+        column = [dr.gather(mi.Float, c, index, active) for c in self._table]
+        to_centre = dr.squared_norm(it.p - mi.Point3f(*column[9:12]))
+        inside = active & (to_centre <= dr.square(column[14]))
+        inv_area = dr.gather(mi.Float, self._inv_area, index, active)
+        cos = dr.abs(dr.dot(ds.d, ds.n))
+        return dr.select(inside, inv_area * dr.square(ds.dist) / cos, pdf)
 
     def _emit_position(self, emitter, index, u_point, u_direction, like, active) -> Emission:
         column = [dr.gather(mi.Float, c, index, active) for c in self._table]
@@ -283,7 +308,7 @@ class Emitters:
         ds.dist = dr.norm(emission.si.p - si.p)
         ds.emitter = emitter
         smooth = active & ~emission.delta
-        pdf = emitter.pdf_direction(mi.Interaction3f(si), ds, smooth)
+        pdf = self._pdf_direction(emitter, emission.index, mi.Interaction3f(si), ds, smooth)
         finite = dr.select(emission.infinite, pdf, pdf * emission.cos)
         delta = dr.select(emission.infinite, 1, dr.square(ds.dist))
         return pmf * dr.select(emission.delta, delta, finite)
@@ -362,16 +387,16 @@ class Emitters:
         """
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))
-        pmf = self._probability(self._index_of(emitter, active), active)
+        index = self._index_of(emitter, active)
+        pmf = self._probability(index, active)
         it = dr.zeros(mi.Interaction3f)
         it.p, it.time, it.wavelengths = previous, si.time, si.wavelengths
         ds = mi.DirectionSample3f(self.scene, si, it)
         ds.n = mi.Normal3f(si.n)
-        pdf = pmf * emitter.pdf_direction(it, ds, active)
+        pdf = pmf * self._pdf_direction(emitter, index, it, ds, active)
         connect, first, second = mi.Float(pdf), mi.Float(pdf), self._disk_density()
         if AREA in self.kinds:
             on_surface = si.is_valid()
-            index = self._index_of(emitter, active & on_surface)
             inv_area = dr.gather(mi.Float, self._inv_area, index, active & on_surface)
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
             cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
@@ -397,21 +422,78 @@ def _kind(emitter) -> int:
 
 
 def _frame(emitter, kind):
-    """Axes, position, emission density (per solid angle) and cosine of the cutoff of a point or
-    spot light; constants for the others."""
-    if kind not in (POINT, SPOT):
-        return (1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 1)
-    params = mi.traverse(emitter)
+    """A row of the table: axes (9), position (3), density of emission per solid angle, cosine of the
+    cutoff, radius. Point and spot lights use all but the radius; spheres that emit inwards position
+    and radius (as far as they sample from inside), 0 for all others."""
+    axes, p, density, cos_cutoff, radius = (1, 0, 0, 0, 1, 0, 0, 0, 1), (0, 0, 0), 1.0, -1.0, 0.0
     if kind == POINT:
-        p = dr.slice(mi.Point3f(params["position"]))
-        return (1, 0, 0, 0, 1, 0, 0, 0, 1, *p, 1 / (4 * dr.pi), -1)
-    to_world = params["to_world"]
-    axes = [dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
-            for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
-    p = dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
-    cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
-    density = 1 / (2 * dr.pi * (1 - cos_cutoff))
-    return (*axes[0], *axes[1], *axes[2], *p, density, cos_cutoff)
+        p, density = dr.slice(mi.Point3f(mi.traverse(emitter)["position"])), 1 / (4 * dr.pi)
+    elif kind == SPOT:
+        params = mi.traverse(emitter)
+        to_world = params["to_world"]
+        axes = [x for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+                for x in dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))]
+        p = dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
+        cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
+        density = 1 / (2 * dr.pi * (1 - cos_cutoff))
+    elif kind == AREA and emitter.get_shape().shape_type() == mi.ShapeType.Sphere.value:
+        to_world = mi.traverse(emitter.get_shape())["to_world"]
+        p = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
+        ps = emitter.get_shape().sample_position(0, mi.Point2f(0.5))
+        if dr.slice(dr.dot(ps.n, ps.p - p)) < 0:
+            # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
+            radius = dr.slice(dr.norm(ps.p - p)) * (1 + 1500 * 2.0**-24)
+        p = dr.slice(p)
+    return (*axes, *p, density, cos_cutoff, radius)
+
+
+class _SmoothMeshes:
+    """Geometric normals of emitting meshes that have vertex normals.
+
+    Repeats the choice of a face that ``Mesh.sample_position`` makes: by area, from ``sample.y``.
+    """
+
+    @staticmethod
+    def of(emitters):
+        """Tables for those of ``emitters`` that need them, or None."""
+        shapes = [e.get_shape() for e in emitters]
+        smooth = [s is not None and s.is_mesh() and s.has_vertex_normals() for s in shapes]
+        return _SmoothMeshes(shapes, smooth) if any(smooth) else None
+
+    def __init__(self, shapes, smooth):
+        normals, cumulative, first, count = [], [], [], []
+        for shape, is_smooth in zip(shapes, smooth, strict=True):
+            first.append(sum(len(c) for c in cumulative))
+            count.append(0)
+            if not is_smooth:
+                continue
+            params = mi.traverse(shape)
+            p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+            a, b, c = p[np.array(params["faces"]).reshape(-1, 3)].transpose(1, 0, 2)
+            cross = np.cross(b - a, c - a)
+            length = np.linalg.norm(cross, axis=1)
+            normals.append(cross / np.maximum(length, 1e-300)[:, None])
+            cumulative.append(np.cumsum(length) / length.sum())
+            count[-1] = len(length)
+        self._normals = mi.Normal3f(np.concatenate(normals).T.astype(np.float32))
+        self._cumulative = mi.Float(np.concatenate(cumulative).astype(np.float32))
+        self._first, self._count = mi.UInt32(first), mi.UInt32(count)
+        self._steps = max(count).bit_length()
+        dr.make_opaque(self._normals, self._cumulative, self._first, self._count)
+
+    def normal(self, n, index, u, active):
+        """Normal of the face chosen by ``u``; ``n`` for emitters that are no such mesh."""
+        first = dr.gather(mi.UInt32, self._first, index, active)
+        count = dr.gather(mi.UInt32, self._count, index, active)
+        mesh = active & (count > 0)
+        low, high = first, dr.select(mesh, first + count - 1, first)
+        for _ in range(self._steps):
+            middle = (low + high) // 2
+            right = dr.gather(mi.Float, self._cumulative, middle, mesh) < u
+            low = dr.select(right & (middle < high), middle + 1, low)
+            high = dr.select(right, high, middle)
+        face = low
+        return dr.select(mesh, dr.gather(mi.Normal3f, self._normals, face, mesh), n)
 
 
 def _inverse_table(pointers):

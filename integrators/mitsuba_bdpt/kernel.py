@@ -117,7 +117,7 @@ def trace(kernel: Kernel, film, batch: Batch, spp: int):
 
     stream = kernel.points.stream("light", place.index(lane), lane)
     shared = _shared(kernel, stream)
-    path = connect.allocate_light_path(kernel.store_size)
+    path = connect.allocate_light_path(kernel.store_size, lanes)
     if kernel.plan.light:
         path, counters = _light_subpath(kernel, film, stream, shared, path, counters)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
@@ -223,10 +224,11 @@ def write_images(
 ) -> None:
     """Write the film as an EXR with these header `attributes`, and as a PNG beside it."""
     bitmap = film.bitmap()
-    component = re.search(r"component_format = (\w+)", str(film))
-    kinds = {"float16": mi.Struct.Type.Float16, "uint32": mi.Struct.Type.UInt32}
-    kind = kinds.get(component[1] if component else "", mi.Struct.Type.Float32)
-    image = bitmap.convert(bitmap.pixel_format(), kind, srgb_gamma=False)
+    names = [channel.name for channel in bitmap.struct_()]
+    # Mitsuba's own conversion loses the names of channels beyond the image's.
+    component = re.search(r"component_format = (float16|float32|uint32)", str(film))
+    pixels = np.array(bitmap).astype(component[1] if component else np.float32)
+    image = mi.Bitmap(pixels, bitmap.pixel_format(), names)
     for key, value in attributes.items():
         image.metadata()[key] = value
     write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
