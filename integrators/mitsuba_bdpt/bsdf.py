@@ -18,7 +18,8 @@ import mitsuba as mi
 # Plugins that are not Mitsuba's own are treated like them.
 _SAMPLED_PDF_IS_PDF = frozenset(
     "SmoothDiffuse SmoothConductor RoughConductor SmoothDielectric RoughDielectric ThinDielectric "
-    "SmoothPlastic RoughPlastic TwoSidedBRDF MaskBSDF Null".split()
+    "SmoothPlastic RoughPlastic PolarizedPlastic Principled PrincipledThin Hair "
+    "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
 )
 
 
@@ -102,7 +103,7 @@ def sample(bsdf, si, u1, u2, active, full_pdf: bool) -> Step:
 def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool) -> Step:
     """Continue a light subpath; the adjoint factor is part of ``weight``."""
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    bs, delta_weight = bsdf.sample(ctx, si, u1, u2, active)
+    bs, mitsuba_weight = bsdf.sample(ctx, si, u1, u2, active)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     smooth = active & ~delta
     radiance = mi.BSDFContext()
@@ -111,10 +112,13 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool) -> Step:
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
     weight = dr.select(
         delta,
-        delta_weight * (_event_cos_ratio(si, bs) * cos_ratio),
+        mitsuba_weight * (_event_cos_ratio(si, bs) * cos_ratio),
         value * (cos_ratio / pdf_fwd),
     )
-    weight = dr.select(bs.pdf > 0, weight, 0)
+    # A direction that Mitsuba rejects has weight 0, whatever its pdf says.
+    valid = (bs.pdf > 0) & (delta | (pdf_fwd > 0))
+    valid &= dr.max(dr.abs(mi.unpolarized_spectrum(mitsuba_weight))) > 0
+    weight = dr.select(valid, weight, 0)
     return _step(si, bs, weight, pdf_fwd, pdf_rev)
 
 

@@ -108,7 +108,7 @@ class Emitters:
         )
         frames = [_frame(e, k) for e, k in zip(emitters, kinds, strict=True)]
         columns = list(zip(*frames, strict=True))
-        bounds = scene.bbox()
+        bounds = _bounds(scene)
         sphere = bounds.bounding_sphere() if bounds.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
         # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
         radius = max(float(sphere.radius) * (1 + 1e-4), 1e-30)
@@ -456,25 +456,18 @@ class _SmoothMeshes:
     @staticmethod
     def of(emitters):
         """Tables for those of ``emitters`` that need them, or None."""
-        shapes = [e.get_shape() for e in emitters]
-        smooth = [s is not None and s.is_mesh() and s.has_vertex_normals() for s in shapes]
-        return _SmoothMeshes(shapes, smooth) if any(smooth) else None
+        faces = [_curved_faces(e.get_shape()) for e in emitters]
+        return _SmoothMeshes(faces) if any(f is not None for f in faces) else None
 
-    def __init__(self, shapes, smooth):
+    def __init__(self, faces):
         normals, cumulative, first, count = [], [], [], []
-        for shape, is_smooth in zip(shapes, smooth, strict=True):
+        for cross in faces:
             first.append(sum(len(c) for c in cumulative))
-            count.append(0)
-            if not is_smooth:
-                continue
-            params = mi.traverse(shape)
-            p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-            a, b, c = p[np.array(params["faces"]).reshape(-1, 3)].transpose(1, 0, 2)
-            cross = np.cross(b - a, c - a)
-            length = np.linalg.norm(cross, axis=1)
-            normals.append(cross / np.maximum(length, 1e-300)[:, None])
-            cumulative.append(np.cumsum(length) / length.sum())
-            count[-1] = len(length)
+            count.append(0 if cross is None else len(cross))
+            if cross is not None:
+                length = np.linalg.norm(cross, axis=1)
+                normals.append(cross / np.maximum(length, 1e-300)[:, None])
+                cumulative.append(np.cumsum(length) / length.sum())
         self._normals = mi.Normal3f(np.concatenate(normals).T.astype(np.float32))
         self._cumulative = mi.Float(np.concatenate(cumulative).astype(np.float32))
         self._first, self._count = mi.UInt32(first), mi.UInt32(count)
@@ -494,6 +487,40 @@ class _SmoothMeshes:
             high = dr.select(right, high, middle)
         face = low
         return dr.select(mesh, dr.gather(mi.Normal3f, self._normals, face, mesh), n)
+
+
+def _curved_faces(shape):
+    """Cross products of the edges of each face, shape (faces, 3), for a mesh whose vertex normals
+    differ from its faces' normals; None for all other shapes."""
+    if shape is None or not shape.is_mesh() or not shape.has_vertex_normals():
+        return None
+    params = mi.traverse(shape)
+    if "vertex_positions" not in params:  # a rectangle: flat
+        return None
+    faces = np.array(params["faces"]).reshape(-1, 3)
+    p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    n = np.array(params["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+    a, b, c = p[faces].transpose(1, 0, 2)
+    cross = np.cross(b - a, c - a)
+    unit = cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-300)[:, None]
+    flat = np.abs(np.einsum("fvi,fi->fv", n[faces], unit)) > 1 - 1e-6
+    return None if flat.all() else cross
+
+
+def _bounds(scene):
+    """Bounding box of all shapes.
+
+    Not ``scene.bbox()`` alone: meshes that Mitsuba merges when it loads a scene keep the box of one
+    part.
+    """
+    bounds = mi.ScalarBoundingBox3f(scene.bbox())
+    for shape in scene.shapes():
+        params = mi.traverse(shape) if shape.is_mesh() else {}
+        if "vertex_positions" in params:
+            vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
+            bounds.expand(mi.ScalarPoint3f(vertices.min(axis=0).tolist()))
+            bounds.expand(mi.ScalarPoint3f(vertices.max(axis=0).tolist()))
+    return bounds
 
 
 def _inverse_table(pointers):

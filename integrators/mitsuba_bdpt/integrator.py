@@ -20,7 +20,7 @@ from .strategies import strategy_count, strategy_names
 
 # Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
 # a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
-PASS_SAMPLES = 1 << 22
+PASS_SAMPLES = 1 << 20
 
 # With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
 PASS_SAMPLES_SAMPLER = 1 << 20

@@ -1,0 +1,171 @@
+"""A slow, obvious oracle for the weights: every density of every strategy, written out.
+
+E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation" (1997), section 10.2: a path
+x_0 ... x_k of k edges, x_0 on an emitter and x_k on the sensor, can be made by the strategies
+(s, t) with t = k + 1 - s. Each makes the first s vertices from the light and the others from the
+camera, so its density is
+
+    p_s = light[0] ... light[s-1] * camera[s] ... camera[k]
+
+with the arrays ``light`` and ``camera`` below: densities of each vertex from either side. Nothing
+is recursive here and nothing is shared with the code under test. Arithmetic is in float64 and in
+logarithms (products of twenty densities over 60 orders of magnitude leave the range of float64).
+
+Edge i joins x_i and x_{i+1}. All arrays have one row per path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+AREA, POSITION, ENVIRONMENT, DIRECTIONAL = range(4)
+
+
+@dataclass
+class Paths:
+    """``n`` paths of ``k`` edges.
+
+    ``dist2`` (n, k): squared length of the edges. ``cos_light`` (n, k): absolute geometric cosine
+    of edge i at x_i; ``cos_camera`` (n, k): at x_{i+1}. ``to_camera``, ``to_light`` (n, k + 1):
+    solid-angle densities of sampling x_{i+1} and x_{i-1} at x_i, used for 0 < i < k. ``delta``
+    (n, k + 1): the event at x_i is a delta event; its densities are not read.
+
+    ``kind`` (n,) of the emitter. ``first``, ``second``: density of x_0 and of the direction to x_1
+    in emission (at infinity: of the direction, solid angle, and of the point on a disk across it).
+    ``direct``: density of x_0 by next-event estimation from x_1, solid angle at x_1 (probability
+    for delta emitters). ``lens``: whether the sensor has area; ``lens_pdf`` area density of x_k on
+    it (1 without); ``sensor_pdf``: solid-angle density of the direction to x_{k-1}.
+    """
+
+    dist2: np.ndarray
+    cos_light: np.ndarray
+    cos_camera: np.ndarray
+    to_camera: np.ndarray
+    to_light: np.ndarray
+    delta: np.ndarray
+    kind: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    direct: np.ndarray
+    lens: np.ndarray
+    lens_pdf: np.ndarray
+    sensor_pdf: np.ndarray
+
+    @property
+    def k(self) -> int:
+        """Number of edges."""
+        return self.dist2.shape[1]
+
+    @property
+    def infinite(self):
+        """Mask: x_0 is a direction."""
+        return (self.kind == ENVIRONMENT) | (self.kind == DIRECTIONAL)
+
+    @property
+    def delta_emitter(self):
+        """Mask: no camera subpath can hit the emitter."""
+        return (self.kind == POSITION) | (self.kind == DIRECTIONAL)
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1, t = 0 has 0."""
+
+    endpoints: float = 1.0
+    splat: float = 1.0
+    inner: float = 1.0
+
+    def of(self, s: int, k: int) -> float:
+        """kappa of the strategy (s, k + 1 - s)."""
+        t = k + 1 - s
+        if s == 0:
+            return 1.0
+        if s == 1 and t == 1:
+            return self.endpoints
+        if s == 1:
+            return 1.0
+        return self.splat if t == 1 else self.inner
+
+
+def log_densities(paths: Paths) -> np.ndarray:
+    """log p_s for s = 0 ... k, shape (n, k + 1); -inf where the strategy cannot make the path."""
+    k, n = paths.k, len(paths.kind)
+    log = {name: np.log(np.asarray(getattr(paths, name), dtype=np.float64))
+           for name in ("dist2", "cos_light", "cos_camera", "to_camera", "to_light", "first",
+                        "second", "direct", "lens_pdf", "sensor_pdf")}
+    is_area = paths.kind == AREA
+
+    # Densities of x_i when sampled from x_{i-1}, area measure. A delta event has the same
+    # (discrete) probability both ways, so that any number serves; here 1.
+    light = np.zeros((n, k + 1))
+    light[:, 0] = log["first"]
+    if k >= 2:
+        # The emission density of x_1: over directions, or already over an area perpendicular to
+        # the edge.
+        spread = np.where(paths.infinite, 0, log["dist2"][:, 0])
+        light[:, 1] = log["second"] + log["cos_camera"][:, 0] - spread
+    for i in range(2, k):
+        pdf = np.where(paths.delta[:, i - 1], 0, log["to_camera"][:, i - 1])
+        light[:, i] = pdf + log["cos_camera"][:, i - 1] - log["dist2"][:, i - 1]
+
+    camera = np.zeros((n, k + 1))
+    camera[:, k] = log["lens_pdf"]
+    for i in range(k - 1, -1, -1):
+        if i == k - 1:
+            pdf = log["sensor_pdf"]
+        else:
+            pdf = np.where(paths.delta[:, i + 1], 0, log["to_light"][:, i + 1])
+        to_area = log["cos_light"][:, i] - log["dist2"][:, i]
+        if i == 0:  # a direction keeps its solid angle; a delta emitter is never hit
+            to_area = np.where(is_area, to_area, 0)
+        camera[:, i] = pdf + to_area
+
+    # Next-event estimation makes x_0 with a density of its own.
+    direct = log["direct"] + np.where(is_area, log["cos_light"][:, 0] - log["dist2"][:, 0], 0)
+
+    p = np.empty((n, k + 1))
+    for s in range(k + 1):
+        t = k + 1 - s
+        start = direct[:, None] if s == 1 and t >= 2 else light[:, :min(s, 1)]
+        p[:, s] = start.sum(1) + light[:, 1:s].sum(1) + camera[:, s:].sum(1)
+        possible = np.ones(n, dtype=bool)
+        if s == 0:
+            possible &= ~paths.delta_emitter
+        elif s == 1 and t == 1:
+            possible &= ~paths.delta_emitter | paths.lens
+        else:  # the connecting edge joins x_{s-1} and x_s
+            possible &= ~paths.delta[:, s - 1] if s >= 2 else True
+            possible &= ~paths.delta[:, s] if t >= 2 else True
+        p[~possible, s] = -np.inf
+    return p
+
+
+def weights(paths: Paths, coefficients: Coefficients, heuristic: str):
+    """Weights of all strategies of each path.
+
+    Returns ``(w, used, tied)``: weights (n, k + 1), zero where a strategy is not in use; the mask
+    of strategies in use (kappa p > 0); and the mask (n,) of paths whose two best strategies are
+    within 1e-4 of each other.
+    """
+    kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 1)])
+    with np.errstate(divide="ignore"):
+        size = log_densities(paths) + np.log(kappa)
+    used = np.isfinite(size)
+    best = size.max(1, keepdims=True, initial=-1e300)
+    ratio = np.where(used, np.exp(np.minimum(size - best, 0)), 0)
+    if heuristic == "balance":
+        part = ratio
+    elif heuristic == "power":
+        part = ratio**2
+    elif heuristic == "maximum":
+        part = (ratio >= 1).astype(float)
+    elif heuristic == "uniform":
+        part = used.astype(float)
+    else:
+        raise ValueError(heuristic)
+    total = part.sum(1, keepdims=True)
+    ordered = np.sort(ratio, axis=1)
+    tied = ordered[:, -2] > 1 - 1e-4
+    return part / np.where(total > 0, total, 1), used, tied

@@ -1,0 +1,341 @@
+"""Every strategy alone and all together: technique images, statistically.
+
+Unweighted images of one path length k estimate the same integral by k + 1 different ways: that they
+agree tests throughputs, densities, adjoint factors, film normalisation, counts. It needs scenes in
+which the geometry term is bounded (inside a unit sphere two wall points have G = 1/4; between
+separated convex bodies distances stay away from zero), else a single strategy has infinite variance.
+Weighted images of one k add up to ``path`` limited to that k: this tests the weights.
+
+Statistics (see ``statistics.py``): the sample is the mean of a 4x4-pixel tile (16 of them, and the
+image) in one render; 32 renders per side with seeds of their own; the two images compared never come
+from the same seeds, for strategies of one render share subpaths. Welch's t per tile with Sidak's
+correction over all tiles, strategies and lengths of a scene, and uniformity of the p-values by
+Kolmogorov-Smirnov, both at 1e-3; seeds are fixed. There is no tolerance besides: an error counts as
+found at about 5 standard errors of a tile, which is about 1 % of a tile's value for most strategies
+here, and 0.3 % for the image.
+
+Roulette is off (``rr_depth`` 100) except where it is the subject.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import statistics as st
+from mitsuba_bdpt.strategies import strategies
+
+DEPTH = 5
+SEEDS = 32
+SIZE, TILES = 16, 4
+CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
+
+T = mi.ScalarTransform4f
+
+
+def sensor(kind="perspective", origin=(0.1, -0.05, 0.5), target=(0, 0, -1), fov=60, **more):
+    return {
+        "type": kind, "fov": fov, "near_clip": 0.05, "far_clip": 50,
+        "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
+        "sampler": {"type": "independent"},
+        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"},
+                 "pixel_format": "rgb", "component_format": "float32"},
+        **more,
+    }
+
+
+def thinlens(**more):
+    return sensor("thinlens", aperture_radius=0.08, focus_distance=1.2, **more)
+
+
+def gray(x):
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": x}}
+
+
+WALL = {"type": "sphere", "flip_normals": True, "bsdf": gray([0.7, 0.5, 0.3])}
+BALL_LAMP = {"type": "sphere", "center": [0.25, 0.3, -0.2], "radius": 0.2, "bsdf": gray(0.0),
+             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [5, 4, 3]}}}
+QUAD_LAMP = {"type": "rectangle", "bsdf": gray(0.0),
+             "to_world": T().translate([-0.2, 0.45, -0.2]).rotate([1, 0, 0], 70).scale(0.25),
+             "emitter": {"type": "area", "radiance": 6.0}}
+DISK_LAMP = {"type": "disk", "bsdf": gray(0.0),
+             "to_world": T().translate([-0.3, -0.4, -0.2]).rotate([1, 0, 0], -80).scale(0.25),
+             "emitter": {"type": "area", "radiance": 4.0, "sampling_weight": 2.5}}
+POINT = {"type": "point", "position": [0.2, 0.3, -0.1], "intensity": 1.0}
+SPOT = {"type": "spot", "intensity": 4.0, "cutoff_angle": 50, "beam_width": 30,
+        "to_world": T().look_at([0.1, 0.3, 0.1], [-0.3, -0.5, -1], [0, 1, 0])}
+SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.8, 1.1]}}
+SUN = {"type": "directional", "direction": [0.3, -1, -0.5], "irradiance": 3.0}
+
+
+MATTE = gray([0.7, 0.5, 0.3])
+ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx",
+         "specular_reflectance": 0.9}
+GLASS = {"type": "dielectric", "int_ior": 1.5}
+PLASTIC = {"type": "plastic", "diffuse_reflectance": 0.6}
+FAR_LAMP = {"type": "sphere", "center": [0.3, 2.8, 1.2], "radius": 1.0, "bsdf": gray(0.0),
+            "emitter": {"type": "area", "radiance": 4.0}}
+
+
+def inside(bsdf):
+    """Inside the wall with a ball lamp and one more ball, all well apart."""
+    ball = {"type": "sphere", "center": [-0.3, -0.25, -0.25], "radius": 0.3, "bsdf": bsdf}
+    return {"sensor": sensor(), "wall": WALL, "lamp": BALL_LAMP, "ball": ball}
+
+
+def outside():
+    """Three separated balls in the open."""
+    return {
+        "sensor": sensor(origin=(0, 0.3, 4), target=(0, 0, 0), fov=35),
+        "a": {"type": "sphere", "center": [-0.75, 0, 0], "radius": 0.6, "bsdf": MATTE},
+        "b": {"type": "sphere", "center": [0.65, 0.2, -0.3], "radius": 0.6, "bsdf": ROUGH},
+        "c": {"type": "sphere", "center": [0, -2.2, -0.2], "radius": 1.5, "bsdf": MATTE},
+    }
+
+
+# name: (scene, whether technique images alone have finite variance)
+SCENES = {
+    "quad and disk lamps": (
+        {"sensor": sensor(), "wall": WALL, "lamp": QUAD_LAMP, "other": DISK_LAMP}, True),
+    "glowing wall": ({"sensor": sensor(), "wall": WALL | {
+        "emitter": {"type": "area", "radiance": 0.5}}}, True),
+    "spot": ({"sensor": sensor(), "wall": WALL, "lamp": SPOT}, True),
+    "point and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": POINT}, True),
+    "ball lamp and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": BALL_LAMP}, True),
+    "rough metal": (inside(ROUGH), True),
+    "sky": (outside() | {"sky": SKY}, True),
+    "sun, sky and lamp": (outside() | {"sky": SKY, "sun": SUN, "lamp": FAR_LAMP}, True),
+    "glass": (inside(GLASS), False),
+    "plastic": (inside(PLASTIC), False),
+}
+
+
+@cache
+def load(name):
+    return mi.load_dict({"type": "scene", **SCENES[name][0]})
+
+
+def bdpt(**more):
+    return mi.load_dict({"type": "bdpt", "skip": "none", "rr_depth": 100, "max_depth": DEPTH, **more})
+
+
+def renders(scene, integrator, spp, first_seed, seeds=SEEDS):
+    """Tile means of ``seeds`` renders, (seeds, tiles, channels)."""
+    return np.stack([
+        st.tile_means(mi.render(scene, integrator=integrator, spp=spp, seed=first_seed + i), TILES)
+        for i in range(seeds)])
+
+
+def layers(tiles):
+    """``{(k, s, t): (weighted, unweighted)}`` of (seeds, tiles) from the layers behind RGB."""
+    parts = tiles[..., 3:].reshape(*tiles.shape[:2], -1, 2, 3) @ CHANNELS
+    return {kst: (parts[:, :, i, 0], parts[:, :, i, 1]) for i, kst in enumerate(strategies(DEPTH))}
+
+
+@cache
+def techniques(name, side, options=()):
+    """Layers of 32 renders with technique images; sides 0 and 1 have different seeds."""
+    integrator = bdpt(strategy_images=True, **dict(options))
+    return layers(renders(load(name), integrator, 64, 1000 + 1000 * side))
+
+
+@cache
+def path_lengths(name):
+    """``path`` limited to k edges, k = 1 ... 5, (seeds, tiles) each.
+
+    It is max_depth k minus max_depth k - 1 of the *same* seed, which draw the same numbers: the
+    difference holds paths of k edges only, without the noise of shorter ones. The seeds are none of
+    `techniques`.
+    """
+    tiles = [0] + [
+        renders(load(name), mi.load_dict({"type": "path", "max_depth": k, "rr_depth": 100}), 64,
+                5000) @ CHANNELS
+        for k in range(1, DEPTH + 1)]
+    return {k: tiles[k] - tiles[k - 1] for k in range(1, DEPTH + 1)}
+
+
+def possible(name, k, s):
+    """Whether the strategy can make all paths of ``k`` edges in this scene of no delta surfaces."""
+    parts = SCENES[name][0].values()
+    hittable = any("emitter" in p or p["type"] == "constant" for p in parts)
+    delta = any(p["type"] in ("point", "spot", "directional") for p in parts)
+    lens = SCENES[name][0]["sensor"]["type"] == "thinlens"
+    if k == 1:  # delta emitters are seen by a lens only, and hit by nothing
+        return (hittable and not (delta and lens)) if s == 0 else (hittable or lens)
+    return hittable and not delta if s == 0 else True
+
+
+def unweighted_family(a, b, name):
+    """Each strategy of seeds ``a`` against the next of the same k of seeds ``b``: no image serves
+    twice."""
+    family = []
+    for k in range(1, DEPTH + 1):
+        usable = [s for s in range(k + 1) if possible(name, k, s)]
+        family += [
+            st.compare_images(a[k, s, k + 1 - s][1], b[k, u, k + 1 - u][1], f"k={k} s={s} vs s={u}")
+            for s, u in zip(usable, usable[1:], strict=False)]
+    return st.Comparisons.join(family)
+
+
+def weighted_sum(images, k):
+    return sum(images[k, s, k + 1 - s][0] for s in range(k + 1))
+
+
+@pytest.mark.parametrize("name", [name for name, (_, bounded) in SCENES.items() if bounded])
+def test_unweighted_strategies_agree(name):
+    """Rationale: see the module. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
+
+    Expected: for k = 1 ... 5 each strategy's own estimate has the mean of the next one's.
+    """
+    family = unweighted_family(techniques(name, 0), techniques(name, 1), name)
+    st.assert_agree(family, at_least=100)
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "glowing wall"])
+def test_weighted_strategies_add_up_to_path(name):
+    """Rationale: see the module. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
+
+    Expected: for k = 1 ... 5 the weighted images of 64 renders add up to ``path`` limited to k.
+    Left out are k = 1 with a point light and a lens, which ``path`` does not see, and the glowing
+    wall, where ``path`` itself is 0.25 % too bright (it samples a sphere's inside by an area
+    density and takes back another); its values are known, see the next test.
+    """
+    shorter = path_lengths(name)
+    family = []
+    for k in range(2 if name == "point and thin lens" else 1, DEPTH + 1):
+        ours = np.concatenate([weighted_sum(techniques(name, side), k) for side in (0, 1)])
+        family.append(st.compare_images(ours, shorter[k], f"k={k}"))
+    st.assert_agree(st.Comparisons.join(family), at_least=40)
+
+
+def test_glowing_wall_is_known():
+    """Rationale: agreement with each other does not exclude a common factor.
+
+    A unit sphere of reflectance r that emits 0.5 has exactly 0.5 r^(k-1) from paths of k edges,
+    everywhere. Expected: each unweighted strategy and the weighted sum have this mean. Statistic:
+    Student's t per tile, Sidak; Kolmogorov-Smirnov.
+    """
+    images, family = techniques("glowing wall", 0), []
+    for k in range(1, DEPTH + 1):
+        known = 0.5 * np.array([0.7, 0.5, 0.3]) ** (k - 1) @ CHANNELS
+        family.append(st.compare_known(weighted_sum(images, k), known, f"k={k} weighted"))
+        family += [st.compare_known(images[k, s, k + 1 - s][1], known, f"k={k} s={s}")
+                   for s in range(k + 1)]
+    st.assert_agree(st.Comparisons.join(family), at_least=100)
+
+
+# What changes counts, coefficients, weights and roulette, but no expectation.
+OPTIONS = {
+    "power": {"heuristic": "power"},
+    "maximum": {"heuristic": "maximum"},
+    "uniform": {"heuristic": "uniform"},
+    "one quarter": {"light_paths": 0.25},
+    "n1c0": {"connections": "none"},
+    "n0c0": {"light_paths": 0},
+    "two vertices": {"stored_vertices": 2},
+    "three vertices": {"stored_vertices": 3, "light_paths": 0.25},
+    "one connection": {"connections": "one"},
+    "impossible": {"skip": "impossible"},
+    "impossible, power": {"skip": "impossible", "heuristic": "power", "connections": "all"},
+    "independent": {"points": "independent", "light_paths": 0.5},
+}
+
+
+@cache
+def path_image(name):
+    """``path`` of up to 5 edges, (seeds, tiles)."""
+    integrator = mi.load_dict({"type": "path", "max_depth": DEPTH, "rr_depth": 100})
+    return renders(load(name), integrator, 256, 7000, 48) @ CHANNELS
+
+
+@pytest.mark.parametrize("options", OPTIONS)
+def test_images_agree_with_path(options):
+    """Rationale: any heuristic, counts, coefficients and roulette leave the image's mean alone.
+
+    Glass makes paths that only some classes can make. Expected: the mean of 32 renders equals
+    ``path``'s of other seeds. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov over the tiles
+    of the scenes "glass" and "rough metal".
+    """
+    family = [
+        st.compare_images(
+            renders(load(name), bdpt(**OPTIONS[options]), 64, 9000) @ CHANNELS, path_image(name),
+            name)
+        for name in ("glass", "rough metal")]
+    st.assert_agree(st.Comparisons.join(family), at_least=32)
+
+
+@pytest.mark.parametrize("heuristic", ["balance", "maximum"])
+def test_unweighted_strategies_ignore_counts_and_coefficients(heuristic):
+    """Rationale: an unweighted layer is the strategy's own estimate, whatever the settings.
+
+    Expected: with a quarter of the light subpaths and kappa = n / 4 it has the mean that it has
+    with all of them. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
+    """
+    options = (("light_paths", 0.25), ("skip", "impossible"), ("heuristic", heuristic))
+    thinned = layers(renders(load("rough metal"), bdpt(strategy_images=True, **dict(options)), 64,
+                             11000))
+    full = techniques("rough metal", 0)
+    family = [st.compare_images(thinned[key][1], full[key][1], f"s={key[1]} t={key[2]}")
+              for key in strategies(DEPTH)]
+    st.assert_agree(st.Comparisons.join(family), at_least=100)
+
+
+@pytest.mark.parametrize("options", [
+    {}, {"light_paths": 0.25}, {"heuristic": "power"}, {"skip": "impossible"},
+    {"light_paths": 0}, {"connections": "none"}])
+def test_weighted_layers_are_the_image(options):
+    """Rationale: layers and image are two records of the same contributions.
+
+    Expected: in one render RGB equals the sum of the weighted layers to 1e-4 of the image's mean
+    (sums of 64 x 30 float32 numbers per pixel, in another order). No statistic.
+    """
+    integrator = bdpt(strategy_images=True, **options)
+    image = np.array(mi.render(load("glass"), integrator=integrator, spp=64, seed=3), dtype=float)
+    parts = image[..., 3:].reshape(SIZE, SIZE, -1, 2, 3)[..., 0, :]
+    np.testing.assert_allclose(parts.sum(2), image[..., :3], atol=1e-4 * image[..., :3].mean())
+    assert len(integrator.aov_names()) == image.shape[2] - 3
+
+
+# -- the statistics themselves -----------------------------------------------------------------------
+
+
+def test_statistics_find_what_they_should_and_no_more():
+    """Rationale: a test that cannot fail, or fails at random, tests nothing.
+
+    Normal samples of unequal variance, 200 families of 50 comparisons: Expected: families of equal
+    means fall below a level of 5 % in 5 % of the cases (10 of 200; between 2 and 22 with a chance
+    of 99.9 %), p-values are uniform; a shift of 6 standard errors in one tile of 50 is found, and
+    so is one of 0.7 standard errors in all of them; zero noise and equal means is no finding, zero
+    noise and unequal means is.
+    """
+    rng = np.random.default_rng(4)
+    a, b = rng.normal(1, 0.1, (200, 32, 50)), rng.normal(1, 0.3, (200, 40, 50))
+    families = [st.welch(x, y) for x, y in zip(a, b, strict=True)]
+    assert 2 <= sum(st.sidak(f.p) < 0.05 for f in families) <= 22
+    assert st.uniformity(np.concatenate([f.p for f in families])) > 1e-3
+    st.assert_agree(families[0])
+
+    error = np.hypot(0.1 / 32**0.5, 0.3 / 40**0.5)
+    one = a[0].copy()
+    one[:, 7] += 6 * error
+    everywhere = a[0] + 0.7 * error
+    for shifted in (st.compare_images(one, b[0]), st.compare_images(everywhere, b[0])):
+        with pytest.raises(AssertionError, match="Sidak"):
+            st.assert_agree(shifted)
+    constant = np.ones((32, 4))
+    assert (st.welch(constant, constant * (1 + 1e-6)).p == 1).all()
+    assert (st.welch(constant, constant * 1.001).p == 0).all()
+    with pytest.raises(AssertionError, match="noise"):
+        st.assert_agree(st.welch(constant, constant))
+    with pytest.raises(AssertionError, match="uniform"):  # one image compared with itself
+        st.assert_agree(st.welch(a[0], a[0] + rng.normal(0, 1e-3, a[0].shape)))
+
+
+def test_tile_means():
+    """Expected: tiles in row order, each the mean of its pixels and channels apart."""
+    image = np.arange(4 * 8 * 2, dtype=float).reshape(4, 8, 2)
+    tiles = st.tile_means(image, 2)
+    assert tiles.shape == (4, 2)
+    np.testing.assert_allclose(tiles[1], image[:2, 4:].mean((0, 1)))
