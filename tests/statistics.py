@@ -127,7 +127,7 @@ def uniformity(p) -> float:
 
 
 def assert_agree(comparisons: Comparisons, level: float = LEVEL, at_least: int = 1):
-    """Fail unless the family passes Sidak and, with 20 p-values or more, Kolmogorov-Smirnov.
+    """Fail unless the family passes Sidak and, with 16 p-values or more, Kolmogorov-Smirnov.
 
     ``at_least``: how many noisy comparisons there must be, so that a family of empty images does
     not pass for one that agrees.
@@ -138,6 +138,6 @@ def assert_agree(comparisons: Comparisons, level: float = LEVEL, at_least: int =
     assert used.sum() >= at_least, f"only {used.sum()} comparisons have noise:\n{worst}"
     family = sidak(p)
     assert family >= level, f"Welch with Sidak over {len(p)}: p={family:.2e}\n{worst}"
-    if used.sum() >= 20:
+    if used.sum() >= 16:
         ks = uniformity(p[used])
         assert ks >= level, f"p-values of {used.sum()} comparisons not uniform: KS p={ks:.2e}\n{worst}"

@@ -94,14 +94,12 @@ def layers(images, bdpt, base=3):
     return {key: np.mean(value, axis=(0, -1, -2)) for key, value in found.items()}
 
 
-# Parameters, and what error the weighted sums can show: `maximum` jumps between strategies,
-# `uniform` follows the noisiest.
+# Parameters, and what error the weighted sums can show: `uniform` follows the noisiest strategy.
 CONFIGURATIONS = {
     "everything": ({"skip": "none"}, 3e-3),
     "K=2": ({"skip": "none", "stored_vertices": 2}, 3e-3),
     "light_paths=1/4": ({"skip": "impossible", "light_paths": "1/4"}, 3e-3),
     "power": ({"skip": "none", "heuristic": "power"}, 3e-3),
-    "maximum": ({"skip": "none", "heuristic": "maximum"}, 1e-2),
     "uniform": ({"skip": "none", "heuristic": "uniform"}, 0.2),
     "K=3": ({"skip": "none", "stored_vertices": 3}, 3e-3),
     "light_paths=1": ({"skip": "impossible", "light_paths": 1}, 3e-3),
@@ -113,8 +111,8 @@ CONFIGURATIONS = {
 
 @pytest.mark.parametrize("kind", ["point", "emission"])
 @pytest.mark.parametrize("name", [
-    *list(CONFIGURATIONS)[:6],
-    *(pytest.param(name, marks=pytest.mark.slow) for name in list(CONFIGURATIONS)[6:])])
+    *list(CONFIGURATIONS)[:5],
+    *(pytest.param(name, marks=pytest.mark.slow) for name in list(CONFIGURATIONS)[5:])])
 def test_every_path_length_in_the_unit_sphere(kind, name):
     """Rationale: inside a sphere the geometry term is constant, so each strategy alone has finite
     variance and each path length a known radiance. Expected: per path length k the weighted
@@ -147,6 +145,20 @@ def test_every_path_length_in_the_unit_sphere(kind, name):
             assert np.all(values == 0), (s, t)
         else:
             check(values, answer(k), 5e-2)
+
+
+def test_maximum_heuristic_in_the_unit_sphere():
+    """Rationale: in a sphere most strategies of a path have the same density, and the maximum
+    heuristic is not made for ties. With the lamp off the centre the three strategies of k = 3 do
+    not tie, and the radiance after two reflections still is 1/4 everywhere. Tolerance: the
+    confidence interval, below 1e-2. Statistic: t-test over 16 seeds.
+    """
+    scene = mi.load_dict({
+        "type": "scene", "sensor": camera(), "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+        "lamp": {"type": "point", "position": [0.2, -0.5, -0.1], "intensity": float(np.pi)}})
+    bdpt = integrator(max_depth=3, strategy_images=True, skip="none", heuristic="maximum")
+    found = layers(render(scene, bdpt, range(16), 256), bdpt)
+    check(sum(found["weighted", s, 4 - s] for s in range(4)), 0.25, 1e-2)
 
 
 @pytest.mark.parametrize("kind", ["point", "emission"])
@@ -236,7 +248,7 @@ def test_borders_of_a_furnace_are_flat(rfilter, border):
     than splats elsewhere (LuxCore 237 and 239: dark or bright rows). In the sphere lit by a point
     light, t = 1 alone must give 2^-m in each row and column. Expected: the unweighted layers
     s2t1 and s3t1 are flat, the outermost rows and columns included. Tolerance: the confidence interval, below
-    8e-2 for a row or column, 3e-2 for the ring of border pixels, 5e-3 for the ring of the image
+    0.12 for a row or column, 3e-2 for the ring of border pixels, 5e-3 for the ring of the image
     with all strategies. Statistic: t-test over 16 seeds.
     """
     scene, answer = sphere_lit_by("point", camera(rfilter=rfilter, size=16, sample_border=border))
@@ -247,7 +259,7 @@ def test_borders_of_a_furnace_are_flat(rfilter, border):
     names = bdpt.aov_names()
     for k, s in ((2, 2), (3, 3)):
         layer = images[..., 3 + names.index(f"unweighted.s{s}t1.G")]
-        check(np.concatenate([layer.mean(1), layer.mean(2)], axis=1), answer(k), 8e-2)
+        check(np.concatenate([layer.mean(1), layer.mean(2)], axis=1), answer(k), 0.12)
         check(layer[:, ring].mean(1), answer(k), 3e-2)
     total = images[..., :3].mean(-1)
     check(total[:, ring].mean(1), answer(2) + answer(3), 5e-3)

@@ -75,40 +75,45 @@ ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx",
          "specular_reflectance": 0.9}
 GLASS = {"type": "dielectric", "int_ior": 1.5}
 PLASTIC = {"type": "plastic", "diffuse_reflectance": 0.6}
-FAR_LAMP = {"type": "sphere", "center": [0.3, 2.8, 1.2], "radius": 1.0, "bsdf": gray(0.0),
-            "emitter": {"type": "area", "radiance": 4.0}}
+NEAR_LAMP = {"type": "sphere", "center": [0, 1.4, 0.6], "radius": 0.4, "bsdf": gray(0.0),
+             "emitter": {"type": "area", "radiance": 8.0}}
 
 
-def inside(bsdf):
-    """Inside the wall with a ball lamp and one more ball, all well apart."""
-    ball = {"type": "sphere", "center": [-0.3, -0.25, -0.25], "radius": 0.3, "bsdf": bsdf}
-    return {"sensor": sensor(), "wall": WALL, "lamp": BALL_LAMP, "ball": ball}
+def inside(left, right=None):
+    """Inside the wall with a ball lamp and one or two more balls, all well apart."""
+    scene = {"sensor": sensor(), "wall": WALL, "lamp": BALL_LAMP, "left": {
+        "type": "sphere", "center": [-0.35, -0.25, -0.25], "radius": 0.3, "bsdf": left}}
+    if right:
+        scene["right"] = {
+            "type": "sphere", "center": [0.3, -0.3, -0.2], "radius": 0.2, "bsdf": right}
+    return scene
 
 
 def outside():
     """Three separated balls in the open."""
     return {
         "sensor": sensor(origin=(0, 0.3, 4), target=(0, 0, 0), fov=35),
-        "a": {"type": "sphere", "center": [-0.75, 0, 0], "radius": 0.6, "bsdf": MATTE},
-        "b": {"type": "sphere", "center": [0.65, 0.2, -0.3], "radius": 0.6, "bsdf": ROUGH},
-        "c": {"type": "sphere", "center": [0, -2.2, -0.2], "radius": 1.5, "bsdf": MATTE},
+        "a": {"type": "sphere", "center": [-0.75, 0, 0], "radius": 0.5, "bsdf": MATTE},
+        "b": {"type": "sphere", "center": [0.65, 0.2, -0.3], "radius": 0.5, "bsdf": ROUGH},
+        "c": {"type": "sphere", "center": [0, -1.6, -0.2], "radius": 0.8, "bsdf": MATTE},
     }
 
 
-# name: (scene, whether technique images alone have finite variance)
+# name: (scene, largest k at which technique images alone are compared). In the open, longer paths
+# come in lumps too rare for tile means to be normal; beside delta surfaces none is compared.
 SCENES = {
     "quad and disk lamps": (
-        {"sensor": sensor(), "wall": WALL, "lamp": QUAD_LAMP, "other": DISK_LAMP}, True),
+        {"sensor": sensor(), "wall": WALL, "lamp": QUAD_LAMP, "other": DISK_LAMP}, 5),
     "glowing wall": ({"sensor": sensor(), "wall": WALL | {
-        "emitter": {"type": "area", "radiance": 0.5}}}, True),
-    "spot": ({"sensor": sensor(), "wall": WALL, "lamp": SPOT}, True),
-    "point and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": POINT}, True),
-    "ball lamp and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": BALL_LAMP}, True),
-    "rough metal": (inside(ROUGH), True),
-    "sky": (outside() | {"sky": SKY}, True),
-    "sun, sky and lamp": (outside() | {"sky": SKY, "sun": SUN, "lamp": FAR_LAMP}, True),
-    "glass": (inside(GLASS), False),
-    "plastic": (inside(PLASTIC), False),
+        "emitter": {"type": "area", "radiance": 0.5}}}, 5),
+    "spot": ({"sensor": sensor(), "wall": WALL, "lamp": SPOT}, 5),
+    "point and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": POINT}, 5),
+    "ball lamp and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": BALL_LAMP}, 5),
+    "rough metal": (inside(ROUGH), 5),
+    "sky": (outside() | {"sky": SKY}, 3),
+    "sun, sky and lamp": (outside() | {"sky": SKY, "sun": SUN, "lamp": NEAR_LAMP}, 2),
+    "glass and plastic": (inside(GLASS, PLASTIC), 0),
+    "glass and metal": (inside(GLASS, ROUGH), 0),
 }
 
 
@@ -171,7 +176,7 @@ def unweighted_family(a, b, name):
     """Each strategy of seeds ``a`` against the next of the same k of seeds ``b``: no image serves
     twice."""
     family = []
-    for k in range(1, DEPTH + 1):
+    for k in range(1, SCENES[name][1] + 1):
         usable = [s for s in range(k + 1) if possible(name, k, s)]
         family += [
             st.compare_images(a[k, s, k + 1 - s][1], b[k, u, k + 1 - u][1], f"k={k} s={s} vs s={u}")
@@ -183,17 +188,19 @@ def weighted_sum(images, k):
     return sum(images[k, s, k + 1 - s][0] for s in range(k + 1))
 
 
-@pytest.mark.parametrize("name", [name for name, (_, bounded) in SCENES.items() if bounded])
+@pytest.mark.parametrize("name", [name for name, (_, k) in SCENES.items() if k])
 def test_unweighted_strategies_agree(name):
     """Rationale: see the module. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
 
-    Expected: for k = 1 ... 5 each strategy's own estimate has the mean of the next one's.
+    Expected: for k = 1 ... 5 (as far as bounded) each strategy's own estimate has the mean of the
+    next one's.
     """
     family = unweighted_family(techniques(name, 0), techniques(name, 1), name)
-    st.assert_agree(family, at_least=100)
+    st.assert_agree(family, at_least=40)
 
 
-@pytest.mark.parametrize("name", [name for name in SCENES if name != "glowing wall"])
+@pytest.mark.parametrize("name", [
+    name for name in SCENES if name not in ("glowing wall", "glass and metal")])
 def test_weighted_strategies_add_up_to_path(name):
     """Rationale: see the module. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
 
@@ -255,15 +262,11 @@ def test_images_agree_with_path(options):
     """Rationale: any heuristic, counts, coefficients and roulette leave the image's mean alone.
 
     Glass makes paths that only some classes can make. Expected: the mean of 32 renders equals
-    ``path``'s of other seeds. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov over the tiles
-    of the scenes "glass" and "rough metal".
+    ``path``'s of other seeds. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
     """
-    family = [
-        st.compare_images(
-            renders(load(name), bdpt(**OPTIONS[options]), 64, 9000) @ CHANNELS, path_image(name),
-            name)
-        for name in ("glass", "rough metal")]
-    st.assert_agree(st.Comparisons.join(family), at_least=32)
+    name = "glass and metal"
+    ours = renders(load(name), bdpt(**OPTIONS[options]), 64, 9000) @ CHANNELS
+    st.assert_agree(st.compare_images(ours, path_image(name)), at_least=16)
 
 
 @pytest.mark.parametrize("heuristic", ["balance", "maximum"])
@@ -292,7 +295,7 @@ def test_weighted_layers_are_the_image(options):
     (sums of 64 x 30 float32 numbers per pixel, in another order). No statistic.
     """
     integrator = bdpt(strategy_images=True, **options)
-    image = np.array(mi.render(load("glass"), integrator=integrator, spp=64, seed=3), dtype=float)
+    image = np.array(mi.render(load("glass and metal"), integrator=integrator, spp=64, seed=3), dtype=float)
     parts = image[..., 3:].reshape(SIZE, SIZE, -1, 2, 3)[..., 0, :]
     np.testing.assert_allclose(parts.sum(2), image[..., :3], atol=1e-4 * image[..., :3].mean())
     assert len(integrator.aov_names()) == image.shape[2] - 3

@@ -17,6 +17,10 @@ from .points import Purpose
 from .subpath import Vertex, newest_coefficient
 
 
+# kappa of s = 0 and s = 1: a sample each per camera vertex.
+NEXT_EVENT = HIT = 1.0
+
+
 @dataclass
 class Contribution:
     """``value`` unweighted estimate, ``weight`` in [0, 1], numbers of light vertices ``s`` and
@@ -103,7 +107,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     active &= dr.max(mi.unpolarized_spectrum(radiance)) != 0
     connect, first, second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
-    newest = dr.select(directly, kernel.coefficient_endpoints, 1) * dr.select(
+    newest = dr.select(directly, kernel.coefficient_endpoints, NEXT_EVENT) * dr.select(
         directly, first, connect
     )
     older = dr.select(kernel.within_store(z.edges), first * second, 0)
@@ -111,7 +115,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
     )
-    weight = h.weight(1, mi.Float(0), camera_side)
+    weight = h.weight(HIT, mi.Float(0), camera_side)
     return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active)
 
 
@@ -130,12 +134,13 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
 
     light_side = h.start(dr.select(e.delta, 0, f.pdf_fwd / e.pdf))
     older = dr.select(kernel.within_store(k), z.partial.d_vc, 0)
-    newest = dr.select(kernel.within_store(k), newest_coefficient(kernel, kernel.camera_side, z.edges), 0)
+    newest = newest_coefficient(kernel, kernel.coefficient_splat, z.edges)
+    newest = dr.select(kernel.within_store(k), newest, 0)
     camera_side = mis.alternatives(
         h, mis.Partial(z.partial.d_vcm, older), newest, f.pdf_rev,
         e.emission_ratio * bsdf.geometric_cos(z.si, wo),
     )
-    weight = h.weight(1, light_side, camera_side)
+    weight = h.weight(NEXT_EVENT, light_side, camera_side)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point = rays.segment(z.anchor, e.anchor, z.si)
@@ -198,7 +203,7 @@ def splat(kernel, y: Vertex, stream, counters):
     value = estimate * dr.rcp(kernel.count_light)
     active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
 
-    newest = newest_coefficient(kernel, kernel.light_side, y.edges)
+    newest = newest_coefficient(kernel, NEXT_EVENT, y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev, join.importance * to_area)
     weight = h.weight(kernel.coefficient_splat, light_side, mi.Float(0))
 
@@ -234,10 +239,10 @@ def inner(kernel, z: Vertex, y: Vertex, counters) -> Contribution:
     counters.zero += _one(active & ~nonzero)
 
     light_side = mis.alternatives(
-        h, y.partial, newest_coefficient(kernel, kernel.light_side, y.edges), f_y.pdf_rev,
+        h, y.partial, newest_coefficient(kernel, NEXT_EVENT, y.edges), f_y.pdf_rev,
         f_z.pdf_fwd * cos_y / dist2)
     camera_side = mis.alternatives(
-        h, z.partial, newest_coefficient(kernel, kernel.camera_side, z.edges), f_z.pdf_rev,
+        h, z.partial, newest_coefficient(kernel, kernel.coefficient_splat, z.edges), f_z.pdf_rev,
         f_y.pdf_fwd * cos_z / dist2)
     weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, nonzero)

@@ -80,7 +80,6 @@ class Kernel:
         self.coefficient_endpoints = f32(count if plan.endpoints else 0)
         self.coefficient_inner = f32(inner)
         self.inverse_threshold = f32(dr.inf)
-        self.camera_side = Side("camera", False, self.max_depth, self.coefficient_splat)
         self.counts = dr.zeros(mi.UInt64, len(RAYS) + len(CONNECTIONS) + 1)
         self.points = None
 
@@ -198,15 +197,13 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         reference=dr.max(mi.unpolarized_spectrum(e.weight)),
         eta=mi.Float(1),
         edges=mi.UInt32(1),
-        infinite=mi.Bool(e.infinite),
         seen=mi.Bool(False),
         active=active,
     )
     side = Side(
-        "light", True, kernel.last_light, mi.Float(1),
+        "light", True, kernel.last_light, connect.NEXT_EVENT,
         complete=lambda si, first: emitters.connection_density(e, si, first),
     )
-    kernel.light_side = side
 
     def visit(vertex, stream, state):
         path, counters = state
@@ -246,7 +243,6 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
         reference=mi.Float(1),
         eta=mi.Float(1),
         edges=mi.UInt32(1),
-        infinite=mi.Bool(False),
         seen=mi.Bool(False),
         active=active,
     )
@@ -271,9 +267,10 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
             radiance += total
         return radiance, path, counters
 
+    side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat)
     state = (dr.zeros(mi.Spectrum), path, counters)
     (radiance, path, counters), seen, traced, _ = random_walk(
-        kernel, kernel.camera_side, walk, stream, visit, state)
+        kernel, side, walk, stream, visit, state)
     counters.camera += traced
     rgb = kernel.to_rgb(radiance, shared.wavelengths)
     finite = dr.all(dr.isfinite(rgb))

@@ -24,7 +24,7 @@ class Walk:
     ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
     measure before that edge; ``reference`` the throughput that roulette compares with; ``eta``
     product of relative indices of refraction; ``edges`` number of edges up to the next vertex;
-    ``infinite``: the first edge comes from infinity; ``seen``: an event other than null happened.
+    ``seen``: an event other than null happened.
     """
 
     pi: object
@@ -35,7 +35,6 @@ class Walk:
     reference: object
     eta: object
     edges: object
-    infinite: object
     seen: object
     active: object
 
@@ -98,10 +97,10 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     return state, walk.seen, traced, stream
 
 
-def newest_coefficient(kernel, side: Side, edges):
+def newest_coefficient(kernel, first, edges):
     """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1 (s = 0 differs,
-    see `connect.hit_emitter`)."""
-    return dr.select(edges == 1, side.coefficient, kernel.coefficient_inner)
+    see `connect.hit_emitter`); ``first`` is that at vertex 1, see `Side`."""
+    return dr.select(edges == 1, first, kernel.coefficient_inner)
 
 
 def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
@@ -144,7 +143,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
     take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
     step = take(vertex.bsdf, si, u1, u2, active, kernel.full_pdf)
-    coefficient = newest_coefficient(kernel, side, walk.edges)
+    coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
     throughput = walk.throughput * step.weight
@@ -169,7 +168,6 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
         reference=walk.reference,
         eta=eta,
         edges=walk.edges + 1,
-        infinite=mi.Bool(False),
         seen=walk.seen | (active & ~step.null),
         active=active,
     )

@@ -1,0 +1,203 @@
+"""Measure cost per sample, efficiency and cold start against Mitsuba's `path`.
+
+    python scripts/benchmark.py cost                    # Cornell box, depth 6, 256x256, 64 spp
+    python scripts/benchmark.py efficiency cornell_box  # also uplight_room, glass_caustics, ...
+    python scripts/benchmark.py coldstart               # empty kernel cache to the first image
+
+All figures are ratios; the two sides alternate in one run. Rules: warm kernels, medians over seeds;
+relMSE = mean of (x - r)^2 / (r^2 + 0.01 mean(r)^2) over pixels and channels, *trimmed* without the
+worst 0.1 % of values; efficiency = 1 / (seconds * relMSE). The reference is rendered by `bdpt` with
+seeds of its own until it carries less than 1 % of the error measured, and kept in renders/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
+import numpy as np
+
+import mitsuba as mi  # isort: skip
+import drjit as dr  # isort: skip
+
+ROOT = Path(__file__).parent.parent
+DEPTH = {"cornell_box": 6, "uplight_room": 8, "ajar_door": 8, "many_lights": 6, "glass_caustics": 8}
+
+
+def timed(scene, integrator, spp, seed):
+    """Image and wall seconds of one render."""
+    start = time.perf_counter()
+    image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
+    dr.eval(image)
+    dr.sync_thread()
+    return np.array(image)[..., :3], time.perf_counter() - start
+
+
+def rel_mse(image, reference, trim=0.0):
+    """relMSE; ``trim`` is the share of the worst values that is left out."""
+    error = (image - reference) ** 2 / (reference**2 + 0.01 * reference.mean() ** 2)
+    values = np.sort(error.ravel())
+    return float(values[: round(len(values) * (1 - trim))].mean())
+
+
+def load(name, resolution, max_depth):
+    """A scene of scenes/ and its depth."""
+    depth = max_depth or DEPTH.get(name, 8)
+    path = str(ROOT / "scenes" / f"{name}.xml")
+    return mi.load_file(path, resolution=resolution, max_depth=depth, parallel=False), depth
+
+
+def integrators(depth):
+    """What is compared, by name; `path` first."""
+    return {
+        "path": mi.load_dict({"type": "path", "max_depth": depth}),
+        "bdpt skip=none": mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": "none"}),
+        "bdpt skip=impossible": mi.load_dict(
+            {"type": "bdpt", "max_depth": depth, "skip": "impossible"}),
+    }
+
+
+def cost(args):
+    """Seconds per sample as a ratio to `path`'s."""
+    scene, depth = load("cornell_box", args.resolution or 256, args.max_depth)
+    sides = integrators(depth)
+    seconds = {name: [] for name in sides}
+    for seed in range(args.seeds + 1):
+        for name, integrator in sides.items():
+            _, t = timed(scene, integrator, args.spp, seed)
+            if seed:  # the first round compiles
+                seconds[name].append(t)
+    ratios = {n: np.array(t) / np.array(seconds["path"]) for n, t in seconds.items()}
+    print(f"cost per sample, cornell_box, depth {depth}, {args.spp} spp, {args.seeds} rounds")
+    for name, r in ratios.items():
+        print(f"  {name:22} {np.median(r):.2f}x  (min {r.min():.2f}, max {r.max():.2f})")
+    return {name: float(np.median(r)) for name, r in ratios.items()}
+
+
+def reference(scene, name, resolution, depth, error):
+    """Reference image whose own relMSE is below ``error``, and that relMSE."""
+    cache = ROOT / "renders" / f"reference_{name}_{resolution}_{depth}.npz"
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "light_paths": "1/4"})
+    halves, rounds = [0.0, 0.0], 0
+    if cache.exists():
+        kept = np.load(cache)
+        halves, rounds = list(kept["halves"]), int(kept["rounds"])
+    while True:
+        if rounds:
+            a, b = (h / rounds for h in halves)
+            mean = (a + b) / 2
+            # The halves differ by twice the standard error of their mean.
+            own = rel_mse((a - b) / 2 + mean, mean)
+            if own < error:
+                return mean, own
+        for half in range(2):
+            image, _ = timed(scene, integrator, 256, 10**6 + 2 * rounds + half)
+            halves[half] = halves[half] + image.astype(np.float64)
+        rounds += 1
+        cache.parent.mkdir(exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=cache.parent, suffix=".npz", delete=False) as f:
+            np.savez(f, halves=np.array(halves), rounds=rounds)
+        os.replace(f.name, cache)
+
+
+def efficiency(args):
+    """Efficiency of default `bdpt` over `path` with independent and multijitter samplers."""
+    resolution = args.resolution or 128
+    scene, depth = load(args.scene, resolution, args.max_depth)
+    sides = integrators(depth)
+    ours, path = sides["bdpt skip=impossible"], sides["path"]
+    trial, _ = timed(scene, ours, args.spp, 1)
+    _, seconds_ours = timed(scene, ours, args.spp, 2)
+    timed(scene, path, 16, 1)
+    _, seconds_path = timed(scene, path, args.spp, 2)
+    spp_path = max(round(args.spp * seconds_ours / seconds_path), 1)
+    ref, own = reference(scene, args.scene, resolution, depth, 1.0)
+    ref, own = reference(
+        scene, args.scene, resolution, depth, 0.01 * rel_mse(trial, ref, 0.001))
+    rows = {"independent": [], "multijitter": []}
+    scenes = {"independent": scene}
+    loaded = mi.load_file(
+        str(ROOT / "scenes" / f"{args.scene}.xml"), resolution=resolution, max_depth=depth,
+        sampler="multijitter", parallel=False)
+    scenes["multijitter"] = loaded
+    for sampler in rows:
+        for seed in range(args.seeds + 1):
+            a, ta = timed(scene, ours, args.spp, seed)
+            b, tb = timed(scenes[sampler], path, spp_path, seed)
+            if seed:
+                rows[sampler].append([
+                    tb * rel_mse(b, ref, trim) / (ta * rel_mse(a, ref, trim))
+                    for trim in (0.001, 0.0)
+                ])
+    print(f"efficiency of bdpt over path, {args.scene}, {resolution}x{resolution}, depth {depth}, "
+          f"{args.spp} spp against {spp_path} spp, {args.seeds} seeds; relMSE trimmed "
+          f"{rel_mse(a, ref, 0.001):.5f}, reference {own:.1e}")
+    result = {}
+    for sampler, r in rows.items():
+        r = np.array(r)
+        print(f"  path {sampler:12} trimmed {np.median(r[:, 0]):.2f}x "
+              f"({r[:, 0].min():.2f}..{r[:, 0].max():.2f}), raw {np.median(r[:, 1]):.2f}x "
+              f"({r[:, 1].min():.2f}..{r[:, 1].max():.2f})")
+        result[sampler] = {"trimmed": float(np.median(r[:, 0])), "raw": float(np.median(r[:, 1]))}
+    return result
+
+
+COLD = """
+import time; start = time.perf_counter()
+import mitsuba_bdpt, mitsuba as mi, drjit as dr
+mi.set_variant('llvm_ad_rgb')
+scene = mi.load_dict(mi.cornell_box())
+integrator = mi.load_dict({'type': '%s', 'max_depth': 6})
+loaded = time.perf_counter()
+image = mi.render(scene, integrator=integrator, spp=16); dr.eval(image); dr.sync_thread()
+print(time.perf_counter() - loaded)
+"""
+
+
+def coldstart(args):
+    """Seconds from an empty kernel cache to the first Cornell image (imports and loading apart)."""
+    seconds = {"path": [], "bdpt": []}
+    for _ in range(args.seeds):
+        for name, rows in seconds.items():
+            with tempfile.TemporaryDirectory() as cache:
+                env = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
+                out = subprocess.run(
+                    [sys.executable, "-c", COLD % name], env=env, check=True, capture_output=True,
+                    text=True)
+            rows.append(float(out.stdout.split()[-1]))
+    result = {name: float(np.median(rows)) for name, rows in seconds.items()}
+    print("cold start to the first Cornell image: "
+          + ", ".join(f"{n} {t:.2f} s" for n, t in result.items())
+          + f", ratio {result['bdpt'] / result['path']:.2f}x")
+    return result
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("cost", "efficiency", "coldstart"))
+    parser.add_argument("scene", nargs="?", default="cornell_box", help="name in scenes/")
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--resolution", type=int)
+    parser.add_argument("--max-depth", type=int)
+    parser.add_argument("--json", type=Path, help="also add the result to this file")
+    args = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    result = globals()[args.what](args)
+    if args.json:
+        kept = json.loads(args.json.read_text()) if args.json.exists() else {}
+        key = args.what if args.what != "efficiency" else f"efficiency {args.scene}"
+        kept[key] = result
+        args.json.write_text(json.dumps(kept, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

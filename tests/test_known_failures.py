@@ -1,0 +1,541 @@
+"""Bugs that other bidirectional path tracers had in public, each as a test that fails on the bug.
+
+Numbers are those of the threads: pbrt-v3 73 and so on. Where two images are compared, the statistic
+is Welch's t-test of tile means over seeds with Sidak's correction (`agree`); where the answer is
+known, the t-test against it. Seeds are fixed and differ between the two sides.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import stats
+
+from mitsuba_bdpt import bsdf as bsdf_module
+
+SIGNIFICANCE = 1e-4
+ROUNDING = 1e-4  # systematic differences in float32 between two ways to one image, relative
+
+T = mi.ScalarTransform4f
+
+
+def integrator(kind="bdpt", **parameters):
+    return mi.load_dict({"type": kind, **parameters})
+
+
+def render(scene, method, seeds, spp):
+    """Images, stacked: (seeds, height, width, channels)."""
+    return np.stack([
+        np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
+
+
+def tiles(images, size=4):
+    """Means of size x size pixels: (seeds, tiles)."""
+    n, h, w = images.shape[:3]
+    cut = images.reshape(n, h // size, size, w // size, size, -1)
+    return cut.mean((2, 4)).reshape(n, -1)
+
+
+def agree(a, b, relative):
+    """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
+    their sums. The confidence interval of the sums' ratio must be narrower than ``relative``."""
+    a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
+    variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
+    error = np.sqrt(sum(variance))
+    freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
+        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120)
+    level = 1 - (1 - SIGNIFICANCE) ** (1 / a.shape[1])
+    scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
+    reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + ROUNDING * scale
+    difference = a.mean(0) - b.mean(0)
+    bad = np.abs(difference) > reach
+    assert not bad.any(), "\n".join(
+        f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
+        f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
+        for i in np.flatnonzero(bad)[-20:])
+    assert scale[-1] > 0
+    assert reach[-1] < relative * scale[-1], (
+        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}")
+
+
+def layer(images, bdpt, name):
+    """The technique image ``name``, for example ``unweighted.s1t2``."""
+    first = bdpt.aov_names().index(name + ".R")
+    base = images.shape[-1] - len(bdpt.aov_names())
+    return images[..., base + first : base + first + 3]
+
+
+def camera(origin, target, fov=45, size=16, up=(0, 1, 0), rfilter="box", **film):
+    return {
+        "type": "perspective", "fov": fov, "near_clip": 1e-3,
+        "to_world": T().look_at(list(origin), list(target), list(up)),
+        "sampler": {"type": "independent"},
+        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
+                 "component_format": "float32", "rfilter": {"type": rfilter}, **film},
+    }
+
+
+def diffuse(reflectance, sides=2):
+    bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [reflectance] * 3}}
+    return {"type": "twosided", "bsdf": bsdf} if sides == 2 else bsdf
+
+
+def bumps():
+    """Three sines, as the height field of a bump map."""
+    y, x = np.mgrid[0:64, 0:64] / 64 * 2 * np.pi
+    height = 0.5 + 0.15 * (np.sin(6 * x) + np.sin(5 * y) + np.sin(3 * x + 4 * y))
+    return {"type": "bitmap", "bitmap": mi.Bitmap(height.astype(np.float32)[..., None]),
+            "raw": True, "wrap_mode": "repeat"}
+
+
+def normals(tilt):
+    """Tangent-space normals of a wavy surface."""
+    y, x = np.mgrid[0:64, 0:64] / 64 * 2 * np.pi
+    n = np.stack([tilt * np.sin(4 * x), tilt * np.sin(3 * y), np.ones_like(x)], axis=-1)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(((n + 1) / 2).astype(np.float32)), "raw": True}
+
+
+ROUGH = {
+    "bumpmap": lambda: {"type": "twosided", "bsdf": {
+        "type": "bumpmap", "arbitrary": bumps(), "scale": 0.3, "bsdf": diffuse(0.7, 1)}},
+    "normalmap": lambda: {"type": "twosided", "bsdf": {
+        "type": "normalmap", "normalmap": normals(0.4), "bsdf": diffuse(0.7, 1)}},
+}
+
+
+def inside_of_a_sphere(bsdf):
+    return mi.load_dict({
+        "type": "scene",
+        "sensor": camera((0, -0.6, 0), (0.3, 0.2, -1), fov=70),
+        "wall": {"type": "sphere", "bsdf": bsdf},
+        "lamp": {"type": "point", "position": [0.1, 0.3, 0.2], "intensity": 3.0}})
+
+
+@pytest.mark.parametrize("kind", ROUGH)
+def test_no_spikes_inside_a_bumpy_sphere(kind):
+    """1 (pbrt-v3 73): the adjoint factor of shading normals was in the walk but not at the join, and
+    spikes were blamed on near vertices. Expected: no pixel above three times its neighbourhood's
+    median, and in each light-side strategy's unweighted image no pixel above 8 times (16 spp
+    leave t = 1 that much noise). Both bounds are far from what noise does here and far below the
+    spikes (orders of magnitude).
+    """
+    scene = inside_of_a_sphere(ROUGH[kind]())
+    bdpt = integrator(max_depth=4, skip="none", strategy_images=True)
+    image = render(scene, bdpt, [1], 256)
+    for name, limit in [(None, 3), *((f"weighted.s{s}t{4 - s}", 12) for s in range(2, 4))]:
+        pixels = (image[..., :3] if name is None else layer(image, bdpt, name))[0].mean(-1)
+        padded = np.pad(pixels, 2, mode="reflect")
+        around = np.median(np.lib.stride_tricks.sliding_window_view(padded, (5, 5)), axis=(2, 3))
+        assert np.max(pixels / around) < limit
+
+
+@pytest.mark.parametrize("kind", ROUGH)
+def test_light_side_agrees_with_camera_side_on_bumpy_surfaces(kind):
+    """17 (mitsuba3 42, 45): the light tracer was brighter than path on bumped surfaces. The
+    reference is the camera side: Mitsuba's `path`. Expected: the unweighted images of every light-side
+    strategy with k = 2 and k = 3 equal those of s = 1, and all together equal `path`. Tolerance:
+    the confidence interval, below 2 % (the bug: 16 to 57 % per pixel). Statistic: Welch, 16 seeds
+    a side.
+    """
+    scene = inside_of_a_sphere(ROUGH[kind]())
+    bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
+    images, others = render(scene, bdpt, range(16), 256), render(scene, bdpt, range(50, 66), 256)
+    for s, t in ((2, 1), (2, 2), (3, 1)):
+        reference = layer(others, bdpt, f"unweighted.s1t{s + t - 1}")
+        agree(tiles(layer(images, bdpt, f"unweighted.s{s}t{t}")), tiles(reference), 0.05)
+    path = integrator("path", max_depth=3, rr_depth=50)
+    agree(tiles(images[..., :3]), tiles(render(scene, path, range(50, 66), 512)), 0.02)
+
+
+def ball_mesh(path, subdivisions=2):
+    """A coarse sphere of triangles with vertex normals, written as PLY."""
+    t = (1 + 5**0.5) / 2
+    v = np.array([(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
+                  (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)], float)
+    f = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
+                  (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
+                  (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    for _ in range(subdivisions):
+        corners = v[f]
+        middles = (corners + np.roll(corners, -1, axis=1)) / 2
+        a, b, c = corners.transpose(1, 0, 2)
+        ab, bc, ca = middles.transpose(1, 0, 2)
+        triangles = np.concatenate([
+            np.stack(x, axis=1) for x in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+        v, f = np.unique(triangles.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+        f = f.reshape(-1, 3)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    mesh = mi.Mesh("ball", len(v), len(f), has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = v.astype(np.float32).ravel()
+    params["vertex_normals"] = v.astype(np.float32).ravel()
+    params["faces"] = f.astype(np.uint32).ravel()
+    params.update()
+    mesh.write_ply(str(path))
+    return {"type": "ply", "filename": str(path)}
+
+
+def test_shading_normals_of_a_coarse_mesh(tmp_path):
+    """2 (pbrt-v4 385, 526, 13): without the adjoint factor a surface with interpolated normals is too
+    shiny on the light side. A ball of 80 triangles with vertex normals above a floor. Expected: t = 1
+    and s = 1 alone agree, and everything agrees with `path` at depth 4. Tolerance: the confidence
+    interval, below 3 %. Statistic: Welch, 16 seeds a side.
+    """
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": camera((0, 1, 5), (0, 0, 0), fov=35),
+        "ball": ball_mesh(tmp_path / "ball.ply", 1) | {"bsdf": diffuse(0.8)},
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.5),
+                  "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(2)},
+        "lamp": {"type": "spot", "intensity": 40.0, "cutoff_angle": 25,
+                 "to_world": T().look_at([3, 4, 1], [0, -0.5, 0], [0, 1, 0])}})
+    bdpt = integrator(max_depth=4, rr_depth=50, skip="none", strategy_images=True)
+    images, others = render(scene, bdpt, range(16), 256), render(scene, bdpt, range(50, 66), 256)
+    agree(tiles(layer(images, bdpt, "unweighted.s2t1")),
+          tiles(layer(others, bdpt, "unweighted.s1t2")), 0.03)
+    path = integrator("path", max_depth=4, rr_depth=50)
+    agree(tiles(images[..., :3]), tiles(render(scene, path, range(50, 66), 512)), 0.02)
+
+
+@pytest.mark.parametrize("transform, flip", [
+    (T(), False), (T().scale([-1, 1, 1]), False), (T().scale([-1, 1, 1]), True),
+    (T().rotate([1, 2, 3], 40).scale([0.7, -1.2, 1]), False)],
+    ids=["plain", "mirrored", "mirrored, flipped", "mirrored, stretched"])
+@pytest.mark.parametrize("inside", [False, True], ids=["outside", "inside"])
+def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
+    """3 and 16 (pbrt-v3 229, mitsuba3 1952): a mirrored emitter mesh with vertex normals emitted on
+    one side when hit and on the other when sampled; its normal differed between sampling and density.
+    A ball of 20 triangles lights a floor from outside and, where its normals point inwards, nothing
+    outside. Expected: s = 0, s = 1 and t = 1 alone agree, with direct light (k = 2) and seen
+    directly (k = 1); a side that is dark for one is dark for all. Tolerance: the confidence
+    interval, below 6 %. Statistic: Welch, 12 seeds a side.
+    """
+    scene = mi.load_dict({
+        "type": "scene",
+        "sensor": camera((0, 0, 0) if inside else (0, 1.5, 4), (0, -0.6, 0.3), fov=60, up=(0, 0, 1)),
+        "lamp": ball_mesh(tmp_path / "lamp.ply", 0) | {
+            "to_world": T().scale(1.5 if inside else 0.5) @ transform, "flip_normals": flip,
+            "bsdf": diffuse(0), "emitter": {"type": "area", "radiance": 2.0}},
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.8),
+                  "to_world": T().translate([0, -0.45 if inside else -1.4, 0])
+                  .rotate([1, 0, 0], -90).scale(0.2 if inside else 2)}})
+    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    images, others = render(scene, bdpt, range(12), 256), render(scene, bdpt, range(50, 62), 256)
+    hit = layer(images, bdpt, "unweighted.s0t3")
+    if hit.max() == 0:
+        assert images.max() == 0  # dark for one, dark for all
+        return
+    assert images[..., :3].max() > 0
+    agree(tiles(hit), tiles(layer(others, bdpt, "unweighted.s1t2")), 0.06)
+    agree(tiles(hit), tiles(layer(others, bdpt, "unweighted.s2t1")), 0.06)
+    seen = layer(images, bdpt, "unweighted.s0t2")
+    agree(tiles(seen), tiles(layer(others, bdpt, "unweighted.s1t1")), 0.06)
+
+
+def test_emitter_meshes_are_lit_on_one_side():
+    """3: the cases above light both sides between them; a test of darkness alone would prove nothing.
+    Expected: a rectangle, mirrored or not, emits along its normal only, for hits, next-event
+    estimation and emission alike.
+    """
+    for transform, flip, lit in (
+        (T(), False, True), (T(), True, False), (T().scale([-1, 1, 1]), False, None),
+    ):
+        scene = mi.load_dict({
+            "type": "scene", "sensor": camera((0, 0, 4), (0, 0, 0)),
+            "lamp": {"type": "rectangle", "to_world": transform, "flip_normals": flip,
+                     "emitter": {"type": "area", "radiance": 1.0}}})
+        bdpt = integrator(max_depth=1, skip="none", strategy_images=True)
+        images = render(scene, bdpt, range(2), 64)
+        hit, sampled = (layer(images, bdpt, f"unweighted.s{s}t{2 - s}").mean() for s in (0, 1))
+        assert (hit > 0) == (sampled > 0)
+        assert lit is None or (hit > 0) == lit
+
+
+def test_point_light_in_a_cornell_box_has_no_hot_pixel():
+    """4 (Mitsuba 0.6 132): a point light seen directly by a pinhole made one pixel above 80,000, and
+    ever hotter with the resolution. Expected: largest pixel below 12 times the median at 16x16 and
+    at 64x64: direct light on the ceiling over the lamp is that much brighter, a seen point light is
+    1e3 times and more.
+    """
+    for size in (16, 64):
+        scene = mi.cornell_box()
+        del scene["light"]
+        scene["sensor"]["film"] |= {"width": size, "height": size, "rfilter": {"type": "box"}}
+        scene["lamp"] = {"type": "point", "position": [0, 0.3, 0], "intensity": 1.0}
+        image = render(mi.load_dict(scene), integrator(max_depth=5), [3], 64)[0].mean(-1)
+        assert image.max() < 12 * np.median(image)
+
+
+@pytest.mark.parametrize("environment", [
+    {"type": "constant", "radiance": 0.8},
+    {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.8, np.float32))}],
+    ids=["constant", "envmap"])
+def test_environment_does_not_depend_on_other_objects(environment):
+    """5 (Mitsuba 0.6 80): brightness depended on other objects in the scene. A grey disk under a sky
+    of 0.8, alone, and with a small sphere far away, out of its sight, that makes the scene 30 times
+    larger. Expected: t = 1 alone, and everything, give 0.8 x 0.5 on the disk. Tolerance: the
+    confidence interval, below 2 %, for t = 1 in the large scene 20 %. Statistic: t-test, 16 seeds.
+    """
+    for far, tolerance in (({}, 0.02), ({"far": {
+            "type": "sphere", "center": [0, -60, 0], "bsdf": diffuse(0)}}, 0.5)):
+        scene = mi.load_dict({
+            "type": "scene", "sensor": camera((0, 3, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
+            "disk": {"type": "disk", "bsdf": diffuse(0.5, 1),
+                     "to_world": T().rotate([1, 0, 0], -90).scale(2)},
+            "sky": environment} | far)
+        bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+        images = render(scene, bdpt, range(16), 256)
+        splat = layer(images, bdpt, "unweighted.s2t1").mean((1, 2, 3))
+        known(splat, 0.4, tolerance)
+        known(images[..., :3].mean((1, 2, 3)), 0.4, 0.02)
+
+
+def known(samples, expected, relative):
+    """t-test of seeds against a known value; the interval must be narrower than ``relative``."""
+    reach = stats.t.isf(SIGNIFICANCE / 2, len(samples) - 1) * samples.std(ddof=1) / len(
+        samples) ** 0.5 + ROUNDING * abs(expected)
+    assert abs(samples.mean() - expected) < reach, (samples.mean(), expected, reach)
+    assert reach < relative * abs(expected), f"too noisy: {reach / abs(expected):.2e}"
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_crop_window_equals_the_region_of_the_whole(rfilter):
+    """6 (pbrt-v4 347, 456): crop windows changed the number of light paths per pixel, in the image but
+    not in the weights. Expected: each strategy's weighted image and the sum equal the same region of
+    the whole image (inner pixels: at the crop's border the filter lacks samples). Tolerance: the
+    confidence interval; bounded at 3 % for the sum, 0.3 for single strategies. Statistic: Welch, 16
+    seeds a side.
+    """
+    def scene(**film):
+        return mi.load_dict({
+            "type": "scene",
+            "sensor": camera((0, 0, 0.5), (0.3, 0.1, -1), fov=60, size=24, rfilter=rfilter, **film),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+            "lamp": {"type": "sphere", "radius": 0.1, "center": [0.2, 0.3, -0.4],
+                     "emitter": {"type": "area", "radiance": 5.0}}})
+
+    bdpt = integrator(max_depth=3, skip="none", strategy_images=True)
+    whole = render(scene(), bdpt, range(16), 128)[:, 5:15, 9:21]
+    part = render(scene(crop_offset_x=8, crop_offset_y=4, crop_width=14, crop_height=12), bdpt,
+                  range(50, 66), 128)[:, 1:11, 1:13]
+    assert part.shape == whole.shape
+    agree(tiles(part[..., :3], 2), tiles(whole[..., :3], 2), 0.03)
+    for k in (1, 2, 3):
+        for s in range(k + 1):
+            for kind in ("weighted", "unweighted"):
+                name = f"{kind}.s{s}t{k + 1 - s}"
+                agree(tiles(layer(part, bdpt, name), 2), tiles(layer(whole, bdpt, name), 2), 0.3)
+
+
+def test_narrow_spot_on_a_matte_floor():
+    """7 (pbrt-v4 362): on a floor lit directly by a narrow spot, light tracing (s=2, t=1) was trusted
+    too much. Expected: the variance with all strategies is below that of t = 1 alone and within the
+    balance bound of next-event estimation's, mu^2 per sample above it. Tolerance: a tenth (variances
+    from 64 seeds, summed over the lit pixels: 5 % noise). Statistic: ratio of summed variances.
+    """
+    spp = 16
+    scene = mi.load_dict({
+        "type": "scene", "sensor": camera((0, 4, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
+        "floor": {"type": "rectangle", "bsdf": diffuse(0.5),
+                  "to_world": T().rotate([1, 0, 0], -90).scale(3)},
+        "lamp": {"type": "spot", "cutoff_angle": 6, "intensity": 30.0,
+                 "to_world": T().look_at([1, 4, 1], [0, 0, 0], [0, 0, 1])}})
+    bdpt = integrator(max_depth=2, skip="none", strategy_images=True, points="independent")
+    images = render(scene, bdpt, range(64), spp)
+    mean, total = images[..., :3].mean(0), images[..., :3].var(0, ddof=1).sum()
+    splats, direct = (
+        layer(images, bdpt, f"unweighted.{name}").var(0, ddof=1).sum() for name in ("s2t1", "s1t2"))
+    assert splats > 10 * direct  # the scene shows what it is meant to show
+    assert total < splats
+    assert total < 1.1 * (direct + np.sum(mean**2) / spp)
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_borders_of_a_uniform_furnace(rfilter):
+    """8 (LuxCore 237, 239): dark or bright border rows with splats and filters. A sphere of radiance
+    0.5 and reflectance 0.5 in which splats carry much of the light. Expected: the ring of border
+    pixels has the radiance 0.75 of depth 2, as has the rest. Tolerance: the confidence interval,
+    below 1 %. Statistic: t-test over 16 seeds.
+    """
+    scene = mi.load_dict({
+        "type": "scene", "sensor": camera((0, 0, 0.5), (0, 0.1, -1), fov=60, rfilter=rfilter),
+        "wall": {"type": "sphere", "flip_normals": True, "bsdf": diffuse(0.5),
+                 "emitter": {"type": "area", "radiance": 0.5}}})
+    image = render(scene, integrator(max_depth=2, skip="none"), range(16), 256).mean(-1)
+    for border in (image[:, 0], image[:, -1], image[:, :, 0], image[:, :, -1]):
+        known(border.mean(1), 0.75, 0.01)
+
+
+@pytest.mark.parametrize("lamp_pane, camera_pane, emitter", [
+    (True, False, "point"), (False, True, "point"), (True, True, "point"), (True, True, "area"),
+    (True, False, "area")])
+def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(
+        lamp_pane, camera_pane, emitter):
+    """9 (LuxCore 678): brightness depended on the distance for certain paths. Removable panes force
+    strategies: one around the lamp leaves t = 1 and inner connections, with a lamp of area s = 0;
+    one around the camera leaves s = 1 and inner; both leave inner alone (after two reflections), or
+    s = 0. In a unit sphere of reflectance 1/2, light reflected twice or more has the radiance
+    phi / (4 pi) x (2^-m) / pi x ... wherever lamp and camera are: 2^-m here. Expected: 1/4 after two
+    reflections for three places of lamp and camera. Tolerance: the confidence interval, below 4 %.
+    Statistic: t-test over 16 seeds.
+    """
+    for lamp, eye in (((0, 0, 0), (0, 0.1, 0.5)), ((0.3, 0.5, -0.2), (0.3, 0, 0.7)),
+                      ((-0.6, 0.1, 0.3), (0.2, -0.6, 0.1))):
+        edges = 3 + lamp_pane + camera_pane
+        scene = {
+            "type": "scene", "sensor": camera(eye, (0.1, 0.1, -1), fov=50, size=8),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)}}
+        if emitter == "point":
+            scene["lamp"] = {"type": "point", "position": list(lamp), "intensity": float(np.pi)}
+        else:  # flux 4 pi^2: area 4 pi 0.05^2, radiance flux / (area pi)
+            scene["lamp"] = {"type": "sphere", "radius": 0.05, "center": list(lamp),
+                             "bsdf": {"type": "null"},
+                             "emitter": {"type": "area", "radiance": 1 / 0.05**2}}
+        for there, place in ((lamp_pane, lamp), (camera_pane, eye)):
+            if there:
+                scene[f"pane{place is eye}"] = {
+                    "type": "sphere", "radius": 0.08, "center": list(place),
+                    "bsdf": {"type": "null"}}
+        scene = mi.load_dict(scene)
+        bdpt = integrator(max_depth=edges, rr_depth=50, skip="none", strategy_images=True)
+        images = render(scene, bdpt, range(16), 512)
+        total = sum(layer(images, bdpt, f"weighted.s{s}t{edges + 1 - s}").mean((1, 2, 3))
+                    for s in range(edges + 1))
+        # Light that meets the other pane, or the lamp, on its way between the walls arrives later.
+        known(total, 0.25, 0.04)
+
+
+@pytest.mark.parametrize("weights", [(1, 1), (0.1, 5), (30, 1)], ids=str)
+def test_emitters_with_unequal_sampling_weights(weights):
+    """10 (LuxCore 671, 687): lights were picked with one probability by next-event estimation and with
+    another by emission. A point light in the centre (half of the light) and a small sphere, in the
+    unit sphere. Expected: all strategies that see a path alone agree on it: s = 1, inner and t = 1
+    at k = 3, and together they give the known radiance. Tolerance: the confidence interval, below
+    6 % (single strategies), 1 % (all). Statistic: t-test over 16 seeds.
+    """
+    scene = mi.load_dict({
+        "type": "scene", "sensor": camera((0, 0, 0.5), (0, 0.1, -1), fov=60),
+        "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+        "one": {"type": "point", "intensity": float(np.pi) / 2, "sampling_weight": weights[0]},
+        "two": {"type": "point", "position": [0.3, 0.2, -0.1], "intensity": float(np.pi) / 2,
+                "sampling_weight": weights[1]}})
+    bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
+    images = render(scene, bdpt, range(16), 256)
+    for s in (1, 2, 3):
+        known(layer(images, bdpt, f"unweighted.s{s}t{4 - s}").mean((1, 2, 3)), 0.25, 0.3)
+    total = sum(layer(images, bdpt, f"weighted.s{s}t{4 - s}").mean((1, 2, 3)) for s in range(4))
+    known(total, 0.25, 0.02)
+
+
+BSDFS = {
+    "diffuse": {"type": "diffuse"},
+    "roughconductor": {"type": "roughconductor", "alpha": 0.2},
+    "anisotropic": {"type": "roughconductor", "alpha_u": 0.1, "alpha_v": 0.4},
+    "roughdielectric": {"type": "roughdielectric", "alpha": 0.3},
+    "plastic": {"type": "plastic"},
+    "roughplastic": {"type": "roughplastic", "alpha": 0.2},
+    "pplastic": {"type": "pplastic", "alpha": 0.2},
+    "principled": {"type": "principled", "roughness": 0.3, "metallic": 0.3, "clearcoat": 0.5,
+                   "spec_trans": 0.4, "flatness": 0.0},
+    "principledthin": {"type": "principledthin", "roughness": 0.3, "spec_trans": 0.3,
+                       "diff_trans": 0.6},
+    "twosided": {"type": "twosided", "bsdf": {"type": "roughplastic"}},
+    "mask": {"type": "mask", "opacity": 0.4, "bsdf": {"type": "diffuse"}},
+    "blend": {"type": "blendbsdf", "weight": 0.3, "a": {"type": "diffuse"},
+              "b": {"type": "roughconductor", "alpha": 0.3}},
+    "hair": {"type": "hair"},
+    "measured": None,
+}
+del BSDFS["measured"]  # needs a data file
+
+
+@pytest.mark.parametrize("name", BSDFS)
+@pytest.mark.parametrize("adjoint", [False, True], ids=["camera", "light"])
+def test_sampled_density_is_the_density(name, adjoint):
+    """11 (pbrt-v4 f739c887): sample() returned another density than pdf(), which makes fireflies
+    through the weights. For each plugin: the step that a walk takes. Expected: `pdf_fwd` equals
+    pdf(), `pdf_rev` that of the reverse, within 1e-3 (float32) for all but one sample in 10,000
+    (grazing ones); weight x pdf_fwd equals the BSDF's value times the cosine, which is what makes a
+    strategy's contribution f / p. Statistic: none, equality sample by sample.
+    """
+    plugin = mi.load_dict(BSDFS[name])
+    rng = np.random.default_rng(5)
+    n = 20000
+    u = rng.random((6, n), dtype=np.float32)
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.t = mi.Float(1)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.uv = mi.Point2f(0.5)
+    si.wi = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
+    pointer = mi.BSDFPtr(plugin)
+    full = bsdf_module.needs_full_pdf([plugin])
+    take = bsdf_module.sample_adjoint if adjoint else bsdf_module.sample
+    active = mi.Bool(dr.abs(si.wi.z) > 0.02)
+    step = take(pointer, si, mi.Float(u[2]), mi.Point2f(u[3], u[4]), active, full)
+    smooth = (active & ~step.delta & (step.pdf_fwd > 0) & (dr.max(step.weight) > 0)
+              & (dr.abs(step.wo.z) > 0.02))
+    ctx = mi.BSDFContext()
+    pdf = pointer.pdf(ctx, si, step.wo, smooth)
+    evaluate = bsdf_module.evaluate_adjoint if adjoint else bsdf_module.evaluate
+    f = evaluate(pointer, si, step.wo, smooth)
+    keep = np.array(smooth)
+    assert keep.sum() > n / 20
+
+    def off(a, b):
+        a, b = np.array(a)[..., keep], np.array(b)[..., keep]
+        return np.mean(np.abs(a - b) > 1e-3 * np.abs(b) + 1e-6)
+
+    assert off(step.pdf_fwd, pdf) < 1e-4
+    assert off(step.pdf_fwd, f.pdf_fwd) < 1e-4
+    assert off(step.pdf_rev, f.pdf_rev) < 1e-4
+    assert off(step.weight * step.pdf_fwd, f.value) < 1e-3
+
+
+def test_directional_light_on_a_wide_floor():
+    """12 (pbrt-v3 69, 21f2ece): a directional light was treated as point-like. A floor much wider than
+    the view, lit at 40 degrees. Expected: rho E cos / pi in every tile, for s = 1 exactly, for t = 1
+    alone and for all together; doubling the floor changes nothing. Tolerance: the confidence
+    interval, below 10 % for t = 1, 1e-3 for the rest. Statistic: t-test over 16 seeds.
+    """
+    expected = 0.5 * 3 * np.cos(np.deg2rad(40)) / np.pi
+    for size in (3, 6):
+        scene = mi.load_dict({
+            "type": "scene", "sensor": camera((0, 4, 0), (0, 0, 0), fov=40, up=(0, 0, 1)),
+            "floor": {"type": "rectangle", "bsdf": diffuse(0.5),
+                      "to_world": T().rotate([1, 0, 0], -90).scale(size)},
+            "sun": {"type": "directional", "irradiance": 3.0,
+                    "direction": [float(np.sin(np.deg2rad(40))), -float(np.cos(np.deg2rad(40))), 0]}})
+        bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+        images = render(scene, bdpt, range(16), 256)
+        known(layer(images, bdpt, "unweighted.s1t2").mean((1, 2, 3)), expected, 1e-3)
+        splat = tiles(layer(images, bdpt, "unweighted.s2t1"), 8)
+        for tile in splat.T:
+            known(tile, expected, 0.2)
+        known(splat.mean(1), expected, 0.1)
+        known(images[..., :3].mean((1, 2, 3)), expected, 0.02)
+
+
+def test_point_light_in_a_glass_shell_lights_the_room():
+    """15 (mitsuba2 262, mitsuba3 1462): a lamp behind glass lights nothing, for `path` cannot find
+    it. A point light in a shell of glass in the unit sphere. All light that leaves the shell is
+    reflected on; glass absorbs nothing, so with every bounce the room is as bright as without the
+    shell: 1 after all bounces but for paths that meet the shell again. Expected: `path` sees
+    black; we see the flux times the transmittance of the two interfaces after one reflection
+    (multiple reflections within the shell at higher depth). Tolerance: the confidence interval,
+    below 4 %. Statistic: t-test over 16 seeds.
+    """
+    scene = mi.load_dict({
+        "type": "scene", "sensor": camera((0, 0, 0.6), (0, 0.5, 1), fov=50, size=8),
+        "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+        "outer": {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric", "int_ior": 1.5}},
+        "inner": {"type": "sphere", "radius": 0.25, "flip_normals": False,
+                  "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}},
+        "lamp": {"type": "point", "intensity": float(np.pi)}})
+    assert render(scene, integrator("path", max_depth=6), [1], 16).max() == 0
+    transmittance = (1 - ((1.5 - 1) / (1.5 + 1)) ** 2) ** 2
+    for skip in ("none", "auto"):
+        images = render(scene, integrator(max_depth=4, skip=skip), range(16), 512)
+        known(images.mean((1, 2, 3)), 0.5 * transmittance, 0.04)
