@@ -18,8 +18,9 @@ ROOT = Path(__file__).resolve().parents[1]
 # (scale of the unit-sized shape, distance by which it is moved in each coordinate)
 PLACES = {"small": (1e-3, 0.0), "unit": (1.0, 0.0), "large": (1e3, 0.0), "moved": (1.0, 1e3)}
 
-CLOSED = {"sphere", "cube", "mesh", "instance", "sdfgrid"}
-SMOOTHED = {"sdfgrid"}  # not exactly convex
+CLOSED = {"sphere", "cube", "mesh", "instance"}
+CONVEX = CLOSED | {"disk", "rectangle", "bsplinecurve", "linearcurve"}  # sdfgrid: not exactly
+FLAT = {"disk", "rectangle"}  # both sides are outside
 
 
 def _curve(folder, kind, scale, shift):
@@ -40,9 +41,7 @@ def _mesh(folder, transform):
     for j in range(6):
         for i in range(12):
             a, b = j * 12 + i, j * 12 + (i + 1) % 12
-            faces += [[a, a + 12, b]] if j < 5 else []
-            faces += [[b, a + 12, b + 12]] if j > 0 else []
-            faces += [[a, a + 12, b]] if j == 5 else []
+            faces += [[a, a + 12, b], [b, a + 12, b + 12]]
     faces = [f for f in faces if len({tuple(np.round(p[k], 6)) for k in f}) == 3]
     mesh = mi.Mesh("ball", len(p), len(faces), has_vertex_normals=True)
     values = mi.traverse(mesh)
@@ -75,13 +74,17 @@ def shape_scene(kind, place, folder):
     elif kind == "mesh":
         shape = {"shape": _mesh(folder, transform)}
     elif kind == "sdfgrid":
-        shape = {"shape": _sdf(transform)}
+        shape = {"shape": _sdf(t().translate([shift] * 3) @ t().scale(scale))}  # takes no rotation
     elif kind == "instance":
         shape = {
             "group": {"type": "shapegroup", "ball": _mesh(folder, turn)},
             "shape": {"type": "instance", "group": {"type": "ref", "id": "group"},
                       "to_world": t().translate([shift] * 3) @ t().scale(scale)},
         }
+    elif kind == "cylinder":
+        ends = np.array([[-0.3, 0.2, -1], [0.3, -0.1, 1]]) * scale + shift
+        shape = {"shape": {"type": kind, "p0": ends[0].tolist(), "p1": ends[1].tolist(),
+                           "radius": 0.6 * scale}}
     else:
         shape = {"shape": {"type": kind, "to_world": transform}}
     return mi.load_dict({"type": "scene", **shape})
@@ -117,13 +120,12 @@ def bad_rays(kind, place, folder, n, seed=0):
         cos = dr.dot(d, si.n)
         hit &= dr.abs(cos) > 1e-6  # along the surface: no side, and no light either
         again = scene.ray_intersect(rays.spawn(anchor, d, ray), hit)
-        near = again.is_valid() & (again.t < 10 * anchor.offset) & (dr.abs(dr.dot(again.n, si.n)) > 0.9)
-        if kind not in SMOOTHED | {"cylinder"}:  # from a convex surface outwards there is nothing
-            outwards = (cos > 0) if kind in CLOSED else mi.Bool(True)
-            if kind in ("bsplinecurve", "linearcurve"):
-                outwards = cos > 0
-            near |= again.is_valid() & outwards
-        own += int(dr.count(hit & near)[0])
+        # Its own start: a hit nearby with the same normal; from a convex surface outwards, any hit.
+        found = again.is_valid() & (again.t < 10 * anchor.offset)
+        found &= dr.abs(dr.dot(again.n, si.n)) > 0.999
+        if kind in CONVEX:
+            found |= again.is_valid() & (mi.Bool(kind in FLAT) | (cos > 0))
+        own += int(dr.count(hit & found)[0])
         if kind in CLOSED:
             leaks += int(dr.count(hit & (cos < 0) & ~again.is_valid())[0])
         total += int(dr.count(hit)[0])

@@ -63,22 +63,32 @@ def connectible(bsdf):
 
 def evaluate(bsdf, si, wo, active) -> Evaluation:
     """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
-    ctx = mi.BSDFContext()
-    value, pdf_fwd = bsdf.eval_pdf(ctx, si, wo, active)
-    pdf_rev = bsdf.pdf(ctx, with_wi(si, wo), si.wi, active)
-    return Evaluation(value, pdf_fwd, pdf_rev)
+
+    def ask(self, si, wo, active):
+        ctx = mi.BSDFContext()
+        value, pdf_fwd = self.eval_pdf(ctx, si, wo, active)
+        return value, pdf_fwd, self.pdf(ctx, with_wi(si, wo), si.wi, active)
+
+    # All questions in one virtual call: its arguments go through memory.
+    return Evaluation(*dr.dispatch(bsdf, ask, si, wo, active))
 
 
-def evaluate_adjoint(bsdf, si, wo, active) -> Evaluation:
+def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
     """BSDF of a light vertex towards the local direction ``wo`` (to the camera's side).
 
-    ``value`` includes |n.wo| / |n.wi| with the geometric normal.
+    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal,
+    which is computed unless given.
     """
-    ctx = mi.BSDFContext()
-    value, pdf_rev = bsdf.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
-    pdf_fwd = bsdf.pdf(ctx, si, wo, active)
-    ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
-    return Evaluation(value * ratio, pdf_fwd, pdf_rev)
+
+    def ask(self, si, wo, active):
+        ctx = mi.BSDFContext()
+        value, pdf_rev = self.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
+        return value, self.pdf(ctx, si, wo, active), pdf_rev
+
+    value, pdf_fwd, pdf_rev = dr.dispatch(bsdf, ask, si, wo, active)
+    if cos_ratio is None:
+        cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
+    return Evaluation(value * cos_ratio, pdf_fwd, pdf_rev)
 
 
 def geometric_cos(si, w):
@@ -86,40 +96,65 @@ def geometric_cos(si, w):
     return dr.abs(dr.dot(si.n, si.to_world(w)))
 
 
-def sample(bsdf, si, u1, u2, active, full_pdf: bool) -> Step:
+def sample(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -> Step:
     """Continue a camera subpath. ``u1`` picks the lobe, ``u2`` the direction.
 
-    ``full_pdf`` asks pdf() instead of trusting sample(), see `needs_full_pdf`.
+    ``full_pdf`` asks pdf() instead of trusting sample(), see `needs_full_pdf`; ``round_trip`` see
+    `needs_round_trip`.
     """
-    ctx = mi.BSDFContext()
-    bs, weight = bsdf.sample(ctx, si, u1, u2, active)
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    smooth = active & ~delta
-    pdf_fwd = bsdf.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
-    pdf_rev = bsdf.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
-    return _step(si, bs, weight, pdf_fwd, pdf_rev)
+
+    def ask(self, si, u1, u2, active):
+        ctx = mi.BSDFContext()
+        bs, weight = self.sample(ctx, si, u1, u2, active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        smooth = active & ~delta
+        pdf_fwd = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
+        pdf_rev = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
+        reversible = mi.Bool(True)
+        if round_trip:
+            back, _ = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Importance)
+            reversible = ~delta | back
+        return bs, weight, pdf_fwd, pdf_rev, reversible
+
+    bs, weight, pdf_fwd, pdf_rev, reversible = dr.dispatch(bsdf, ask, si, u1, u2, active)
+    step = _step(si, bs, weight, pdf_fwd, pdf_rev)
+    if round_trip:  # no alternative that would have to make this event from the other side
+        step.cos_out = dr.select(reversible, step.cos_out, 0)
+    return step
 
 
-def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool) -> Step:
-    """Continue a light subpath; the adjoint factor is part of ``weight``."""
-    ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    bs, mitsuba_weight = bsdf.sample(ctx, si, u1, u2, active)
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    smooth = active & ~delta
-    radiance = mi.BSDFContext()
-    value, pdf_rev = bsdf.eval_pdf(radiance, with_wi(si, bs.wo), si.wi, smooth)
-    pdf_fwd = bsdf.pdf(radiance, si, bs.wo, smooth) if full_pdf else bs.pdf
+def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -> Step:
+    """Continue a light subpath; the adjoint factor is part of ``weight``. Arguments as `sample`."""
+
+    def ask(self, si, u1, u2, active):
+        bs, mitsuba_weight = self.sample(
+            mi.BSDFContext(mi.TransportMode.Importance), si, u1, u2, active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        smooth = active & ~delta
+        ctx = mi.BSDFContext()
+        value, pdf_rev = self.eval_pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
+        pdf_fwd = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
+        delta_weight = mitsuba_weight
+        if round_trip:  # the radiance that a camera subpath carries, without its factor eta^-2
+            back, weight = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Radiance)
+            delta_weight = dr.select(back, weight / dr.square(bs.eta), 0)
+        # A direction that Mitsuba rejects has weight 0, whatever its pdf says.
+        valid = (bs.pdf > 0) & (delta | (pdf_fwd > 0))
+        valid &= dr.max(dr.abs(mi.unpolarized_spectrum(mitsuba_weight))) > 0
+        weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd)
+        return bs, dr.select(valid, weight, 0), pdf_fwd, pdf_rev
+
+    bs, weight, pdf_fwd, pdf_rev = dr.dispatch(bsdf, ask, si, u1, u2, active)
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
-    weight = dr.select(
-        delta,
-        mitsuba_weight * (_event_cos_ratio(si, bs) * cos_ratio),
-        value * (cos_ratio / pdf_fwd),
-    )
-    # A direction that Mitsuba rejects has weight 0, whatever its pdf says.
-    valid = (bs.pdf > 0) & (delta | (pdf_fwd > 0))
-    valid &= dr.max(dr.abs(mi.unpolarized_spectrum(mitsuba_weight))) > 0
-    weight = dr.select(valid, weight, 0)
+    weight = dr.select(dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0, weight * cos_ratio, 0)
     return _step(si, bs, weight, pdf_fwd, pdf_rev)
+
+
+def _back(bsdf, si, bs, u1, u2, active, mode):
+    """Sample a delta event from its other end; whether it leads back, and its weight."""
+    back, weight = bsdf.sample(mi.BSDFContext(mode), with_wi(si, bs.wo), u1, u2, active)
+    same = dr.squared_norm(back.wo - si.wi) < 1e-4
+    return same & (dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0), weight
 
 
 def _event_cos_ratio(si, bs):
@@ -129,6 +164,7 @@ def _event_cos_ratio(si, bs):
     m = bs.eta * bs.wo + si.wi  # bs.eta = eta_c / eta_l when sampling from l
     ratio = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
     refracted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
+    refracted &= dr.abs(bs.eta - 1) > 1e-5  # equal indices: straight on, and m is zero
     return dr.select(refracted, ratio, 1)
 
 
@@ -152,6 +188,18 @@ def needs_full_pdf(bsdfs) -> bool:
     in the weights of multiple importance sampling, nor as divisor of a full evaluation.
     """
     return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in nested(bsdfs))
+
+
+def needs_round_trip(bsdfs) -> bool:
+    """Whether a delta event may exist from one end only: under a bump or normal map.
+
+    Mitsuba's maps drop sampled directions (not incident ones) on different sides of the surface and
+    of the perturbed normal, and turn the normal towards the incident direction.
+    """
+    return any(
+        b.class_name() in ("BumpMap", "NormalMap") and mi.has_flag(b.flags(), mi.BSDFFlags.Delta)
+        for b in nested(bsdfs)
+    )
 
 
 def nested(bsdfs):

@@ -41,7 +41,8 @@ class Contribution:
 class LightPath:
     """Connectible vertices of a lane's light subpath in local memory, ``count`` of them.
 
-    ``throughput`` is that of the vertex; ``s`` the number of light vertices up to and including it.
+    ``throughput`` is that of the vertex over its cosine of incidence (the constant part of the adjoint
+    factor); ``s`` the number of light vertices up to and including it.
     """
 
     si: object
@@ -70,7 +71,7 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
     keep = vertex.hit & (vertex.edges <= kernel.last_stored) & bsdf.connectible(vertex.bsdf)
     slot = path.count
     path.si.write(vertex.si, slot, keep)
-    path.throughput.write(mi.Spectrum(vertex.throughput), slot, keep)
+    path.throughput.write(mi.Spectrum(vertex.throughput / vertex.cos), slot, keep)
     path.partial.write(mi.Vector2f(vertex.partial.d_vcm, vertex.partial.d_vc), slot, keep)
     path.anchor.write(vertex.anchor.offset, slot, keep)
     path.s.write(vertex.edges + 1, slot, keep)
@@ -85,6 +86,7 @@ def read_light_vertex(path: LightPath, slot) -> Vertex:
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
+        cos=mi.Float(1),
         anchor=rays.Anchor(si.p, si.n, path.anchor[slot]),
         throughput=path.throughput[slot],
         partial=mis.Partial(partial.x, partial.y),
@@ -138,7 +140,7 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
     newest = dr.select(kernel.within_store(k), newest, 0)
     camera_side = mis.alternatives(
         h, mis.Partial(z.partial.d_vcm, older), newest, f.pdf_rev,
-        e.emission_ratio * bsdf.geometric_cos(z.si, wo),
+        e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
     weight = h.weight(NEXT_EVENT, light_side, camera_side)
 
@@ -197,8 +199,9 @@ def splat(kernel, y: Vertex, stream, counters):
     if kernel.plan.hide_emitters:
         active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)
     wo = y.si.to_local(join.d)
-    f = bsdf.evaluate_adjoint(y.bsdf, y.si, wo, active)
-    to_area = bsdf.geometric_cos(y.si, wo) / join.dist2
+    cos = dr.abs(dr.dot(y.si.n, join.d))
+    f = bsdf.evaluate_adjoint(y.bsdf, y.si, wo, active, cos / y.cos)
+    to_area = cos / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
     active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
@@ -231,8 +234,8 @@ def inner(kernel, z: Vertex, y: Vertex, counters) -> Contribution:
     d = between * dr.rsqrt(dist2)
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
     f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
-    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active)
-    cos_z, cos_y = bsdf.geometric_cos(z.si, wo_z), bsdf.geometric_cos(y.si, wo_y)
+    cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
+    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, cos_y / y.cos)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput) / dist2
     counters.evaluated += _one(active)
     nonzero = active & (dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0)

@@ -80,9 +80,10 @@ class Heuristic:
         ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
         alternatives with fewer and with more light vertices (eqs. 37 and 38).
         """
+        if self.name == "maximum":  # of equal ones, that with the fewest light vertices counts
+            best = (coefficient >= camera_side) & (coefficient > light_side)
+            return dr.select(best, 1.0, 0.0)
         others = self.combine(light_side, camera_side)
-        if self.name == "maximum":
-            return dr.select(coefficient >= others, 1.0, 0.0)
         if self.name == "uniform":
             return dr.rcp(1 + others)
         ratio = others / coefficient

@@ -42,10 +42,12 @@ class Walk:
 @dataclass
 class Vertex:
     """A vertex that a walk has reached; ``partial`` is in the area measure (camera subpaths that
-    left the scene: solid angle). ``anchor`` starts rays; ``hit`` is false in the surroundings."""
+    left the scene: solid angle). ``cos`` absolute geometric cosine of the edge to it; ``anchor``
+    starts rays; ``hit`` is false in the surroundings."""
 
     si: object
     bsdf: object
+    cos: object
     anchor: rays.Anchor
     throughput: object
     partial: mis.Partial
@@ -123,6 +125,7 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
+        cos=cos,
         anchor=rays.surface_anchor(si, walk.ray),
         throughput=walk.throughput,
         partial=partial,
@@ -142,7 +145,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
     take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
-    step = take(vertex.bsdf, si, u1, u2, active, kernel.full_pdf)
+    step = take(vertex.bsdf, si, u1, u2, active, kernel.full_pdf, kernel.round_trip)
     coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
