@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
-from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensors, subpath
+from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensors
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coefficients, Paths
 
 # n c: all classes, kappa different from every count, and classes left out.
@@ -537,14 +537,14 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         hide_emitters=False)
     k_ = SimpleNamespace(
         scene=scene, camera=Sensor(world), emitters=Lights(world), plan=plan,
-        heuristic=mis.Heuristic(name), full_pdf=False, strategy_images=False,
+        heuristic=mis.Heuristic(name), full_pdf=False, round_trip=False,
+        strategy_images=False,
         max_depth=u32(k), rr_depth=u32(10**6), last_stored=u32(k - 2 if k > 2 else 0),
         last_inner=u32(k), last_light=u32(k - 1), count_light=f(1),
         coefficient_splat=f(kappa.splat), coefficient_endpoints=f(kappa.endpoints),
         coefficient_inner=f(kappa.inner), points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
         to_rgb=lambda value, wavelengths: mi.Color3f(value))
-    k_.camera_side = subpath.Side("camera", False, k_.max_depth, k_.coefficient_splat)
     result = [f(0)] * (k + 1)
     stored = []
 
@@ -577,6 +577,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         (connect.inner, lambda z, y, *_: (edges(y) + 1, edges(y) + edges(z) + 1)),
     ):
         monkeypatch.setattr(connect, function.__name__, record(function, edges_of))
+    monkeypatch.setattr(dr, "dispatch", lambda bsdf, function, *arguments: function(bsdf, *arguments))
     monkeypatch.setattr(connect, "store_light_vertex", lambda kernel_, y, path: stored.append(y))
     monkeypatch.setattr(connect, "connect_all", connect_all)
 
@@ -604,9 +605,9 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
 def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
     """Rationale: right arithmetic with the wrong argument is still wrong; see the module.
 
-    200 random paths each of k = 1, 2, 3, 4 and 6 edges, fixed seed, all kinds of emitters, a fifth of the
-    vertices delta, half of these with a BSDF that has other lobes too, shading frames unrelated
-    to geometric normals. Expected: every weight equals the oracle's to 1e-3 of its own size
+    200 random paths each of k = 1, 2, 3, 4 and 6 edges, fixed seed, all kinds of emitters, a fifth
+    of the vertices delta, half of these with a BSDF that has other lobes too, shading frames
+    unrelated to geometric normals. Expected: every weight equals the oracle's to 1e-3 of its own size
     (cosines of at least 0.1, computed in float32 through a change of frame, carry 1e-5 each; up to
     20 of them enter a weight), sums are 1 within 1e-4 for the paths with a strategy in use.
     """
@@ -617,3 +618,134 @@ def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch)
         with monkeypatch.context() as patch:
             weights = kernel_weights(world, kappa, name, patch)
         check(world.paths, kappa, name, weights, relative=1e-3)
+
+
+# -- layer 3: densities of real scenes ---------------------------------------------------------------
+
+T = mi.ScalarTransform4f
+
+
+def lamp(shape, weight=1.0):
+    return {**shape, "bsdf": {"type": "diffuse", "reflectance": 0.0},
+            "emitter": {"type": "area", "radiance": 3.0, "sampling_weight": weight}}
+
+
+def sky_map():
+    pixels = np.random.default_rng(5).uniform(0.2, 2, (8, 16, 3)).astype(np.float32)
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels),
+            "to_world": T().rotate([1, 0, 0], 50).rotate([0, 1, 0], 30)}
+
+
+TURN = T().translate([0.3, 0.2, -0.4]).rotate([0, 1, 0], 25)
+EMITTERS = {
+    "sphere": [lamp({"type": "sphere", "center": [0.3, 0.2, -0.4], "radius": 0.4})],
+    "glowing inside": [lamp({"type": "sphere", "radius": 8.0, "flip_normals": True})],
+    "rectangle": [lamp({"type": "rectangle", "to_world": TURN.scale(0.5)})],
+    "disk": [lamp({"type": "disk", "to_world": TURN.scale(0.5)})],
+    "cylinder": [lamp({"type": "cylinder", "radius": 0.3, "to_world": TURN})],
+    "mesh": [lamp({"type": "cube", "to_world": TURN.scale(0.3)})],
+    "constant": [{"type": "constant", "radiance": 1.0}],
+    "envmap": [sky_map()],
+    "several": [
+        lamp({"type": "sphere", "center": [-1, 0.5, 0], "radius": 0.3}, 0.7),
+        lamp({"type": "rectangle", "to_world": T().translate([1, 0, 0]).scale(0.4)}, 3.0),
+        {"type": "point", "position": [0, 1.5, 0], "intensity": 1.0}, sky_map()],
+}
+
+
+def real_scene(name):
+    """The emitters between a floor and a ball."""
+    return mi.load_dict({
+        "type": "scene",
+        "floor": {"type": "rectangle", "to_world": T().translate([0, -2, 0]).rotate(
+            [1, 0, 0], -90).scale(4)},
+        "ball": {"type": "sphere", "center": [0.5, 0, 2.5], "radius": 0.8},
+        **{f"emitter {i}": e for i, e in enumerate(EMITTERS[name])}})
+
+
+def relative_gap(a, b, mask):
+    """Relative differences where ``mask`` holds."""
+    mask = np.broadcast_to(mask.numpy(), 4096)
+    a, b = (np.broadcast_to(x.numpy(), 4096)[mask] for x in (a, b))
+    assert mask.sum() > 100
+    return np.abs(a - b) / np.abs(b)
+
+
+def assert_equal(a, b, mask):
+    """Equal to 2e-3 for 95 % of the samples. Hit points are float32: where a surface is nearly seen
+    from the side a position's last digit decides the cosine, and at an edge the face."""
+    assert np.quantile(relative_gap(a, b, mask), 0.95) < 2e-3
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_densities_of_emission_are_those_of_hits(name):
+    """Rationale: a path's densities are computed in four places (emission, first light vertex,
+    next-event estimation, hit by a camera subpath); weights are right only if all agree.
+
+    4,096 emissions are traced to y_1 and back to y_0; next-event samples from y_1 likewise.
+    Expected: the same three densities from both ends. Tolerance: see `assert_equal`.
+    """
+    scene, n = real_scene(name), 4096
+    assert scene.shapes()  # as a render does first: it decides of which Python class they are
+    lights = emitters.Emitters(scene)
+    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    rng = mi.PCG32(n)
+
+    def pair():
+        return mi.Point2f(rng.next_float32(), rng.next_float32())
+
+    e = lights.sample_emission(pair(), pair(), like, mi.Bool(True))
+    ray = rays.spawn(e.anchor, e.d, like)
+    y1 = scene.ray_intersect(ray)
+    there = y1.is_valid() & ~e.delta
+    anchor = rays.surface_anchor(y1, ray)
+    y0 = scene.ray_intersect(rays.spawn(anchor, -e.d, like), there)
+    near = dr.norm(y0.p - e.si.p) < 1e-3
+    there &= dr.select(e.infinite, ~y0.is_valid(), y0.is_valid() & near)
+    connect_, first, second = lights.hit_densities(y0, y1.p, there)
+    scale = dr.select(e.infinite, 1, dr.squared_norm(y0.p - y1.p))
+    assert_equal(e.pdf_first, first, there)
+    assert_equal(e.pdf_second, second, there)
+    assert_equal(lights.connection_density(e, y1, there), connect_ * scale, there)
+
+    direct = lights.sample_direct(y1, pair(), y1.is_valid())
+    there = y1.is_valid() & (dr.max(direct.weight) > 0) & ~direct.delta
+    z0 = scene.ray_intersect(rays.spawn(anchor, direct.d, like), there)
+    near = dr.norm(z0.p - direct.anchor.p) < 1e-3
+    there &= dr.select(direct.infinite, ~z0.is_valid(), z0.is_valid() & near)
+    connect_, first, second = lights.hit_densities(z0, y1.p, there)
+    dist2 = dr.squared_norm(z0.p - y1.p)
+    to_area = dr.select(direct.infinite, 1, dr.abs(dr.dot(z0.n, direct.d)) / dist2)
+    assert_equal(direct.pdf * to_area, connect_, there)
+    ratio = first * second / (connect_ * dr.select(direct.infinite, 1, dist2))
+    assert_equal(direct.emission_ratio, ratio, there & (ratio > 0))
+
+
+@pytest.mark.parametrize("crop", [False, True])
+@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
+def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
+    """Rationale: the density of a camera ray enters s = 0 and s = 1, that of a join t = 1.
+
+    4,096 camera rays to random distances are joined back from there. Expected: the same density,
+    distance and direction to 1e-4 (float32 through a 4x4 matrix), the film position to 0.01 pixels.
+    """
+    more = {"aperture_radius": 0.1, "focus_distance": 2.5} if kind == "thinlens" else {}
+    window = {"crop_width": 20, "crop_height": 10, "crop_offset_x": 7, "crop_offset_y": 11}
+    sensor = mi.load_dict({
+        "type": kind, "fov": 70, "near_clip": 0.05, "far_clip": 100,
+        "to_world": T().look_at([1, 2, 3], [0.2, 0.1, -1], [0, 1, 0.1]),
+        "film": {"type": "hdrfilm", "width": 40, "height": 30, **(window if crop else {})}, **more})
+    camera = sensors.Camera(sensor)
+    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    rng = mi.PCG32(4096)
+    u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]
+    width, height = (int(x) for x in sensor.film().crop_size())
+    index = mi.UInt32(u[2].x * (width * height - 1))
+    start = camera.start(camera.pixel(index), u[0], u[1], like)
+    join = camera.join(start.p + start.ray.d * (0.5 + 5 * u[2].y), u[1])
+    everything = mi.Bool(np.ones(4096, dtype=bool))
+    inside = np.array(join.valid)
+    assert inside.mean() > 0.999  # rounding may move a ray over the film's edge
+    assert relative_gap(join.importance, start.pdf_w, everything).max() < 1e-4
+    assert dr.max(dr.norm(join.d + start.ray.d)) < 1e-4
+    assert np.abs(np.array(join.position) - np.array(start.position)).max() < 0.01

@@ -27,7 +27,7 @@ def _curve(folder, kind, scale, shift):
     """A straight curve of constant radius, so that it is convex."""
     points = np.linspace([-1, -0.5, -0.2], [1, 0.5, 0.3], 6) * scale + shift
     path = folder / f"{kind}-{scale}-{shift}.txt"
-    lines = [" ".join(f"{x:.9g}" for x in (*p, 0.05 * scale)) for p in points]
+    lines = [" ".join(f"{x:.9g}" for x in (*p, 0.2 * scale)) for p in points]
     path.write_text("\n".join(lines) + "\n")
     return {"type": kind, "filename": str(path)}
 
@@ -134,3 +134,189 @@ def bad_rays(kind, place, folder, n, seed=0):
 
 KINDS = ["sphere", "cylinder", "disk", "rectangle", "cube", "mesh", "instance", "bsplinecurve",
          "linearcurve", "sdfgrid"]
+# Hits per kind of shape, over all places (two rays each). SDF grids take 50 times longer a ray.
+HITS = {"sdfgrid": 100_000}
+
+
+def _allowed(kind, place, total):
+    """How many of ``total`` hits may go wrong.
+
+    Linear curves: Embree's own precision, far from the origin (design.md: at most 1e-3), and where
+    radii are below 1e-3 (0.1-0.5 % of first hits lie inside the curve, whatever the offset). Cubes
+    and meshes moved away: within rounding (3e-5) of an edge a hit may itself lie outside the shape.
+    """
+    if kind == "linearcurve":
+        return total * {"small": 1e-2, "moved": 1e-3}.get(place, 0), 0
+    return 0, total * 1e-4 if place == "moved" else 0
+
+
+def _check_bad_rays(kind, folder, n):
+    for place in PLACES:
+        own, leaks, total = bad_rays(kind, place, folder, n // 4)
+        most_own, most_leaks = _allowed(kind, place, total)
+        assert total > 0.005 * n
+        assert own <= most_own, f"{kind}, {place}: {own} of {total} hits find their own start"
+        assert leaks <= most_leaks, f"{kind}, {place}: {leaks} of {total} rays leak"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_ray_finds_its_own_start(kind, tmp_path):
+    """Rays leave the surface that they start on, and none leaves a closed shape through it.
+
+    Rationale: known failure 13; the offset must clear the rounding error of the hit on every shape
+    at every scale. Scene: one shape, convex where its kind allows, at scales 1e-3, 1 and 1e3 and
+    moved by 1e3. Expected: of hits by rays from all sides, none finds its start again (from convex
+    shapes outwards: nothing at all), and none of the rays that go into a closed shape fails to meet
+    its other side. Counts, not statistics: a million hits (SDF grids: 1e5). With 8 ulps instead of
+    32, cylinders fail on 0.1 %, with 4 spheres, rectangles, cubes and instances too.
+    """
+    _check_bad_rays(kind, tmp_path, HITS.get(kind, 1_000_000))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_ray_of_ten_million_finds_its_own_start(kind, tmp_path):
+    """As `test_no_ray_finds_its_own_start`, with ten times the rays."""
+    _check_bad_rays(kind, tmp_path, 10 * HITS.get(kind, 1_000_000))
+
+
+def _points(place, n, rng, z, half=1.0):
+    """Anchors on the plane at height ``z`` (unit scale), found by rays from a point beside it."""
+    scale, shift = PLACES[place]
+    x, y = (2 * rng.next_float32() - 1) * half, (2 * rng.next_float32() - 1) * half
+    return mi.Point3f(x, y, z) * scale + shift
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_thin_walls_block_and_ends_do_not(place, tmp_path):
+    """A segment through a thin wall is blocked; without the wall, its ends do not block it.
+
+    Rationale: known failure 13: Mitsuba's offsets jump over walls of 1e-4 and shorten segments by a
+    relative 9e-4. Scene: two squares that face each other 0.02 apart, between them a plate 1e-3
+    thick, as large as the squares; 1e6 pairs of points, found by rays. Expected: with the plate all
+    segments between the squares are blocked, without it none. The moved scene, where coordinates
+    of 1e3 leave steps of 6e-5, has ten times the gap and the thickness.
+    """
+    n = 1 << 20
+    scale, shift = PLACES[place]
+    wide = 10 if place == "moved" else 1
+    t = mi.ScalarTransform4f
+    to_place = t().translate([shift] * 3) @ t().scale(scale)
+    gap = 0.01 * wide
+    squares = {
+        "below": {"type": "rectangle", "to_world": to_place @ t().translate([0, 0, -gap])},
+        "above": {"type": "rectangle",
+                  "to_world": to_place @ t().translate([0, 0, gap]) @ t().rotate([1, 0, 0], 180)},
+    }
+    plate = {"type": "cube", "to_world": to_place @ t().scale([1.5, 1.5, 5e-4 * wide])}
+    open_scene = mi.load_dict({"type": "scene", **squares})
+    walled = mi.load_dict({"type": "scene", **squares, "plate": plate})
+    rng = mi.PCG32(n, 3)
+    anchors = []
+    for z, side in ((-gap, 1), (gap, -1)):
+        target = _points(place, n, rng, z, 0.99)
+        # From between plate and square, so that the point is found with the plate in place.
+        origin = _points(place, n, rng, z + side * 0.5 * gap, 0.99)
+        ray = mi.Ray3f(origin, dr.normalize(target - origin))
+        si = open_scene.ray_intersect(ray)
+        assert dr.all(si.is_valid())
+        anchors.append(rays.surface_anchor(si, ray))
+    like = dr.zeros(mi.SurfaceInteraction3f, n)
+    for a, b in (anchors, anchors[::-1]):
+        segment = rays.segment(a, b, like)
+        assert int(dr.count(~walled.ray_test(segment))[0]) == 0, "leaks through the plate"
+        assert int(dr.count(open_scene.ray_test(segment))[0]) == 0, "blocked by its ends"
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("kind", ["sphere", "cube", "mesh", "instance"])
+def test_points_of_a_hollow_see_each_other(kind, place, tmp_path):
+    """From inside a convex shape every point sees every other.
+
+    Rationale: a segment's end must not be blocked by the surface it lies on, at grazing angles too.
+    Expected: none of 2.5e5 segments between points found from near the centre is blocked, except
+    those that stay within one offset of an end's surface, as between two points of one face: they
+    carry no light to speak of. Moved by 1e3: at most 1e-4 of them, near edges.
+    """
+    n = 1 << 18
+    scene = shape_scene(kind, place, tmp_path)
+    anchors = []
+    for seed in (1, 2):
+        si, ray = first_hits(scene, place, n, mi.PCG32(n, seed), inside=True)
+        anchors.append(rays.surface_anchor(si, ray))
+    a, b = anchors
+    between = b.p - a.p
+    counts = dr.abs(dr.dot(between, a.n)) > a.offset
+    counts &= dr.abs(dr.dot(between, b.n)) > b.offset
+    segment = rays.segment(a, b, dr.zeros(mi.SurfaceInteraction3f, n))
+    blocked = int(dr.count(counts & scene.ray_test(segment))[0])
+    assert int(dr.count(counts)[0]) > 0.5 * n
+    assert blocked <= (1e-4 * n if place == "moved" else 0)
+
+
+# -- whole scenes in other units --------------------------------------------------------------
+
+SCALED = ["cornell_box", "glass_caustics", "open_sky", "lamp_behind_glass", "uplight_room"]
+
+
+def scaled_scene(name, scale, **parameters):
+    """The scene of that name with all lengths times ``scale``; intensities times its square, so
+    that radiances stay."""
+    tree = ElementTree.parse(ROOT / "scenes" / f"{name}.xml")
+    root = tree.getroot()
+
+    def times(element, *names):
+        for key in names:
+            numbers = [float(x) * scale for x in element.get(key).replace(",", " ").split()]
+            element.set(key, ", ".join(f"{x:.9g}" for x in numbers))
+
+    for sensor in root.findall("sensor"):
+        for lookat in sensor.iter("lookat"):
+            times(lookat, "origin", "target")
+        clips = {f.get("name"): f for f in sensor.findall("float")}
+        for clip, default in (("near_clip", 0.01), ("far_clip", 10000.0)):
+            if clip not in clips:
+                clips[clip] = ElementTree.SubElement(
+                    sensor, "float", name=clip, value=str(default))
+            times(clips[clip], "value")
+    for shape in root.iter("shape"):
+        for file in shape.findall("string[@name='filename']"):
+            file.set("value", str(ROOT / "scenes" / file.get("value")))
+        to_world = shape.find("transform[@name='to_world']")
+        if to_world is None:
+            to_world = ElementTree.SubElement(shape, "transform", name="to_world")
+        ElementTree.SubElement(to_world, "scale", value=str(scale))
+    for emitter in root.iter("emitter"):
+        if emitter.get("type") in ("point", "spot"):
+            for point in emitter.findall("point"):
+                if point.get("value"):
+                    times(point, "value")
+                else:
+                    times(point, *(k for k in "xyz" if point.get(k)))
+            for lookat in emitter.iter("lookat"):
+                times(lookat, "origin", "target")
+            for intensity in emitter.findall("*[@name='intensity']"):
+                numbers = intensity.get("value").replace(",", " ").split()
+                intensity.set("value", ", ".join(f"{float(x) * scale**2:.9g}" for x in numbers))
+    text = ElementTree.tostring(root, encoding="unicode")
+    return mi.load_string(text, integrator="path", **parameters)
+
+
+@pytest.mark.parametrize("name", SCALED)
+def test_scale_does_not_change_the_image(name):
+    """A scene in millimetres or kilometres gives the image that it gives in metres.
+
+    Rationale: known failure 13. Expected: equal images at scale 1e-3 and 1e3, with emitters'
+    radiances kept, to that of scale 1 (our own: `path` is right at unit scale only). Statistic:
+    means of 4x4 tiles of 16x16 pixels, 16 renders a side at 64 samples with different seeds, Welch
+    with Sidak at 1e-3. Fails with Mitsuba's own offsets, which swallow the small scene.
+    """
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 6})
+    means = []
+    for side, scale in enumerate((1.0, 1e-3, 1e3)):
+        scene = scaled_scene(name, scale, resolution=16)
+        images = [mi.render(scene, integrator=integrator, spp=64, seed=100 * side + i).numpy()
+                  for i in range(16)]
+        means.append([tile_means(image, 4)[:, 1] for image in images])
+    for label, other in zip(("1e-3", "1e3"), means[1:], strict=True):
+        assert_agree(compare_images(means[0], other, f"{name} x {label}"), at_least=8)

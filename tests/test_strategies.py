@@ -19,12 +19,12 @@ Roulette is off (``rr_depth`` 100) except where it is the subject.
 
 from __future__ import annotations
 
+import statistics as st
 from functools import cache
 
 import mitsuba as mi
 import numpy as np
 import pytest
-import statistics as st
 from mitsuba_bdpt.strategies import strategies
 
 DEPTH = 5
@@ -196,7 +196,7 @@ def test_unweighted_strategies_agree(name):
     next one's.
     """
     family = unweighted_family(techniques(name, 0), techniques(name, 1), name)
-    st.assert_agree(family, at_least=40)
+    st.assert_agree(family, at_least=25)
 
 
 @pytest.mark.parametrize("name", [
@@ -254,10 +254,14 @@ OPTIONS = {
 def path_image(name):
     """``path`` of up to 5 edges, (seeds, tiles)."""
     integrator = mi.load_dict({"type": "path", "max_depth": DEPTH, "rr_depth": 100})
-    return renders(load(name), integrator, 256, 7000, 48) @ CHANNELS
+    return renders(load(name), integrator, 128, 7000, 48) @ CHANNELS
 
 
-@pytest.mark.parametrize("options", OPTIONS)
+LONGER = ("three vertices", "impossible, power", "independent")  # each a variation of another
+
+
+@pytest.mark.parametrize("options", [
+    pytest.param(name, marks=[pytest.mark.slow] if name in LONGER else []) for name in OPTIONS])
 def test_images_agree_with_path(options):
     """Rationale: any heuristic, counts, coefficients and roulette leave the image's mean alone.
 
@@ -269,7 +273,8 @@ def test_images_agree_with_path(options):
     st.assert_agree(st.compare_images(ours, path_image(name)), at_least=16)
 
 
-@pytest.mark.parametrize("heuristic", ["balance", "maximum"])
+@pytest.mark.parametrize("heuristic", [
+    "balance", pytest.param("maximum", marks=pytest.mark.slow)])
 def test_unweighted_strategies_ignore_counts_and_coefficients(heuristic):
     """Rationale: an unweighted layer is the strategy's own estimate, whatever the settings.
 
@@ -295,7 +300,8 @@ def test_weighted_layers_are_the_image(options):
     (sums of 64 x 30 float32 numbers per pixel, in another order). No statistic.
     """
     integrator = bdpt(strategy_images=True, **options)
-    image = np.array(mi.render(load("glass and metal"), integrator=integrator, spp=64, seed=3), dtype=float)
+    image = mi.render(load("glass and metal"), integrator=integrator, spp=64, seed=3)
+    image = np.array(image, dtype=float)
     parts = image[..., 3:].reshape(SIZE, SIZE, -1, 2, 3)[..., 0, :]
     np.testing.assert_allclose(parts.sum(2), image[..., :3], atol=1e-4 * image[..., :3].mean())
     assert len(integrator.aov_names()) == image.shape[2] - 3

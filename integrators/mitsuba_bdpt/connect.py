@@ -79,7 +79,7 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
 
 
 def read_light_vertex(path: LightPath, slot) -> Vertex:
-    """The stored vertex ``slot``."""
+    """The stored vertex ``slot``, the same in all lanes that use it."""
     si = path.si[slot]
     partial = path.partial[slot]
     s = path.s[slot]
@@ -223,8 +223,11 @@ def splat(kernel, y: Vertex, stream, counters):
     return c, join.position
 
 
-def inner(kernel, z: Vertex, y: Vertex, counters) -> Contribution:
-    """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41)."""
+def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
+    """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41).
+
+    ``active`` where the contribution is not zero.
+    """
     h = kernel.heuristic
     k = z.edges + y.edges + 1
     active = z.hit & (k <= kernel.last_inner)
@@ -233,13 +236,11 @@ def inner(kernel, z: Vertex, y: Vertex, counters) -> Contribution:
     active &= dist2 > 0
     d = between * dr.rsqrt(dist2)
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
-    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
     cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
+    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
     f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, cos_y / y.cos)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput) / dist2
-    counters.evaluated += _one(active)
-    nonzero = active & (dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0)
-    counters.zero += _one(active & ~nonzero)
+    nonzero = active & (_size(value) > 0)
 
     light_side = mis.alternatives(
         h, y.partial, newest_coefficient(kernel, NEXT_EVENT, y.edges), f_y.pdf_rev,
@@ -257,59 +258,72 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
     ``deposit(contribution, total)`` adds a contribution to a running total and returns it.
     """
 
-    def body(slot, total, counters):
+    def body(slot, total, nonzero):
         y = read_light_vertex(path, slot)
-        c = inner(kernel, z, y, counters)
-        counters.shadow_inner += _one(c.active)
+        c = inner(kernel, z, y)
+        nonzero = nonzero + _one(c.active)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         c.active = c.active & ~rays.occluded(kernel.scene, ray, c.active)
-        total = deposit(c, total)
-        return slot + 1, total, counters
+        return slot + 1, deposit(c, total), nonzero
 
-    end = dr.select(z.hit & bsdf.connectible(z.bsdf), path.count, 0)
-    _, total, counters = dr.while_loop(
-        (mi.UInt32(0), dr.zeros(mi.Spectrum), counters),
-        lambda slot, total, counters: slot < end,
+    candidates = _candidates(kernel, z, path)
+    _, total, nonzero = dr.while_loop(
+        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.UInt32(0)),
+        lambda slot, total, nonzero: slot < candidates,
         body,
         label="inner connections",
     )
-    return total, counters
+    counters.evaluated += candidates
+    counters.zero += candidates - nonzero
+    counters.shadow_inner += nonzero
+    return total
 
 
 def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
 
-    The draw is a running one over all candidates; the estimate is that of all of them.
+    The draw is a running one over all candidates; the estimate is that of all of them. One random
+    number serves the whole draw: what is left of it after each decision is uniform again.
     """
 
-    def body(slot, chosen, total, target, stream, counters):
-        y = read_light_vertex(path, slot)
-        c = inner(kernel, z, y, counters)
+    def body(slot, chosen, total, target, u, nonzero):
+        c = inner(kernel, z, read_light_vertex(path, slot))
         value = c.weighted()
         size = _size(value)
         total = total + size
-        u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
-        take = u * total < size
+        share = dr.select(size > 0, size / total, 0)
+        take = u < share
+        u = dr.select(take, u / share, (u - share) / (1 - share))
         chosen = dr.select(take, value / size, chosen)
-        target = dr.select(take, y.anchor, target)
-        return slot + 1, chosen, total, target, stream, counters
+        return slot + 1, chosen, total, dr.select(take, slot, target), u, nonzero + _one(c.active)
 
-    end = dr.select(z.hit & bsdf.connectible(z.bsdf), path.count, 0)
-    start = rays.Anchor(dr.zeros(mi.Point3f), dr.zeros(mi.Normal3f), mi.Float(0))
-    _, chosen, total, target, stream, counters = dr.while_loop(
-        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), start, stream, counters),
-        lambda slot, chosen, total, target, stream, counters: slot < end,
+    candidates = _candidates(kernel, z, path)
+    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
+    lanes = dr.width(path.count)
+    _, chosen, total, target, _, nonzero = dr.while_loop(
+        # The target is as wide as the lanes, see the counter of `LightPath`.
+        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), dr.zeros(mi.UInt32, lanes), u, mi.UInt32(0)),
+        lambda slot, chosen, total, target, u, nonzero: slot < candidates,
         body,
-        label="choose an inner connection",
+        label="draw an inner connection",
     )
+    counters.evaluated += candidates
+    counters.zero += candidates - nonzero
     value = chosen * total
     active = total > 0
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
     active, survival = _roulette(kernel, value, u, active, counters)
     counters.shadow_inner += _one(active)
-    ray = rays.segment(z.anchor, target, z.si)
-    active &= ~rays.occluded(kernel.scene, ray, active)
-    return dr.select(active, value / survival, 0), stream, counters
+    si = path.si.read(target, active)
+    anchor = rays.Anchor(si.p, si.n, path.anchor.read(target, active))
+    active &= ~rays.occluded(kernel.scene, rays.segment(z.anchor, anchor, z.si), active)
+    return dr.select(active, value / survival, 0)
+
+
+def _candidates(kernel, z: Vertex, path: LightPath):
+    """Number of light vertices to try at ``z``."""
+    possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)
+    return dr.select(possible, path.count, 0)
 
 
 def _roulette(kernel, value, u, active, counters):

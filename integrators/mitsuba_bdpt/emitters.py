@@ -185,7 +185,8 @@ class Emitters:
 
     def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
         shape = emitter.get_shape()
-        ps = shape.sample_position(like.time, u_point, active)
+        # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
+        ps, _ = emitter.sample_position(like.time, u_point, active)
         local = mi.warp.square_to_cosine_hemisphere(u_direction)
         si = mi.SurfaceInteraction3f(ps, like.wavelengths)
         si.t = mi.Float(0)

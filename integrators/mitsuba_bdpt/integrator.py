@@ -283,9 +283,10 @@ class Render:
     def _launch(self):
         """Evaluate what was recorded, and note how it was compiled."""
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            self.accumulator.evaluate(self.kernel.counts)
+            self.accumulator.evaluate(self.kernel.batch_counts)
             dr.sync_thread()
             history = dr.kernel_history()
+        self.kernel.counts += self.kernel.batch_counts.numpy()
         for entry in history:
             hit = entry.get("cache_hit", False)
             self.cached += hit
@@ -295,14 +296,14 @@ class Render:
 
     def report(self, spp: int) -> PassReport:
         """Progress so far, for ``on_pass``."""
-        counts = self.kernel.counts.numpy()
+        counts = self.kernel.counts
         return PassReport(
             sum(self.passes), spp, time.perf_counter() - self.started,
             int(counts[: len(RAYS)].sum()))
 
     def statistics(self) -> dict:
         """The render in numbers; plain values only."""
-        counts = [int(x) for x in self.kernel.counts.numpy()]
+        counts = [int(x) for x in self.kernel.counts]
         rays = dict(zip(RAYS, counts, strict=False))
         connections = dict(zip(CONNECTION_COUNTS, counts[len(RAYS):], strict=False))
         connections["traced"] = rays["shadow_inner"]

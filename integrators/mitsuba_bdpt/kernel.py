@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from . import bsdf, connect, mis, rays
 from .plan import UNLIMITED, scene_bsdfs
@@ -81,7 +82,8 @@ class Kernel:
         self.coefficient_endpoints = f32(count if plan.endpoints else 0)
         self.coefficient_inner = f32(inner)
         self.inverse_threshold = f32(dr.inf)
-        self.counts = dr.zeros(mi.UInt64, len(RAYS) + len(CONNECTIONS) + 1)
+        self.counts = np.zeros(len(RAYS) + len(CONNECTIONS) + 1, dtype=np.int64)
+        self.batch_counts = None
         self.points = None
 
     def within_store(self, k):
@@ -215,9 +217,9 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
             connect.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    (path, counters), _, traced, _ = random_walk(
+    (path, counters), _, traced = random_walk(
         kernel, side, walk, stream, visit, (path, counters))
-    counters.light += traced
+    counters.light += dr.select(active, traced, 0)
     return path, counters
 
 
@@ -260,19 +262,16 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
         if plan.direct:
             radiance = add(connect.next_event(kernel, z, stream, counters), radiance)
         if plan.connections == "all":
-            total, counters = connect.connect_all(kernel, z, path, counters, add)
-            radiance += total
+            radiance += connect.connect_all(kernel, z, path, counters, add)
         elif plan.connections == "one":
-            total, stream_, counters = connect.connect_one(kernel, z, path, stream, counters)
-            stream.rng = stream_.rng
-            radiance += total
+            radiance += connect.connect_one(kernel, z, path, stream, counters)
         return radiance, path, counters
 
     side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat)
     state = (dr.zeros(mi.Spectrum), path, counters)
-    (radiance, path, counters), seen, traced, _ = random_walk(
+    (radiance, path, counters), seen, traced = random_walk(
         kernel, side, walk, stream, visit, state)
-    counters.camera += traced
+    counters.camera += dr.select(active, traced, 0)
     rgb = kernel.to_rgb(radiance, shared.wavelengths)
     finite = dr.all(dr.isfinite(rgb))
     counters.non_finite += dr.select(active & ~finite, mi.UInt32(1), mi.UInt32(0))
@@ -304,9 +303,12 @@ def _deposit_strategy(kernel, film, c, position, shared):
 
 
 def _record(kernel, counters: Counters):
-    """Add the lanes' counters to the render's."""
-    for i, value in enumerate(vars(counters).values()):
-        dr.scatter_add(kernel.counts, mi.UInt64(value), mi.UInt32(i))
+    """Reduce the lanes' counters to the batch's."""
+    values = list(vars(counters).values())
+    kernel.batch_counts = dr.zeros(mi.UInt32, len(values))
+    for i, value in enumerate(values):
+        dr.scatter_reduce(
+            dr.ReduceOp.Add, kernel.batch_counts, value, mi.UInt32(i), mode=dr.ReduceMode.Expand)
 
 
 def _opaque(kind):

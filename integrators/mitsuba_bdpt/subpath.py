@@ -76,27 +76,26 @@ class Side:
 
 
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
-    """Follow ``walk`` to its end; returns ``(state, seen, rays, stream)``.
+    """Follow ``walk`` to its end; returns ``(state, seen, rays)``.
 
     ``visit(vertex, stream, state)`` returns the new state; ``rays`` counts closest-hit rays per
     lane; ``seen`` says whether an event other than null happened.
     """
 
-    def body(walk, stream, state, traced):
+    def body(walk, stream, state):
         vertex = _arrive(kernel, side, walk)
         state = visit(vertex, stream, state)
         walk = _leave(kernel, side, walk, vertex, stream)
-        traced += dr.select(walk.active, mi.UInt32(1), mi.UInt32(0))
-        return walk, stream, state, traced
+        return walk, stream, state
 
-    traced = dr.select(walk.active, mi.UInt32(1), mi.UInt32(0))
-    walk, stream, state, traced = dr.while_loop(
-        (walk, stream, state, traced),
-        lambda walk, stream, state, traced: walk.active,
+    walk, stream, state = dr.while_loop(
+        (walk, stream, state),
+        lambda walk, stream, state: walk.active,
         body,
         label=f"{side.name} subpath",
     )
-    return state, walk.seen, traced, stream
+    # The last step counts an edge but traces no ray.
+    return state, walk.seen, dr.maximum(walk.edges, 2) - 1
 
 
 def newest_coefficient(kernel, first, edges):
