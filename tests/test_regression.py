@@ -26,6 +26,9 @@ SCENES = [
 ]
 SAMPLES = 2e6  # per scene, as in Mitsuba's test
 REFERENCE_SPP = 32_000
+# The references' conversion between colour spaces: white is (0.95075, 1, 1.08846) in them where it
+# is (0.95046, 1, 1.08875) in Mitsuba 3.9.1, and `path` itself is off by as much.
+CONVERSION = 5e-4
 SEEDS = 16
 
 pytestmark = pytest.mark.skipif(
@@ -71,7 +74,8 @@ def test_image_is_mitsubas(name, skip):
     """Our image equals the reference that Mitsuba ships.
 
     Rationale: images made by others, on scenes with textures, masks, rough glass, meshes. Expected:
-    at least 99.75 % of the values pass, and the image's mean is within 4.5 sigma. Statistic:
+    at least 99.75 % of the values pass, and the image's mean is within 4.5 sigma (plus 5e-4 for the
+    references' colour conversion). Statistic:
     Z = |mean - ref| / sqrt(v / seeds + var / 32000 + 1e-4 / spp) with v our variance over 16 seeds
     and var the reference's, Student's t with 15 degrees, Sidak at 0.01 over the pixels: Mitsuba's
     rule, but with our variance, for `path` has next to none where a bidirectional image has some.
@@ -98,9 +102,10 @@ def test_image_is_mitsubas(name, skip):
     sigma = np.sqrt(
         own.var(0, ddof=1) / SEEDS
         + np.maximum(ref_variance, 0).mean((0, 1)) / REFERENCE_SPP / pixels)
-    off = (own.mean(0) - ref.mean((0, 1))) / sigma
-    report = f"{name}, skip={skip}: {passed:.4%} of values pass, mean off by {off.round(2)} sigma, " \
-        f"relative {(own.mean(0) / ref.mean((0, 1)) - 1).round(5)}"
-    print(report)
+    gap = np.abs(own.mean(0) - ref.mean((0, 1))) - CONVERSION * ref.mean((0, 1))
+    off = np.maximum(gap, 0) / sigma
+    relative = own.mean(0) / ref.mean((0, 1)) - 1
+    report = (f"{name}, skip={skip}: {passed:.4%} of values pass, mean off by {off.round(2)} sigma, "
+              f"relative {relative.round(5)}")
     assert passed >= 0.9975, report
-    assert (np.abs(off) < 4.5).all(), report
+    assert (off < 4.5).all(), report

@@ -115,6 +115,10 @@ class Emitters:
         self._pmf = pmf
         self._inv_area = dr.rcp(area)
         self._table = [mi.Float([float(x) for x in column]) for column in columns]
+        textured = [k == AREA and mi.has_flag(e.flags(), mi.EmitterFlags.SpatiallyVarying)
+                    for e, k in zip(emitters, kinds, strict=True)]
+        self._any_textured = any(textured)
+        self._textured = mi.Bool(textured)
         self._inverse = _inverse_table(self._pointers)
         self._smooth_meshes = _SmoothMeshes.of(emitters)
         self._inward_spheres = any(frame[14] > 0 for frame in frames)
@@ -193,7 +197,7 @@ class Emitters:
         si.shape = shape
         si.wi = local
         d = si.to_world(local)
-        pdf_first = dr.gather(mi.Float, self._inv_area, index, active)
+        pdf_first = ps.pdf
         pdf_second = mi.warp.square_to_cosine_hemisphere_pdf(local)
         n = self.geometric_normal(ps, index, u_point, active)
         cos = dr.abs(dr.dot(n, d))
@@ -361,8 +365,8 @@ class Emitters:
         weight = dr.select(ds.pdf > 0, weight / (to_geometric * pmf), 0)
         ratio = mi.Float(0)
         if AREA in self.kinds:
-            inv_area = dr.gather(mi.Float, self._inv_area, index, area)
-            emitted = pmf * inv_area * dr.maximum(cos_shading, 0) * dr.inv_pi
+            density = self._area_density(emitter, index, ds, n, area)
+            emitted = pmf * density * dr.maximum(cos_shading, 0) * dr.inv_pi
             ratio = dr.select(area, emitted / (pdf * cos), ratio)
         if self.kinds & {POINT, SPOT}:
             here = self._is(index, active, POINT, SPOT)
@@ -398,13 +402,27 @@ class Emitters:
         connect, first, second = mi.Float(pdf), mi.Float(pdf), self._disk_density()
         if AREA in self.kinds:
             on_surface = si.is_valid()
-            inv_area = dr.gather(mi.Float, self._inv_area, index, active & on_surface)
+            density = self._area_density(emitter, index, si, si.n, active & on_surface)
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
             cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
             connect = dr.select(on_surface, pdf * to_area, connect)
-            first = dr.select(on_surface, pmf * inv_area, first)
+            first = dr.select(on_surface, pmf * density, first)
             second = dr.select(on_surface, cos_second, second)
         return connect, first, second
+
+    def _area_density(self, emitter, index, at, n, active):
+        """Density of emission's y_0 on a surface, without the selection. ``at`` has ``p``, ``uv``."""
+        density = dr.gather(mi.Float, self._inv_area, index, active)
+        if not self._any_textured:
+            return density
+        # A textured emitter samples its texture. It tells the area density only to a reference point
+        # at unit distance straight above.
+        textured = active & dr.gather(mi.Bool, self._textured, index, active)
+        it = dr.zeros(mi.Interaction3f)
+        it.p = at.p + n
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p, ds.n, ds.uv, ds.d, ds.dist = at.p, n, at.uv, -mi.Vector3f(n), mi.Float(1)
+        return dr.select(textured, emitter.pdf_direction(it, ds, textured), density)
 
     def _probability(self, index, active):
         if self.count == 1:

@@ -20,7 +20,7 @@ from .strategies import strategy_count, strategy_names
 
 # Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
 # a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
-PASS_SAMPLES = 1 << 20
+PASS_SAMPLES = 1 << 21
 
 # With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
 PASS_SAMPLES_SAMPLER = 1 << 20
@@ -288,11 +288,10 @@ class Render:
             history = dr.kernel_history()
         self.kernel.counts += self.kernel.batch_counts.numpy()
         for entry in history:
-            hit = entry.get("cache_hit", False)
-            self.cached += hit
-            self.compiled += not hit
-            seconds = entry.get("codegen_time", 0) + entry.get("backend_time", 0)
-            self.compile_seconds += float(seconds) / 1000
+            if entry["type"] == dr.KernelType.JIT:
+                self.cached += bool(entry["cache_hit"])
+                self.compiled += not entry["cache_hit"]
+                self.compile_seconds += (entry["codegen_time"] + entry["backend_time"]) / 1000
 
     def report(self, spp: int) -> PassReport:
         """Progress so far, for ``on_pass``."""
