@@ -4,13 +4,30 @@ PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 
-.PHONY: render test lint
+.PHONY: render test lint gallery benchmark slow
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
 
 test: $(INSTALLED)
 	$(VENV)/bin/python -m pytest
+
+slow: $(INSTALLED)
+	$(VENV)/bin/python -m pytest -m slow
+
+# The images of the README.
+gallery: $(INSTALLED)
+	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml -o renders/lamp_behind_glass.exr
+	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
+	mkdir -p docs/images
+	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
+
+# The figures of the README; best on a quiet machine.
+benchmark: $(INSTALLED)
+	$(VENV)/bin/python scripts/benchmark.py cost --json docs/benchmark.json
+	$(VENV)/bin/python scripts/benchmark.py efficiency cornell_box --json docs/benchmark.json
+	$(VENV)/bin/python scripts/benchmark.py efficiency uplight_room --json docs/benchmark.json
+	$(VENV)/bin/python scripts/benchmark.py coldstart --json docs/benchmark.json
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .

@@ -36,10 +36,10 @@ def tiles(images, size=4):
 
 def agree(a, b, relative):
     """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
-    their means. Columns that are zero in a tenth of the renders are left to the mean: a few lumps
-    are not normal. The confidence interval of the mean must be narrower than ``relative``."""
-    share = np.stack([(a != 0).mean(0), (b != 0).mean(0)])
-    lumpy = np.append((share.min(0) < 0.9) & (share.max(0) < 1), False)
+    their means. Faint columns that are zero in a tenth of the renders are left to the mean: a few
+    lumps are not normal. The confidence interval of the mean must be narrower than ``relative``."""
+    share = np.minimum((a != 0).mean(0), (b != 0).mean(0))
+    lumpy = np.append((share < 0.9) & (b.mean(0) < 0.05 * b.mean(0).max()), False)
     a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
     variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
     error = np.sqrt(sum(variance))
@@ -213,7 +213,7 @@ def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
     A ball of 20 triangles lights a floor from outside and, where its normals point inwards, nothing
     outside. Expected: s = 0, s = 1 and t = 1 alone agree, with direct light (k = 2) and seen
     directly (k = 1); a side that is dark for one is dark for all. Tolerance: the confidence
-    interval, below 10 % on the bright side. Statistic: Welch, 12 seeds a side.
+    interval, below 20 % on the bright side. Statistic: Welch, 12 seeds a side.
     """
     scene = mi.load_dict({
         "type": "scene",
@@ -233,9 +233,9 @@ def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
     assert images[..., :3].max() > 0
     bright = hit.mean() > 0.01  # else only what shading normals let through a dark side is seen
     for name in ("s1t2", "s2t1"):
-        agree(tiles(hit), tiles(layer(others, bdpt, f"unweighted.{name}")), 0.1 if bright else 1)
+        agree(tiles(hit), tiles(layer(others, bdpt, f"unweighted.{name}")), 0.2 if bright else 1)
     seen = layer(images, bdpt, "unweighted.s0t2")
-    agree(tiles(seen), tiles(layer(others, bdpt, "unweighted.s1t1")), 0.1 if bright else 1)
+    agree(tiles(seen), tiles(layer(others, bdpt, "unweighted.s1t1")), 0.2 if bright else 1)
 
 
 def test_emitter_meshes_are_lit_on_one_side():
@@ -328,8 +328,8 @@ def test_crop_window_equals_the_region_of_the_whole(rfilter):
 
     bdpt = integrator(max_depth=3, skip="none", strategy_images=True)
     whole = render(scene(), bdpt, range(16), 128)[:, 5:15, 9:21]
-    part = render(scene(crop_offset_x=8, crop_offset_y=4, crop_width=14, crop_height=12), bdpt,
-                  range(50, 66), 128)[:, 1:11, 1:13]
+    part = render(scene(crop_offset_x=7, crop_offset_y=3, crop_width=16, crop_height=14), bdpt,
+                  range(50, 66), 128)[:, 2:12, 2:14]
     assert part.shape == whole.shape
     agree(tiles(part[..., :3], 2), tiles(whole[..., :3], 2), 0.03)
     for k in (1, 2, 3):
@@ -388,7 +388,8 @@ def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(
     s = 0. In a unit sphere of reflectance 1/2, light reflected m >= 2 times has the same radiance
     everywhere, wherever lamp and camera are: 2^-m for a flux of 4 pi^2. Expected: 1/4 after two
     reflections for three places of lamp and camera. Tolerance: the confidence interval, below 4 %,
-    plus the 0.15 % that panes of radius 0.01 at most take out of the light between lamp and walls. Statistic: t-test over 16 seeds.
+    plus the 0.15 % that panes of radius 0.01 at most take out of the light between lamp and
+    walls. Statistic: t-test over 16 seeds.
     """
     for lamp, eye in (((0, 0, 0.7), (0, 0.1, 0.5)), ((0.3, 0.5, 0.4), (0.3, 0, 0.2)),
                       ((-0.6, 0.1, 0.3), (0.2, -0.6, 0.1))):

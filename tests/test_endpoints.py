@@ -1,0 +1,647 @@
+"""Every kind of emitter and sensor by itself, every pair of them, and everything between.
+
+The reference for images is Mitsuba's `path`; where it is wrong or blind, a closed form. Statistic of
+image comparisons: Welch's t-test of tile means over seeds with Sidak's correction (`agree`).
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import sensors
+from mitsuba_bdpt.emitters import Emitters
+from mitsuba_bdpt.kernel import Shared
+from scipy import stats
+
+SIGNIFICANCE = 1e-4
+ROUNDING = 2e-4  # `path` and we offset rays differently; relative
+
+T = mi.ScalarTransform4f
+
+
+def integrator(kind="bdpt", **parameters):
+    return mi.load_dict({"type": kind, **parameters})
+
+
+def render(scene, method, seeds, spp, **keywords):
+    """Images, stacked: (seeds, height, width, channels)."""
+    return np.stack([
+        np.array(method.render(scene, seed=seed, spp=spp, **keywords), dtype=np.float64)
+        for seed in seeds])
+
+
+def tiles(images, size=4):
+    """Means of size x size pixels: (seeds, tiles x channels)."""
+    n, h, w = images.shape[:3]
+    cut = images.reshape(n, h // size, size, w // size, size, -1)
+    return cut.mean((2, 4)).reshape(n, -1)
+
+
+def agree(a, b, relative):
+    """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
+    their means. Faint columns that are zero in a tenth of the renders are left to the mean: a few
+    lumps are not normal. The confidence interval of the mean must be narrower than ``relative``."""
+    share = np.minimum((a != 0).mean(0), (b != 0).mean(0))
+    lumpy = np.append((share < 0.9) & (b.mean(0) < 0.05 * b.mean(0).max()), False)
+    a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
+    variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
+    error = np.sqrt(sum(variance))
+    freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
+        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120)
+    level = 1 - (1 - SIGNIFICANCE) ** (1 / a.shape[1])
+    scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
+    reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + ROUNDING * scale
+    difference = a.mean(0) - b.mean(0)
+    bad = (np.abs(difference) > reach) & ~lumpy
+    assert not bad.any(), "\n".join(
+        f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
+        f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
+        for i in np.flatnonzero(bad)[-20:])
+    assert scale[-1] > 0
+    assert reach[-1] < relative * scale[-1], (
+        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}")
+
+
+def same_image(scene, relative=0.02, seeds=10, spp=(128, 256), method=None, size=4, **parameters):
+    """Assert that we and `path` agree on ``scene``; ``spp`` ours and `path`'s."""
+    depth = parameters.pop("max_depth", 4)
+    ours = method or integrator(max_depth=depth, skip="none", **parameters)
+    path = integrator("path", max_depth=depth,
+                      hide_emitters=parameters.get("hide_emitters", False))
+    a = render(scene, ours, range(seeds), spp[0])
+    b = render(scene, path, range(100, 100 + seeds), spp[1])
+    assert a.shape == b.shape
+    agree(tiles(a, size), tiles(b, size), relative)
+    return a, b
+
+
+def layer(images, bdpt, name):
+    """The technique image ``name``, for example ``unweighted.s1t2``."""
+    first = bdpt.aov_names().index(name + ".R")
+    base = images.shape[-1] - len(bdpt.aov_names())
+    return images[..., base + first : base + first + 3]
+
+
+def film(size=16, rfilter="box", **keys):
+    return {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
+            "component_format": "float32", "rfilter": {"type": rfilter}} | keys
+
+
+def perspective(origin=(0, 2, 5), target=(0, 0.3, 0), fov=40, keys=None, **film_keys):
+    return {
+        "type": "perspective", "fov": fov,
+        "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
+        "sampler": {"type": "independent"}, "film": film(**film_keys)} | (keys or {})
+
+
+def thinlens(aperture=0.15, focus=4.5, **keys):
+    return perspective(**keys) | {
+        "type": "thinlens", "aperture_radius": aperture, "focus_distance": focus}
+
+
+SENSORS = {"perspective": perspective, "thinlens": thinlens}
+
+
+def grey(value):
+    return {"type": "twosided", "bsdf": {
+        "type": "diffuse", "reflectance": {"type": "rgb", "value": [value] * 3}}}
+
+
+def sky_bitmap():
+    """A sky that is uneven in every direction, brighter in one place."""
+    rng = np.random.default_rng(3)
+    data = rng.random((8, 16, 3), dtype=np.float32) * 0.5 + 0.2
+    data[2, 3] = 6.0
+    return mi.Bitmap(data)
+
+
+def texture():
+    data = np.random.default_rng(4).random((6, 6, 3), dtype=np.float32) + 0.1
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
+
+
+EMITTERS = {
+    "rectangle": lambda: {
+        "type": "rectangle", "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.4),
+        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 6.0}},
+    "disk": lambda: {
+        "type": "disk", "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 100).scale(0.4),
+        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 8.0}},
+    "sphere": lambda: {
+        "type": "sphere", "center": [-1, 1.6, 0.5], "radius": 0.3, "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": 5.0}},
+    "cylinder": lambda: {
+        "type": "cylinder", "p0": [-1.2, 1.5, 0], "p1": [1, 2, 0.4], "radius": 0.15,
+        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 4.0}},
+    "cube": lambda: {
+        "type": "cube", "to_world": T().translate([1, 1.6, 0.4]).rotate([1, 1, 0], 30).scale(0.25),
+        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 5.0}},
+    "textured": lambda: {
+        "type": "rectangle", "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.5),
+        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": texture()}},
+    "point": lambda: {"type": "point", "position": [0.7, 2.2, 1], "intensity": 5.0},
+    "spot": lambda: {
+        "type": "spot", "intensity": 12.0, "cutoff_angle": 35, "beam_width": 20,
+        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1])},
+    "textured spot": lambda: {
+        "type": "spot", "intensity": 12.0, "cutoff_angle": 35, "texture": texture(),
+        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1])},
+    "directional": lambda: {"type": "directional", "direction": [-1, -2, -0.7], "irradiance": 3.0},
+    "constant": lambda: {"type": "constant", "radiance": 0.7},
+    "envmap": lambda: {"type": "envmap", "bitmap": sky_bitmap(), "scale": 0.8},
+    "rotated envmap": lambda: {
+        "type": "envmap", "bitmap": sky_bitmap(), "to_world": T().rotate([1, 2, 3], 70)},
+}
+
+
+def room(sensor=None, **more):
+    """A floor, a back wall, a ball and a box. Shapes of unequal BSDFs, so that Mitsuba merges none."""
+    return {
+        "type": "scene", "sensor": sensor or perspective(),
+        "floor": {"type": "rectangle", "bsdf": grey(0.6),
+                  "to_world": T().rotate([1, 0, 0], -90).scale(2)},
+        "back": {"type": "rectangle", "bsdf": grey(0.55), "to_world": T().translate([0, 1, -2]).scale(2)},
+        "ball": {"type": "sphere", "center": [-0.6, 0.5, 0.4], "radius": 0.5,
+                 "bsdf": {"type": "roughplastic", "alpha": 0.3}},
+        "box": {"type": "cube", "bsdf": grey(0.5),
+                "to_world": T().translate([0.8, 0.4, -0.3]).rotate([0, 1, 0], 25).scale(0.4)},
+    } | more
+
+
+# -- emitters ---------------------------------------------------------------------------------
+
+
+def emission(name, count, **others):
+    """Scene, tables, and ``count`` sampled emissions of the emitter ``name``."""
+    scene = mi.load_dict(room() | {"lamp": EMITTERS[name]()} | others)
+    emitters = Emitters(scene)
+    rng = np.random.default_rng(11)
+    u = [mi.Float(rng.random(count, dtype=np.float32)) for _ in range(4)]
+    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    e = emitters.sample_emission(
+        mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    return scene, emitters, e, rng
+
+
+POWER = {  # emitted flux of the first channel
+    "rectangle": np.pi * 6 * 4 * 0.4**2,
+    "disk": np.pi * 8 * np.pi * 0.4**2,
+    "sphere": np.pi * 5 * 4 * np.pi * 0.3**2,
+    "cylinder": np.pi * 4 * 2 * np.pi * 0.15 * np.sqrt(2.2**2 + 0.5**2 + 0.4**2),
+    "cube": np.pi * 5 * 24 * 0.25**2,
+    "point": 4 * np.pi * 5,
+}
+
+
+@pytest.mark.parametrize("name", POWER)
+def test_emitted_power(name):
+    """Rationale: the mean of the emission's weight is the flux, whatever the densities. Expected: the
+    closed form. Tolerance: four standard errors of 1e5 samples plus 1e-4.
+    """
+    _, _, e, _ = emission(name, 100_000)
+    weight = np.array(e.weight, dtype=np.float64)[0]
+    error = weight.std() / np.sqrt(len(weight))
+    assert abs(weight.mean() - POWER[name]) < 4 * error + 1e-4 * POWER[name]
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_emission_density_integrates_to_one(name):
+    """Rationale: the stated density of an emission must be the one it is sampled with. The mean over
+    samples of 1 / (density) over a region is that region's measure; here the region is everything:
+    positions and directions. Expected: area x pi / cos... for a surface A x 2 pi, for a point light
+    4 pi, a spot its cone, an environment 4 pi x the disk, a directional light the disk. Tolerance: five
+    standard errors plus 1e-3; cosines below 0.02 are left out on both sides, for 1/cos has no variance.
+    """
+    scene, emitters, e, _ = emission(name, 100_000)
+    n = 100_000
+    first, second, cos = (
+        np.broadcast_to(np.array(x, dtype=np.float64), n) for x in (e.pdf_first, e.pdf_second, e.cos))
+    disk = np.pi * float(emitters.radius[0]) ** 2
+    keep = cos > 0.02
+    values = np.where(keep, 1 / np.maximum(first * second, 1e-30), 0)
+    if name in ("constant", "envmap", "rotated envmap"):
+        measure = 4 * np.pi * disk
+    elif name == "directional":
+        measure = disk
+    elif name == "point":
+        measure = 4 * np.pi
+    elif "spot" in name:
+        measure = 2 * np.pi * (1 - np.cos(np.deg2rad(35)))
+    else:
+        shape = next(x for x in scene.emitters()).get_shape()
+        measure = float(shape.surface_area()[0]) * 2 * np.pi * (1 - 0.02)
+    error = values.std() / np.sqrt(n)
+    assert error < 0.05 * measure
+    assert abs(values.mean() - measure) < 5 * error + 1e-3 * measure
+
+
+@pytest.mark.parametrize("name", [k for k in EMITTERS if k not in ("point", "spot", "textured spot",
+                                                                  "directional")])
+def test_emission_agrees_with_hits(name):
+    """Rationale: light that is emitted towards the scene must be what a ray in the other direction
+    sees, weight x density = radiance x cosine, and the densities must be those that a hit computes.
+    Expected: for each emission, tracing back to y_0 from its first hit finds the same radiance and the
+    same two density factors, and the density of next-event estimation there equals that of
+    `sample_direct`'s kind. Tolerance: 2e-3 relative for all but 1 % (edges of textures and pixels of
+    an environment, where the traced point falls on the other side).
+    """
+    scene, emitters, e, _ = emission(name, 20_000)
+    n = 20_000
+    ray = mi.Ray3f(e.anchor.towards(e.d), e.d)
+    si = scene.ray_intersect(ray)
+    hit = np.array(si.is_valid()) & (np.array(dr.max(e.weight)) > 0)
+    hit &= np.broadcast_to(np.array(e.cos), n) > 0.05
+    back = mi.Ray3f(si.p + si.n * dr.mulsign(mi.Float(1e-4), dr.dot(si.n, -e.d)), -e.d)
+    at = scene.ray_intersect(back)
+    radiance = emitters.emitted(at, mi.Bool(hit))
+    connect, first, second = emitters.hit_densities(at, mi.Point3f(si.p), mi.Bool(hit))
+    expected = e.weight * (e.pdf_first * e.pdf_second / e.cos)
+
+    def off(a, b):
+        a, b = (np.broadcast_to(np.array(x, dtype=np.float64), (n,))[hit] for x in (a, b))
+        return np.mean(np.abs(a - b) > 2e-3 * np.abs(b) + 1e-6)
+
+    assert hit.sum() > 500
+    assert off(radiance.x, expected.x) < 0.01
+    assert off(first, e.pdf_first) < 0.01
+    assert off(second, e.pdf_second) < 0.01
+    # connection_density: in the measure of pdf_first, times the squared length of the edge.
+    density = emitters.connection_density(e, si, mi.Bool(hit))
+    finite = 1 if "envmap" in name or name == "constant" else dr.squared_norm(si.p - e.si.p)
+    assert off(connect * finite, density) < 0.01
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_direct_sample_agrees_with_hits(name):
+    """Rationale: next-event estimation and a hit of the same point must name the same density and the
+    same radiance. Expected: weight x density = radiance at the point, density = the one that
+    `hit_densities` gives, emission ratio = what its factors give. Tolerance: 2e-3 relative for all but
+    1 % of the samples (edges of textures).
+    """
+    n = 20_000
+    rng = np.random.default_rng(12)
+    scene = mi.load_dict(room() | {"lamp": EMITTERS[name]()})
+    emitters = Emitters(scene)
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    u = rng.random((5, n), dtype=np.float32)
+    si.p = mi.Point3f(2 * u[0] - 1, 0.02 + 0 * u[1], 2 * u[2] - 1)
+    si.n, si.t = mi.Normal3f(0, 1, 0), mi.Float(1)
+    direct = emitters.sample_direct(si, mi.Point2f(u[3], u[4]), mi.Bool(True))
+    if np.all(np.array(direct.delta)):
+        assert np.all(np.array(direct.pdf) == 1)
+        return
+    at = scene.ray_intersect(mi.Ray3f(mi.Point3f(si.p), direct.d))
+    emitter = at.emitter(scene)
+    seen = np.array(emitter != dr.zeros(mi.EmitterPtr)) & (np.array(direct.pdf) > 0)
+    seen &= np.array(direct.d.y) > 0.05
+    radiance = emitters.emitted(at, mi.Bool(seen))
+    connect, first, second = emitters.hit_densities(at, mi.Point3f(si.p), mi.Bool(seen))
+    cos = dr.abs(dr.dot(at.n, direct.d))
+    to_angle = dr.select(at.is_valid(), dr.square(at.t) / cos, 1)
+
+    def off(a, b):
+        a, b = (np.broadcast_to(np.array(x, dtype=np.float64), (n,))[seen] for x in (a, b))
+        return np.mean(np.abs(a - b) > 2e-3 * np.abs(b) + 1e-6)
+
+    lit = mi.Bool(np.array(dr.max(radiance)) > 0)
+    seen &= np.array(lit)
+    assert seen.sum() > 500
+    assert off((direct.weight * direct.pdf).x, radiance.x) < 0.01
+    assert off(direct.pdf, connect * to_angle) < 0.01
+    edge = dr.select(at.is_valid(), dr.rcp(dr.square(at.t)), 1)
+    assert off(direct.emission_ratio, first * second / connect * edge) < 0.01
+
+
+def test_directions_of_a_spot():
+    """Rationale: falloff must be in the weight of the emission, as next-event estimation has it.
+    Expected: the histogram of emitted power over the angle equals the integral of Mitsuba's
+    sample_direction on a sphere around the lamp. Tolerance: five standard errors per bin.
+    """
+    scene, _, e, _ = emission("spot", 200_000)
+    lamp = scene.emitters()[0]
+    axis = np.array([0, 0, 0]) - np.array([1, 3, 1.5])
+    axis = axis / np.linalg.norm(axis)
+    angle = np.rad2deg(np.arccos(np.clip(axis @ np.array(e.d, dtype=np.float64), -1, 1)))
+    weight = np.array(e.weight, dtype=np.float64)[0]
+    edges = np.linspace(0, 35, 8)
+    rng = np.random.default_rng(2)
+    z = 1 - 2 * rng.random(400_000)
+    phi = 2 * np.pi * rng.random(400_000)
+    d = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z])
+    it = dr.zeros(mi.Interaction3f, 400_000)
+    it.p = mi.Point3f(np.array([1, 3, 1.5])[:, None] + d)
+    _, w = lamp.sample_direction(it, mi.Point2f(0.5))
+    power = np.array(w, dtype=np.float64)[0] * 4 * np.pi
+    other = np.rad2deg(np.arccos(np.clip(axis @ d, -1, 1)))
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        a = weight * ((angle >= low) & (angle < high))
+        b = power * ((other >= low) & (other < high))
+        error = np.hypot(a.std() / np.sqrt(len(a)), b.std() / np.sqrt(len(b)))
+        assert abs(a.mean() - b.mean()) < 5 * error
+
+
+def test_emitters_are_chosen_by_sampling_weight():
+    """Rationale: selection is part of every density. Expected: the share of emissions per emitter is
+    its sampling_weight's (a weight of zero: never chosen, and `path` does not see it either), and the
+    emitted power stays the sum. Tolerance: five standard errors.
+    """
+    lamps = {
+        "a": EMITTERS["point"]() | {"sampling_weight": 0.5},
+        "b": EMITTERS["sphere"]() | {"emitter": {
+            "type": "area", "radiance": 5.0, "sampling_weight": 3.0}},
+        "c": {"type": "spot", "intensity": 1.0, "sampling_weight": 0.0}}
+    scene = mi.load_dict(room() | lamps)
+    emitters = Emitters(scene)
+    rng = np.random.default_rng(11)
+    u = [mi.Float(rng.random(100_000, dtype=np.float32)) for _ in range(4)]
+    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]),
+                                 Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1)), mi.Bool(True))
+    names = [x.class_name() for x in scene.emitters()]
+    share = np.bincount(np.array(e.index), minlength=3) / 100_000
+    weights = np.array([{"PointLight": 0.5, "AreaLight": 3.0, "SpotLight": 0.0}[n] for n in names])
+    np.testing.assert_allclose(share, weights / 3.5, atol=5 * 0.5 / np.sqrt(100_000))
+    assert share[weights == 0] == 0
+    power = np.array(e.weight, dtype=np.float64)[0]
+    expected = POWER["point"] + POWER["sphere"]
+    assert abs(power.mean() - expected) < 5 * power.std() / np.sqrt(100_000)
+
+
+# -- every emitter with every sensor ----------------------------------------------------------
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("name", EMITTERS)
+def test_every_emitter_with_every_sensor(name, sensor):
+    """Rationale: each pair has its own combination of strategies, measures and special cases.
+    Expected: the image with all strategies (skip=none) equals `path`'s. Tolerance: the confidence
+    interval, below 2 %. Statistic: Welch over tiles of 4x4 pixels, 10 seeds a side.
+    """
+    same_image(mi.load_dict(room(SENSORS[sensor]()) | {"lamp": EMITTERS[name]()}), 0.03, max_depth=3)
+
+
+def test_several_emitters_of_unequal_weight():
+    """Rationale: selection among emitters of every kind, finite and infinite, hittable and not.
+    Expected: equals `path`. Tolerance: the confidence interval, below 4 %. Statistic: as above.
+    """
+    lamps = {}
+    for i, name in enumerate(("rectangle", "sphere", "point", "spot", "directional", "envmap")):
+        lamp = EMITTERS[name]()
+        (lamp["emitter"] if "emitter" in lamp else lamp)["sampling_weight"] = 0.3 + i * i / 4
+        lamps[name.replace(" ", "_")] = lamp
+    same_image(mi.load_dict(room() | lamps), 0.05, spp=(256, 512), max_depth=3)
+
+
+def test_rotated_environment_by_light_tracing_alone():
+    """Rationale: Mitsuba's own `envmap.sample_ray` starts from the wrong disk under rotation, and its
+    light tracer is 36 % too bright. Expected: t = 1 alone equals s = 1 alone. Tolerance: the
+    confidence interval, below 10 %. Statistic: Welch over tiles, 16 seeds.
+    """
+    scene = mi.load_dict(room() | {"lamp": EMITTERS["rotated envmap"]()})
+    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    a, b = render(scene, bdpt, range(16), 512), render(scene, bdpt, range(50, 66), 256)
+    agree(tiles(layer(a, bdpt, "unweighted.s2t1"), 8), tiles(layer(b, bdpt, "unweighted.s1t2"), 8), 0.1)
+
+
+# -- sensors ----------------------------------------------------------------------------------
+
+CAMERAS = {
+    "plain": perspective,
+    "crop": lambda: perspective(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16,
+                                crop_height=16),
+    "off axis": lambda: perspective(keys={"principal_point_offset_x": 0.2,
+                                          "principal_point_offset_y": -0.15}),
+    "off axis, crop": lambda: perspective(
+        size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16,
+        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15}),
+    **{f"fov {axis}": (lambda axis=axis: perspective(height=24, keys={"fov_axis": axis}))
+       for axis in ("x", "y", "diagonal", "smaller", "larger")},
+    "thinlens": thinlens,
+    "thinlens, crop": lambda: thinlens(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16,
+                                       crop_height=16),
+    "sample_border": lambda: perspective(rfilter="gaussian", sample_border=True),
+}
+
+
+def camera_of(sensor):
+    camera = sensors.Camera(sensor)
+    return camera, Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_splats_land_where_rays_started(name):
+    """Rationale: a splat's film position must be that of the camera ray that finds the same point.
+    Expected: joining a point on a camera ray gives back the ray's film position within 1e-4 pixels
+    (float32: 1e-7 of some 30 pixels, times ten), and the density with which the ray was sampled
+    within 1e-4.
+    """
+    sensor = mi.load_dict(CAMERAS[name]())
+    camera, like = camera_of(sensor)
+    n = 5000
+    rng = np.random.default_rng(6)
+    u = rng.random((5, n), dtype=np.float32)
+    width, height = (int(x) for x in camera.region)
+    index = mi.UInt32(rng.integers(0, width * height, n).astype(np.uint32))
+    lens = mi.Point2f(u[2], u[3])
+    start = camera.start(camera.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
+    p = start.ray.o + start.ray.d * mi.Float(0.5 + 20 * u[4])
+    join = camera.join(p, lens)
+    assert np.array(join.valid).mean() > 0.999  # float32 loses a few on the film's rim
+    for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
+        assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
+    np.testing.assert_allclose(join.importance, start.pdf_w, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_importance_integrates_to_one(name):
+    """Rationale: W_e as a density over directions. Expected: its integral over the hemisphere is 1 for
+    a fixed lens point (uniform sampling of a cone around the axis). Tolerance: five standard errors, the
+    standard error below 1 %.
+    """
+    sensor = mi.load_dict(CAMERAS[name]())
+    camera, _ = camera_of(sensor)
+    n = 400_000
+    rng = np.random.default_rng(7)
+    u = rng.random((2, n), dtype=np.float32)
+    cos = np.cos(np.deg2rad(50))
+    local = mi.warp.square_to_uniform_cone(mi.Point2f(u[0], u[1]), cos)
+    to_world = sensor.world_transform()
+    d = to_world @ mi.Vector3f(local)
+    lens = mi.Point2f(0.3, 0.6)
+    join = camera.join(camera._lens_point(lens) + 7 * d, lens)
+    values = np.where(np.array(join.valid), np.array(join.importance), 0) * 2 * np.pi * (1 - cos)
+    error = values.std() / np.sqrt(n)
+    assert error < 0.01
+    assert abs(values.mean() - 1) < 5 * error
+
+
+@pytest.mark.parametrize("name", [k for k in CAMERAS if k not in ("plain", "thinlens")])
+def test_every_camera_sees_what_path_sees(name):
+    """Rationale: crop windows, offsets of the principal point (where Mitsuba's sample_direction loses
+    28 to 45 % of the points) and field-of-view axes change the importance. Expected: t = 1 alone
+    equals s = 1 alone, and all strategies equal `path`. Tolerance: the confidence interval, below
+    12 % and 2 %. Statistic: Welch over tiles, 10 seeds a side.
+    """
+    scene = mi.load_dict(room(CAMERAS[name]()) | {"lamp": EMITTERS["point"]()})
+    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
+    agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
+    path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
+    agree(tiles(a[..., :3]), tiles(path), 0.02)
+
+
+def test_near_and_far_clip():
+    """Rationale: rays start on the near plane and end on the far one. Expected: a blocker before the
+    near plane neither is seen nor hides the floor from t = 1; a wall beyond the far plane is not
+    seen by t = 1 either. All strategies equal `path`. Tolerance: the confidence interval, below
+    2 %; t = 1 alone against s = 1 alone 10 %. Statistic: Welch over tiles.
+    """
+    scene = mi.load_dict(room(perspective(keys={"near_clip": 1.0, "far_clip": 6.0})) | {
+        "lamp": EMITTERS["point"](),
+        "blocker": {"type": "disk", "bsdf": grey(0.3),
+                    "to_world": T().look_at([0, 1.8, 4.4], [0, 2, 5], [0, 1, 0]).scale(0.15)}})
+    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
+    agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
+    path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
+    agree(tiles(a[..., :3]), tiles(path), 0.02)
+
+
+def test_thin_lens_at_its_default_focus_distance():
+    """Rationale: Mitsuba's thinlens.sample_direction returns zero when the focus distance is the far
+    clip, which is its default. Expected: t = 1 alone equals s = 1 alone, and everything `path`.
+    Tolerance and statistic as above.
+    """
+    sensor = perspective() | {"type": "thinlens", "aperture_radius": 0.02}
+    scene = mi.load_dict(room(sensor) | {"lamp": EMITTERS["point"]()})
+    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
+    agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
+    path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
+    agree(tiles(a[..., :3]), tiles(path), 0.02)
+
+
+# -- between the endpoints --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hide", [False, True])
+@pytest.mark.parametrize("lamp", ["sphere", "constant"])
+def test_hide_emitters_and_alpha(hide, lamp):
+    """Rationale: under hide_emitters `path` lets camera rays pass emitting shapes and takes the alpha of
+    what is behind; without, alpha covers emitters and the environment. The lamp stands before the
+    wall, and one corner of the image sees past all. Expected: colours and alpha equal
+    `path`'s in each tile. Tolerance: the confidence interval, below 3 %. Statistic: Welch over tiles.
+    """
+    scene = room(perspective(origin=(0, 2, 7), fov=50, pixel_format="rgba")) | {
+        "lamp": EMITTERS[lamp](),
+        "glass": {"type": "sphere", "center": [1, 1.5, 0.5], "radius": 0.4,
+                  "bsdf": {"type": "null"}}}
+    a, b = same_image(mi.load_dict(scene), 0.03, hide_emitters=hide, max_depth=3)
+    assert a.shape[-1] == 4
+    np.testing.assert_allclose(a[..., 3].mean(0), b[..., 3].mean(0), atol=0.05)
+    if hide or lamp == "sphere":
+        assert b[..., 3].min() < 0.9
+
+
+SURFACES = {
+    "mask": lambda: {"type": "mask", "opacity": 0.5, "bsdf": grey(0.7)},
+    "null": lambda: {"type": "null"},
+    "one-sided": lambda: {"type": "diffuse"},
+    "two-sided, two kinds": lambda: {
+        "type": "twosided", "front": {"type": "diffuse"},
+        "back": {"type": "roughconductor", "alpha": 0.3}},
+    "glass": lambda: {"type": "dielectric"},
+    "thin glass": lambda: {"type": "thindielectric"},
+    "rough glass": lambda: {"type": "roughdielectric", "alpha": 0.3},
+    "mirror": lambda: {"type": "conductor"},
+    "plastic": lambda: {"type": "plastic", "diffuse_reflectance": 0.5},
+    "blend": lambda: {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse"},
+                      "b": {"type": "roughconductor", "alpha": 0.25}},
+    "principled": lambda: {"type": "principled", "roughness": 0.4, "metallic": 0.4},
+    "textured": lambda: {"type": "diffuse", "reflectance": texture()},
+    "bump map": lambda: {"type": "bumpmap", "texture": {
+        "type": "bitmap", "raw": True, "bitmap": mi.Bitmap(
+            (0.1 * np.sin(np.linspace(0, 20, 32))[:, None, None] * np.ones((32, 32, 1))).astype(
+                np.float32))}, "bsdf": grey(0.6)["bsdf"]},
+}
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_every_surface_between_lamp_and_camera(name):
+    """Rationale: null events, delta lobes, mixtures and one-sided surfaces change which strategies
+    exist at a vertex. A ball and an upright card of the material, an area lamp. Expected: equals
+    `path`. Tolerance: the confidence interval, below 3 %. Statistic: Welch over tiles, 10 seeds.
+    """
+    scene = room()
+    scene["ball"]["bsdf"] = SURFACES[name]()
+    scene |= {"lamp": EMITTERS["rectangle"](), "card": {
+        "type": "rectangle", "bsdf": SURFACES[name](),
+        "to_world": T().translate([0.3, 0.7, 1]).rotate([0, 1, 0], 40).scale([0.5, 0.7, 1])}}
+    same_image(mi.load_dict(scene), 0.04, max_depth=4)
+
+
+def test_instances(tmp_path):
+    """Rationale: a hit on an instance is rebuilt from its preliminary record, and light vertices on
+    instances are stored. Expected: a group of a ball and a box, instanced twice with scale and
+    rotation, equals `path`. Tolerance: the confidence interval, below 3 %. Statistic: as above.
+    """
+    scene = room() | {
+        "lamp": EMITTERS["rectangle"](),
+        "group": {"type": "shapegroup",
+                  "a": {"type": "sphere", "radius": 0.3, "bsdf": {"type": "roughplastic"}},
+                  "b": {"type": "cube", "bsdf": grey(0.4),
+                        "to_world": T().translate([0.5, 0, 0]).scale(0.2)}},
+        "one": {"type": "instance", "group": {"type": "ref", "id": "group"},
+                "to_world": T().translate([-0.2, 1.3, 0.5]).rotate([0, 1, 1], 50)},
+        "two": {"type": "instance", "group": {"type": "ref", "id": "group"},
+                "to_world": T().translate([0.4, 0.4, 1.2]).scale([1, 1.3, 0.8])}}
+    same_image(mi.load_dict(scene), 0.04, max_depth=4)
+
+
+# -- film -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("border", [False, True], ids=["", "sample_border"])
+@pytest.mark.parametrize("rfilter", ["box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos"])
+def test_every_reconstruction_filter(rfilter, border):
+    """Rationale: splats and camera samples are filtered alike and weighted differently, at the border
+    too. Expected: equals `path` per pixel in tiles of 2x2. Tolerance: the confidence interval, below
+    2 %. Statistic: Welch, 10 seeds a side.
+    """
+    if border and rfilter in ("tent", "catmullrom"):
+        pytest.skip("covered by the other filters")
+    scene = mi.load_dict(room(perspective(rfilter=rfilter, sample_border=border))
+                         | {"lamp": EMITTERS["sphere"]()})
+    same_image(scene, 0.02, max_depth=3, size=2)
+
+
+@pytest.mark.parametrize("pixel_format, channels", [
+    ("rgb", 3), ("rgba", 4), ("luminance", 1), ("luminance_alpha", 2), ("xyz", 3), ("xyza", 4)])
+def test_pixel_formats(pixel_format, channels):
+    """Rationale: the film converts on development; our block must be what it expects. Expected: the
+    number of channels, and equality with `path`. Tolerance: the confidence interval, below 3 %.
+    Statistic: Welch over tiles.
+    """
+    scene = mi.load_dict(room(perspective(pixel_format=pixel_format)) | {
+        "lamp": EMITTERS["sphere"]()})
+    a, _ = same_image(scene, 0.03, max_depth=2)
+    assert a.shape[-1] == channels
+
+
+@pytest.mark.parametrize("component", ["float16", "float32", "uint32"])
+def test_component_formats(component, tmp_path):
+    """Rationale and expected: the film writes its file in the component format asked for, with the
+    values that develop() gives (half precision: 1e-3)."""
+    scene = mi.load_dict(room(perspective(component_format=component)) | {
+        "lamp": EMITTERS["point"]()})
+    bdpt = integrator(max_depth=2)
+    image = np.array(bdpt.render(scene, spp=16))
+    film = scene.sensors()[0].film()
+    assert str(film.bitmap().component_format()).lower().endswith("float32")
+    path = tmp_path / "out.exr"
+    film.write(str(path))
+    bitmap = mi.Bitmap(str(path))
+    assert str(bitmap.component_format()).lower().endswith(component)
+    if component != "uint32":
+        np.testing.assert_allclose(
+            np.array(bitmap.convert(component_format=mi.Struct.Type.Float32)), image,
+            rtol=1e-3, atol=1e-3)
