@@ -98,13 +98,19 @@ def read_light_vertex(path: LightPath, slot) -> Vertex:
     )
 
 
+def sees_emitter(kernel, z: Vertex):
+    """Mask: the camera subpath has hit an emitter that may be seen."""
+    active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
+    if kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
+        active &= z.hit | z.seen
+    return active
+
+
 def hit_emitter(kernel, z: Vertex) -> Contribution:
     """s = 0: the camera subpath has hit an emitter (eq. 44)."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
-    active = mi.Bool(z.active)
-    if kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
-        active &= z.hit | z.seen
+    active = sees_emitter(kernel, z)
     radiance = emitters.emitted(z.si, active)
     active &= dr.max(mi.unpolarized_spectrum(radiance)) != 0
     connect, first, second = emitters.hit_densities(z.si, z.previous, active)

@@ -123,18 +123,18 @@ def trace(kernel: Kernel, film, batch: Batch, spp: int):
     if kernel.plan.light:
         path, counters = _light_subpath(kernel, film, stream, shared, path, counters)
 
-    def body(served, path, counters):
+    def body(served, counters):
         slot = lane + served * dr.opaque(mi.UInt32, lanes)
         active = slot < dr.opaque(mi.UInt32, total)
         counters = _camera_subpath(kernel, film, place, slot, shared, path, counters, active)
-        return served + 1, path, counters
+        return served + 1, counters
 
     if kernel.plan.served == 1:
-        _, path, counters = body(mi.UInt32(0), path, counters)
+        _, counters = body(mi.UInt32(0), counters)
     else:
-        _, path, counters = dr.while_loop(
-            (mi.UInt32(0), path, counters),
-            lambda served, path, counters: served < kernel.served,
+        _, counters = dr.while_loop(
+            (mi.UInt32(0), counters),
+            lambda served, counters: served < kernel.served,
             body,
             label="camera subpaths of one light subpath",
         )
@@ -256,20 +256,27 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
         return total + c.weighted()
 
     def visit(z, stream, state):
-        radiance, path, counters = state
+        radiance, counters = state
         if plan.hit:
-            radiance = add(connect.hit_emitter(kernel, z), radiance)
+            # A branch of its own: few lanes hit an emitter.
+            radiance = dr.if_stmt(
+                (z, radiance),
+                connect.sees_emitter(kernel, z),
+                lambda z, radiance: add(connect.hit_emitter(kernel, z), radiance),
+                lambda z, radiance: radiance,
+                label="s = 0",
+            )
         if plan.direct:
             radiance = add(connect.next_event(kernel, z, stream, counters), radiance)
         if plan.connections == "all":
             radiance += connect.connect_all(kernel, z, path, counters, add)
         elif plan.connections == "one":
             radiance += connect.connect_one(kernel, z, path, stream, counters)
-        return radiance, path, counters
+        return radiance, counters
 
     side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat)
-    state = (dr.zeros(mi.Spectrum), path, counters)
-    (radiance, path, counters), seen, traced = random_walk(
+    state = (dr.zeros(mi.Spectrum), counters)
+    (radiance, counters), seen, traced = random_walk(
         kernel, side, walk, stream, visit, state)
     counters.camera += dr.select(active, traced, 0)
     rgb = kernel.to_rgb(radiance, shared.wavelengths)
