@@ -94,17 +94,22 @@ def _sphere(rng):
     return mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
 
 
-def first_hits(scene, place, n, rng, inside):
-    """Hits of ``n`` rays from outside (or from near the centre): ``(si, ray)``."""
+def first_hits(scene, place, n, rng, inside, distance=3.0):
+    """Hits of ``n`` rays from ``distance`` outside (or from near the centre): ``(si, ray)``."""
     scale, shift = PLACES[place]
     spread = _sphere(rng) * dr.cbrt(rng.next_float32())
     if inside:
         origin, d = mi.Point3f(shift) + spread * (0.2 * scale), _sphere(rng)
     else:
-        origin = mi.Point3f(shift) + _sphere(rng) * (3 * scale)
+        origin = mi.Point3f(shift) + _sphere(rng) * (distance * scale)
         d = dr.normalize(mi.Point3f(shift) + spread * scale - origin)
     ray = mi.Ray3f(origin, d)
     return scene.ray_intersect(ray), ray
+
+
+def anchor_of(scene, si, ray):
+    """The anchor of a hit, as a subpath makes it."""
+    return rays.surface_anchor(si, ray, rays.Quadrics(scene))
 
 
 def bad_rays(kind, place, folder, n, seed=0):
@@ -115,7 +120,7 @@ def bad_rays(kind, place, folder, n, seed=0):
         rng = mi.PCG32(n, seed + 10 * inside)
         si, ray = first_hits(scene, place, n, rng, inside)
         hit = si.is_valid()
-        anchor = rays.surface_anchor(si, ray)
+        anchor = anchor_of(scene, si, ray)
         d = _sphere(rng)
         cos = dr.dot(d, si.n)
         hit &= dr.abs(cos) > 1e-6  # along the surface: no side, and no light either
@@ -180,6 +185,38 @@ def test_no_ray_of_ten_million_finds_its_own_start(kind, tmp_path):
     _check_bad_rays(kind, tmp_path, 10 * HITS.get(kind, 1_000_000))
 
 
+@pytest.mark.parametrize("distance", [30.0, 300.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_far_ends_do_not_block(kind, distance, tmp_path):
+    """A shape that is small against its distance sees and is seen.
+
+    Rationale: Mitsuba solves the quadratics of cylinders, and of spheres in visibility tests, in
+    single precision: their distance errs by several ulps of D^2 / r, which outgrows any offset
+    proportional to D. Seen: 60 % of the visibility rays to a lamp of radius 0.05 at distance 12
+    blocked by the lamp itself, in scenes/veach_mis.xml 10-37 % of the light. Scene: one shape of
+    about unit size, points found by rays from 30 and 300 units away. Expected: segments back to
+    where those rays came from, in both directions, are free, and no ray that starts there finds its
+    own start: exactly so on flat shapes, up to one in 1e4 where limbs and edges are grazed.
+    """
+    n = 1 << (14 if kind == "sdfgrid" else 17)
+    scene = shape_scene(kind, "unit", tmp_path)
+    rng = mi.PCG32(n, 7)
+    si, ray = first_hits(scene, "unit", n, rng, False, distance)
+    anchor = anchor_of(scene, si, ray)
+    flux = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ray.d)), 0)
+    like = dr.zeros(mi.SurfaceInteraction3f, n)
+    for a, b in ((rays.free_anchor(ray.o), anchor), (anchor, rays.free_anchor(ray.o))):
+        blocked = scene.ray_test(rays.segment(a, b, like))
+        lost = dr.sum(dr.select(blocked, flux, 0)) / dr.sum(flux)
+        assert lost[0] <= (0 if kind in FLAT else 1e-4)
+    if kind != "sdfgrid":  # convex: outwards there is nothing
+        d = _sphere(rng)
+        outwards = si.is_valid() & (dr.dot(d, si.n) * dr.dot(-ray.d, si.n) > 0)
+        outwards &= dr.abs(dr.dot(d, si.n)) > 1e-3
+        found = outwards & scene.ray_test(rays.spawn(anchor, d, ray))
+        assert int(dr.count(found)[0]) <= (0 if kind in FLAT else 1e-4 * n)
+
+
 def _points(place, n, rng, z, half=1.0):
     """Anchors on the plane at height ``z`` (unit scale), found by rays from a point beside it."""
     scale, shift = PLACES[place]
@@ -220,7 +257,7 @@ def test_thin_walls_block_and_ends_do_not(place, tmp_path):
         ray = mi.Ray3f(origin, dr.normalize(target - origin))
         si = open_scene.ray_intersect(ray)
         assert dr.all(si.is_valid())
-        anchors.append(rays.surface_anchor(si, ray))
+        anchors.append(anchor_of(open_scene, si, ray))
     like = dr.zeros(mi.SurfaceInteraction3f, n)
     for a, b in (anchors, anchors[::-1]):
         segment = rays.segment(a, b, like)
@@ -243,7 +280,7 @@ def test_points_of_a_hollow_see_each_other(kind, place, tmp_path):
     anchors = []
     for seed in (1, 2):
         si, ray = first_hits(scene, place, n, mi.PCG32(n, seed), inside=True)
-        anchors.append(rays.surface_anchor(si, ray))
+        anchors.append(anchor_of(scene, si, ray))
     a, b = anchors
     between = b.p - a.p
     counts = dr.abs(dr.dot(between, a.n)) > a.offset
@@ -308,15 +345,15 @@ def test_scale_does_not_change_the_image(name):
 
     Rationale: known failure 13. Expected: equal images at scale 1e-3 and 1e3, with emitters'
     radiances kept, to that of scale 1 (our own: `path` is right at unit scale only). Statistic:
-    means of 4x4 tiles of 16x16 pixels, 16 renders a side at 64 samples with different seeds, Welch
+    means of 4x4 tiles of 16x16 pixels, 12 renders a side at 32 samples with different seeds, Welch
     with Sidak at 1e-3. Fails with Mitsuba's own offsets, which swallow the small scene.
     """
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 6})
     means = []
     for side, scale in enumerate((1.0, 1e-3, 1e3)):
         scene = scaled_scene(name, scale, resolution=16)
-        images = [mi.render(scene, integrator=integrator, spp=64, seed=100 * side + i).numpy()
-                  for i in range(16)]
+        images = [mi.render(scene, integrator=integrator, spp=32, seed=100 * side + i).numpy()
+                  for i in range(12)]
         means.append([tile_means(image, 4)[:, 1] for image in images])
     for label, other in zip(("1e-3", "1e3"), means[1:], strict=True):
         assert_agree(compare_images(means[0], other, f"{name} x {label}"), at_least=8)

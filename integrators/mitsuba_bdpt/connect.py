@@ -78,7 +78,7 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
-def read_light_vertex(path: LightPath, slot) -> Vertex:
+def read_light_vertex(kernel, path: LightPath, slot) -> Vertex:
     """The stored vertex ``slot``, the same in all lanes that use it."""
     si = path.si[slot]
     partial = path.partial[slot]
@@ -87,7 +87,7 @@ def read_light_vertex(path: LightPath, slot) -> Vertex:
         si=si,
         bsdf=si.bsdf(),
         cos=mi.Float(1),
-        anchor=rays.Anchor(si.p, si.n, path.anchor[slot]),
+        anchor=rays.Anchor(si.p, si.n, path.anchor[slot], kernel.quadrics.ends(si.shape)),
         throughput=path.throughput[slot],
         partial=mis.Partial(partial.x, partial.y),
         edges=s - 1,
@@ -221,7 +221,7 @@ def splat(kernel, y: Vertex, stream, counters):
     counters.shadow_t1 += _one(active)
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
-        pi, _ = rays.intersect_past_emitters(scene, ray, active, coherent=False)
+        pi, _ = rays.intersect_past_emitters(scene, kernel.quadrics, ray, active, coherent=False)
         active &= ~pi.is_valid()
     else:
         active &= ~rays.occluded(scene, ray, active)
@@ -265,7 +265,7 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
     """
 
     def body(slot, total, nonzero):
-        y = read_light_vertex(path, slot)
+        y = read_light_vertex(kernel, path, slot)
         c = inner(kernel, z, y)
         nonzero = nonzero + _one(c.active)
         ray = rays.segment(z.anchor, y.anchor, z.si)
@@ -293,7 +293,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     """
 
     def body(slot, chosen, total, target, u, nonzero):
-        c = inner(kernel, z, read_light_vertex(path, slot))
+        c = inner(kernel, z, read_light_vertex(kernel, path, slot))
         value = c.weighted()
         size = _size(value)
         total = total + size
@@ -321,7 +321,8 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     active, survival = _roulette(kernel, value, u, active, counters)
     counters.shadow_inner += _one(active)
     si = path.si.read(target, active)
-    anchor = rays.Anchor(si.p, si.n, path.anchor.read(target, active))
+    anchor = rays.Anchor(
+        si.p, si.n, path.anchor.read(target, active), kernel.quadrics.ends(si.shape, active))
     active &= ~rays.occluded(kernel.scene, rays.segment(z.anchor, anchor, z.si), active)
     return dr.select(active, value / survival, 0)
 

@@ -90,6 +90,7 @@ class Emitters:
 
     def __init__(self, scene):
         self.scene = scene
+        self.quadrics = rays.Quadrics(scene)
         emitters = scene.emitters()
         kinds = [_kind(e) for e in emitters]
         self.kinds = frozenset(kinds)
@@ -205,7 +206,7 @@ class Emitters:
         return Emission(
             weight=dr.select(pdf_second > 0, radiance * (cos / (pdf_first * pdf_second)), 0),
             d=d,
-            anchor=rays.sampled_anchor(ps.p, n, ps.p),
+            anchor=rays.sampled_anchor(ps.p, n, ps.p, self.quadrics.ends(shape, active)),
             cos=cos,
             pdf_first=pdf_first,
             pdf_second=pdf_second,
@@ -373,7 +374,10 @@ class Emitters:
             emitted = self._direction_density(index, here) / dr.square(ds.dist)
             ratio = dr.select(here, emitted, ratio)
         ratio = dr.select(infinite, self._disk_density(), ratio)
-        anchor = rays.sampled_anchor(ds.p, n, si.p)
+        curvature = mi.Float(0)
+        if AREA in self.kinds:
+            curvature = self.quadrics.ends(emitter.get_shape(), area)
+        anchor = rays.sampled_anchor(ds.p, n, si.p, curvature)
         return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio)
 
     # -- hits by camera subpaths ------------------------------------------------------------

@@ -63,6 +63,7 @@ class Kernel:
     def __init__(self, scene, camera, emitters, plan, settings, heuristic):
         self.scene, self.camera, self.emitters, self.plan = scene, camera, emitters, plan
         self.heuristic = heuristic
+        self.quadrics = emitters.quadrics
         self.full_pdf = bsdf.needs_full_pdf(scene_bsdfs(scene))
         self.round_trip = bsdf.needs_round_trip(scene_bsdfs(scene))
         depth = min(settings.max_depth, UNLIMITED)
@@ -234,7 +235,8 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
     active = active & (kernel.max_depth >= 1)
     ray = start.ray
     if plan.hide_emitters:
-        pi, ray = rays.intersect_past_emitters(kernel.scene, ray, active, coherent=True)
+        pi, ray = rays.intersect_past_emitters(
+            kernel.scene, kernel.quadrics, ray, active, coherent=True)
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     walk = Walk(

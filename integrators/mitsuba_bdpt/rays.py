@@ -19,17 +19,24 @@ import mitsuba as mi
 OFFSET_ULPS = 32
 
 
+# Mitsuba solves for hits on spheres and cylinders in single precision: measured error of t up to
+# 8 * 2^-24 * t^2 / radius (with 4, one visibility ray in a thousand is blocked by its own target).
+QUADRIC_ULPS = 8
+
+
 @dataclass
 class Anchor:
     """A point that rays may start from or end at.
 
     ``p`` position, ``n`` geometric normal of unit length (zero for a point in free space),
-    ``offset`` distance in scene units by which a ray leaves the surface along ``n``.
+    ``offset`` distance in scene units by which a ray leaves the surface along ``n``, ``curvature``
+    1 / radius on spheres and cylinders, 0 elsewhere.
     """
 
     p: object
     n: object
     offset: object
+    curvature: object
 
     def towards(self, d):
         """The start of a ray that leaves into direction ``d`` (any length)."""
@@ -42,20 +49,67 @@ def rounding_offset(p, o, t):
     return (OFFSET_ULPS * 2.0**-24) * dr.maximum(magnitude, t)
 
 
-def surface_anchor(si, ray) -> Anchor:
+class Quadrics:
+    """Curvature of the scene's spheres and cylinders, by shape pointer."""
+
+    def __init__(self, scene):
+        shapes = scene.shapes()
+        rows = [_curvatures(s) for s in shapes]
+        self._size = 0
+        if any(any(row) for row in rows):
+            ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
+            self._size = max(ids) + 1
+            table = [(0.0, 0.0)] * self._size
+            for number, row in zip(ids, rows, strict=True):
+                table[number] = row
+            self._ends, self._starts = (mi.Float(column) for column in zip(*table, strict=True))
+            dr.make_opaque(self._ends, self._starts)
+
+    def ends(self, shape, active=True):
+        """1 / radius where ``shape`` is a sphere or cylinder, else 0."""
+        return self._look_up("_ends", shape, active)
+
+    def starts(self, shape, active=True):
+        """1 / radius where ``shape`` is a cylinder (hits on spheres are exact), else 0."""
+        return self._look_up("_starts", shape, active)
+
+    def _look_up(self, column, shape, active):
+        if self._size == 0:
+            return mi.Float(0)
+        number = dr.reinterpret_array(mi.UInt32, shape)
+        known = mi.Bool(active) & (number < self._size)  # shapes inside instances are not
+        return dr.gather(mi.Float, getattr(self, column), number, known)
+
+
+def _curvatures(shape) -> tuple[float, float]:
+    if shape.shape_type() == mi.ShapeType.Sphere.value:
+        box = shape.bbox()
+        return 2 / max(float(box.max.x - box.min.x), 1e-30), 0.0
+    if shape.shape_type() == mi.ShapeType.Cylinder.value:
+        to_world = mi.traverse(shape)["to_world"]
+        across = dr.norm(mi.Vector3f(to_world @ mi.Vector3f(1, 0, 0)))
+        inverse = 1 / max(float(dr.slice(across)), 1e-30)
+        return inverse, inverse
+    return 0.0, 0.0
+
+
+def surface_anchor(si, ray, quadrics: Quadrics) -> Anchor:
     """Anchor of the hit ``si`` that ``ray`` found."""
-    return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), rounding_offset(si.p, ray.o, si.t))
+    offset = rounding_offset(si.p, ray.o, si.t)
+    offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * quadrics.starts(si.shape, si.is_valid())
+    curvature = quadrics.ends(si.shape, si.is_valid())
+    return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, curvature)
 
 
-def sampled_anchor(p, n, reference) -> Anchor:
+def sampled_anchor(p, n, reference, curvature) -> Anchor:
     """Anchor of a point sampled on a surface, to be joined with the point ``reference``."""
-    return Anchor(
-        mi.Point3f(p), mi.Normal3f(n), rounding_offset(p, reference, dr.norm(p - reference)))
+    offset = rounding_offset(p, reference, dr.norm(p - reference))
+    return Anchor(mi.Point3f(p), mi.Normal3f(n), offset, mi.Float(curvature))
 
 
 def free_anchor(p) -> Anchor:
     """Anchor of a point without surface: a point light, a pinhole, a point of a lens."""
-    return Anchor(mi.Point3f(p), mi.Normal3f(0), mi.Float(0))
+    return Anchor(mi.Point3f(p), mi.Normal3f(0), mi.Float(0), mi.Float(0))
 
 
 def spawn(anchor: Anchor, d, like) -> mi.Ray3f:
@@ -69,7 +123,8 @@ def segment(a: Anchor, b: Anchor, like) -> mi.Ray3f:
     o = a.towards(between)
     to_target = b.towards(-between) - o
     dist = dr.norm(to_target)
-    return mi.Ray3f(o, to_target / dist, dist, like.time, like.wavelengths)
+    early = dr.minimum((QUADRIC_ULPS * 2.0**-24) * dist * b.curvature, 0.01)
+    return mi.Ray3f(o, to_target / dist, dist * (1 - early), like.time, like.wavelengths)
 
 
 def occluded(scene, ray, active):
@@ -77,7 +132,7 @@ def occluded(scene, ray, active):
     return scene.ray_test(ray, active=active)
 
 
-def intersect_past_emitters(scene, ray, active, coherent):
+def intersect_past_emitters(scene, quadrics, ray, active, coherent):
     """First hit along ``ray`` on a shape that does not emit, and the ray that found it.
 
     This is how ``path`` treats camera rays under ``hide_emitters``.
@@ -86,7 +141,7 @@ def intersect_past_emitters(scene, ray, active, coherent):
     def body(ray, pi, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         onward = mi.Ray3f(ray)
-        onward.o = surface_anchor(si, ray).towards(ray.d)
+        onward.o = surface_anchor(si, ray, quadrics).towards(ray.d)
         # maxt bounds a segment: what was travelled is taken off (infinity stays infinity).
         onward.maxt = ray.maxt - dr.dot(onward.o - ray.o, ray.d)
         onward = dr.select(active, onward, ray)

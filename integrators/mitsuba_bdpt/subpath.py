@@ -125,7 +125,7 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
         si=si,
         bsdf=si.bsdf(),
         cos=cos,
-        anchor=rays.surface_anchor(si, walk.ray),
+        anchor=rays.surface_anchor(si, walk.ray, kernel.quadrics),
         throughput=walk.throughput,
         partial=partial,
         edges=walk.edges,
