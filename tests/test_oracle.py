@@ -441,7 +441,7 @@ class Lights:
         w = self.world
         n = dr.select(self.area, w.v(mi.Normal3f, w.normal[:, 0]), 0)
         return emitters.Emission(
-            weight=mi.Spectrum(1), d=w.towards(0, 1), anchor=rays.Anchor(w.point(0), n, mi.Float(0)),
+            weight=mi.Spectrum(1), d=w.towards(0, 1), anchor=rays.Anchor(w.point(0), n, mi.Float(0), mi.Float(0)),
             cos=self.cos, pdf_first=self.first, pdf_second=self.second, infinite=self.infinite,
             delta=self.delta, index=mi.UInt32(0), si=w.interaction(0, from_light=True))
 
@@ -504,6 +504,15 @@ class Sensor:
         return join
 
 
+class Flat:
+    """Stand-in for `rays.Quadrics`: no shape is curved."""
+
+    def starts(self, *_):
+        return mi.Float(0)
+
+    ends = starts
+
+
 class Nothing:
     """Accepts any call: film, and points (every number is a half)."""
 
@@ -550,6 +559,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         coefficient_splat=f(kappa.splat), coefficient_endpoints=f(kappa.endpoints),
         coefficient_inner=f(kappa.inner), points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
+        quadrics=Flat(),
         to_rgb=lambda value, wavelengths: mi.Color3f(value))
     result = [f(0)] * (k + 1)
     stored = []
@@ -586,6 +596,8 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     monkeypatch.setattr(dr, "dispatch", lambda bsdf, function, *arguments: function(bsdf, *arguments))
     monkeypatch.setattr(connect, "store_light_vertex", lambda kernel_, y, path: stored.append(y))
     monkeypatch.setattr(connect, "connect_all", connect_all)
+    monkeypatch.setattr(connect, "sees_emitter", lambda kernel_, z: z.active)
+    monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))
 
     shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
     counters = kernel.Counters(*(u32(0) for _ in kernel.Counters.__dataclass_fields__))
@@ -704,7 +716,7 @@ def test_densities_of_emission_are_those_of_hits(name):
     ray = rays.spawn(e.anchor, e.d, like)
     y1 = scene.ray_intersect(ray)
     there = y1.is_valid() & ~e.delta
-    anchor = rays.surface_anchor(y1, ray)
+    anchor = rays.surface_anchor(y1, ray, lights.quadrics)
     y0 = scene.ray_intersect(rays.spawn(anchor, -e.d, like), there)
     near = dr.norm(y0.p - e.si.p) < 1e-3
     there &= dr.select(e.infinite, ~y0.is_valid(), y0.is_valid() & near)

@@ -32,8 +32,11 @@ class Accumulator:
         self.offset = [int(x) for x in film.crop_offset()]
         self.rfilter = film.rfilter()
         film.prepare(strategy_names(depth))
-        self.camera = self._block(5 if self.alpha else 4)
-        self.light = self._block(3)
+        # Even numbers of channels, padded with zeros: Dr.Jit then adds a pixel's channels as a packet
+        # (three by three, splats alone cost a tenth of a render).
+        self.channels = 5 if self.alpha else 4
+        self.camera = self._block(self.channels + self.channels % 2)
+        self.light = self._block(4)
         # One strip of rows per strategy, far enough apart for the filter.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         self.strategies = self._block(6, strategy_count(depth) * self._stride) if depth else None
@@ -48,11 +51,12 @@ class Accumulator:
     def put_camera(self, position, rgb, alpha, active):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
         values = [rgb.x, rgb.y, rgb.z, *([alpha] if self.alpha else []), mi.Float(1)]
+        values += [mi.Float(0)] * (self.channels % 2)
         self.camera.put(position, values, active)
 
     def put_light(self, position, rgb, active):
         """Add a splat at a continuous film position."""
-        self.light.put(position, [rgb.x, rgb.y, rgb.z], active)
+        self.light.put(position, [rgb.x, rgb.y, rgb.z, mi.Float(0)], active)
 
     def put_strategy(self, position, weighted, unweighted, s, t, active):
         """Add to the technique images of the strategy (s, t)."""
@@ -85,7 +89,7 @@ class Accumulator:
             np.array(s).reshape(-1, b.channel_count()) for s, b in
             zip(self._sums[:2], (self.camera, self.light), strict=True)
         )
-        weight = max(camera[:, -1].sum(), 1e-30)
+        weight = max(camera[:, self.channels - 1].sum(), 1e-30)
         splat_weight = max(self._splat_weight(spp).sum(), 1e-30)
         return float((camera[:, :3].sum(0) / weight + light[:, :3].sum(0) / splat_weight).max())
 
@@ -115,8 +119,9 @@ class Accumulator:
         camera, light = (
             np.array(s).reshape(h, w, -1) for s in self._sums[:2]
         )
+        camera = camera[..., : self.channels]
         to_film = camera[..., -1:] / self._splat_weight(spp)[..., None]
-        camera[..., :3] += light * to_film
+        camera[..., :3] += light[..., :3] * to_film
         layers = [camera]
         if self.depth:
             tall = np.array(self._sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
