@@ -373,7 +373,7 @@ def test_normal_mapped_glass_from_both_sides():
     camera; k = 3, where (0,4) and (3,1) are the only strategies. Expected: equal unweighted images.
     Statistic: means of 4x4 tiles, 16 renders a side with different seeds, Welch with Sidak at 1e-3.
     """
-    from statistics import assert_agree, compare_images, tile_means
+    from welch import assert_agree, compare_images, tile_means
 
     scene = pane_scene(16)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "skip": "none", "strategy_images": True})

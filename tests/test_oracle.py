@@ -441,7 +441,8 @@ class Lights:
         w = self.world
         n = dr.select(self.area, w.v(mi.Normal3f, w.normal[:, 0]), 0)
         return emitters.Emission(
-            weight=mi.Spectrum(1), d=w.towards(0, 1), anchor=rays.Anchor(w.point(0), n, mi.Float(0), mi.Float(0)),
+            weight=mi.Spectrum(1), d=w.towards(0, 1),
+            anchor=rays.Anchor(w.point(0), n, mi.Float(0), mi.Float(0)),
             cos=self.cos, pdf_first=self.first, pdf_second=self.second, infinite=self.infinite,
             delta=self.delta, index=mi.UInt32(0), si=w.interaction(0, from_light=True))
 

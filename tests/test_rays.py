@@ -5,7 +5,7 @@ Known failure 13: offsets of 8.9e-5 (1 + max|p|) swallow small scenes and leave 
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from statistics import assert_agree, compare_images, tile_means
+from welch import assert_agree, compare_images, tile_means
 
 import drjit as dr
 import mitsuba as mi

@@ -19,7 +19,7 @@ Roulette is off (``rr_depth`` 100) except where it is the subject.
 
 from __future__ import annotations
 
-import statistics as st
+import welch as st
 from functools import cache
 
 import mitsuba as mi

@@ -515,10 +515,11 @@ class _SmoothMeshes:
 def _curved_faces(shape):
     """Cross products of the edges of each face, shape (faces, 3), for a mesh whose vertex normals
     differ from its faces' normals; None for all other shapes."""
-    if shape is None or not shape.is_mesh() or not shape.has_vertex_normals():
+    if shape is None or not shape.is_mesh():
         return None
     params = mi.traverse(shape)
-    if "vertex_positions" not in params:  # a rectangle: flat
+    # Neither a rectangle (flat, without vertices) nor a mesh without normals at its vertices.
+    if "vertex_positions" not in params or not len(params["vertex_normals"]):
         return None
     faces = np.array(params["faces"]).reshape(-1, 3)
     p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)

@@ -56,7 +56,8 @@ class Heuristic:
         """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
         if self.name == "uniform":  # counts strategies: only whether a density is zero matters
             return dr.select(factor > 0, x, 0)
-        return dr.minimum(x * factor, SATURATION)
+        # The factor as well: 0 times an infinite product of densities would be NaN.
+        return dr.minimum(x * dr.minimum(factor, SATURATION), SATURATION)
 
     def combine(self, a, b):
         """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
@@ -80,8 +81,11 @@ class Heuristic:
         ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
         alternatives with fewer and with more light vertices (eqs. 37 and 38).
         """
-        if self.name == "maximum":  # of equal ones, that with the fewest light vertices counts
-            best = (coefficient >= camera_side) & (coefficient > light_side)
+        if self.name == "maximum":
+            # Of equal ones, that with the fewest light vertices counts. Rounding must not decide:
+            # each strategy computes the ratio by itself.
+            near = coefficient * (1 + 1e-4)
+            best = (near >= camera_side) & (coefficient > light_side * (1 + 1e-4))
             return dr.select(best, 1.0, 0.0)
         others = self.combine(light_side, camera_side)
         if self.name == "uniform":
