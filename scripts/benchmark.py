@@ -59,8 +59,7 @@ def integrators(depth):
     return {
         "path": mi.load_dict({"type": "path", "max_depth": depth}),
         "bdpt skip=none": mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": "none"}),
-        "bdpt skip=impossible": mi.load_dict(
-            {"type": "bdpt", "max_depth": depth, "skip": "impossible"}),
+        "bdpt skip=impossible": mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": "impossible"}),
     }
 
 
@@ -119,32 +118,38 @@ def efficiency(args):
     _, seconds_path = timed(scene, path, args.spp, 2)
     spp_path = max(round(args.spp * seconds_ours / seconds_path), 1)
     ref, own = reference(scene, args.scene, resolution, depth, 1.0)
-    ref, own = reference(
-        scene, args.scene, resolution, depth, 0.01 * rel_mse(trial, ref, 0.001))
+    ref, own = reference(scene, args.scene, resolution, depth, 0.01 * rel_mse(trial, ref, 0.001))
     rows = {"independent": [], "multijitter": []}
     scenes = {"independent": scene}
     loaded = mi.load_file(
-        str(ROOT / "scenes" / f"{args.scene}.xml"), resolution=resolution, max_depth=depth,
-        sampler="multijitter", parallel=False)
+        str(ROOT / "scenes" / f"{args.scene}.xml"),
+        resolution=resolution,
+        max_depth=depth,
+        sampler="multijitter",
+        parallel=False,
+    )
     scenes["multijitter"] = loaded
     for sampler in rows:
         for seed in range(args.seeds + 1):
             a, ta = timed(scene, ours, args.spp, seed)
             b, tb = timed(scenes[sampler], path, spp_path, seed)
             if seed:
-                rows[sampler].append([
-                    tb * rel_mse(b, ref, trim) / (ta * rel_mse(a, ref, trim))
-                    for trim in (0.001, 0.0)
-                ])
-    print(f"efficiency of bdpt over path, {args.scene}, {resolution}x{resolution}, depth {depth}, "
-          f"{args.spp} spp against {spp_path} spp, {args.seeds} seeds; relMSE trimmed "
-          f"{rel_mse(a, ref, 0.001):.5f}, reference {own:.1e}")
+                rows[sampler].append(
+                    [tb * rel_mse(b, ref, trim) / (ta * rel_mse(a, ref, trim)) for trim in (0.001, 0.0)]
+                )
+    print(
+        f"efficiency of bdpt over path, {args.scene}, {resolution}x{resolution}, depth {depth}, "
+        f"{args.spp} spp against {spp_path} spp, {args.seeds} seeds; relMSE trimmed "
+        f"{rel_mse(a, ref, 0.001):.5f}, reference {own:.1e}"
+    )
     result = {}
     for sampler, r in rows.items():
         r = np.array(r)
-        print(f"  path {sampler:12} trimmed {np.median(r[:, 0]):.2f}x "
-              f"({r[:, 0].min():.2f}..{r[:, 0].max():.2f}), raw {np.median(r[:, 1]):.2f}x "
-              f"({r[:, 1].min():.2f}..{r[:, 1].max():.2f})")
+        print(
+            f"  path {sampler:12} trimmed {np.median(r[:, 0]):.2f}x "
+            f"({r[:, 0].min():.2f}..{r[:, 0].max():.2f}), raw {np.median(r[:, 1]):.2f}x "
+            f"({r[:, 1].min():.2f}..{r[:, 1].max():.2f})"
+        )
         result[sampler] = {"trimmed": float(np.median(r[:, 0])), "raw": float(np.median(r[:, 1]))}
     return result
 
@@ -169,19 +174,26 @@ def coldstart(args):
             with tempfile.TemporaryDirectory() as cache:
                 env = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
                 out = subprocess.run(
-                    [sys.executable, "-c", COLD % name], env=env, check=True, capture_output=True,
-                    text=True)
+                    [sys.executable, "-c", COLD % name],
+                    env=env,
+                    check=True,
+                    capture_output=True,
+                    text=True,
+                )
             rows.append(float(out.stdout.split()[-1]))
     result = {name: float(np.median(rows)) for name, rows in seconds.items()}
-    print("cold start to the first Cornell image: "
-          + ", ".join(f"{n} {t:.2f} s" for n, t in result.items())
-          + f", ratio {result['bdpt'] / result['path']:.2f}x")
+    print(
+        "cold start to the first Cornell image: "
+        + ", ".join(f"{n} {t:.2f} s" for n, t in result.items())
+        + f", ratio {result['bdpt'] / result['path']:.2f}x"
+    )
     return result
 
 
 def main():
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("cost", "efficiency", "coldstart"))
     parser.add_argument("scene", nargs="?", default="cornell_box", help="name in scenes/")
     parser.add_argument("--spp", type=int, default=64)

@@ -92,9 +92,21 @@ class Coefficients:
 def log_densities(paths: Paths) -> np.ndarray:
     """log p_s for s = 0 ... k, shape (n, k + 1); -inf where the strategy cannot make the path."""
     k, n = paths.k, len(paths.kind)
-    log = {name: np.log(np.asarray(getattr(paths, name), dtype=np.float64))
-           for name in ("dist2", "cos_light", "cos_camera", "to_camera", "to_light", "first",
-                        "second", "direct", "lens_pdf", "sensor_pdf")}
+    log = {
+        name: np.log(np.asarray(getattr(paths, name), dtype=np.float64))
+        for name in (
+            "dist2",
+            "cos_light",
+            "cos_camera",
+            "to_camera",
+            "to_light",
+            "first",
+            "second",
+            "direct",
+            "lens_pdf",
+            "sensor_pdf",
+        )
+    }
     is_area = paths.kind == AREA
 
     # Densities of x_i when sampled from x_{i-1}, area measure. A delta event has the same
@@ -128,7 +140,7 @@ def log_densities(paths: Paths) -> np.ndarray:
     p = np.empty((n, k + 1))
     for s in range(k + 1):
         t = k + 1 - s
-        start = direct[:, None] if s == 1 and t >= 2 else light[:, :min(s, 1)]
+        start = direct[:, None] if s == 1 and t >= 2 else light[:, : min(s, 1)]
         p[:, s] = start.sum(1) + light[:, 1:s].sum(1) + camera[:, s:].sum(1)
         possible = np.ones(n, dtype=bool)
         if s == 0:

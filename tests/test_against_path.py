@@ -6,11 +6,11 @@ with Sidak's correction at 1e-3 over all tiles (and Kolmogorov-Smirnov for the p
 """
 
 from pathlib import Path
-from welch import Comparisons, assert_agree, compare_images, tile_means
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from welch import Comparisons, assert_agree, compare_images, tile_means
 
 ROOT = Path(__file__).resolve().parents[1]
 TILES = 4
@@ -20,15 +20,18 @@ def load(name, resolution=16, **parameters):
     if name == "veach_mis":
         parameters["resolution_y"] = resolution
     return mi.load_file(
-        str(ROOT / "scenes" / f"{name}.xml"), integrator="path", resolution=resolution, **parameters)
+        str(ROOT / "scenes" / f"{name}.xml"), integrator="path", resolution=resolution, **parameters
+    )
 
 
 def renders(scene, integrator, count, spp, first_seed, tiles=TILES):
     """Tile means (green) of ``count`` renders, shape (count, tiles^2)."""
-    return np.stack([
-        tile_means(mi.render(scene, integrator=integrator, spp=spp, seed=first_seed + i), tiles)[:, 1]
-        for i in range(count)
-    ])
+    return np.stack(
+        [
+            tile_means(mi.render(scene, integrator=integrator, spp=spp, seed=first_seed + i), tiles)[:, 1]
+            for i in range(count)
+        ]
+    )
 
 
 def bdpt(max_depth, **parameters):
@@ -60,8 +63,7 @@ def test_scene_equals_path(name):
     scene = load(name)
     reference = renders(scene, path(depth), 32, 128, 0)
     family = [
-        compare_images(
-            reference, renders(scene, bdpt(depth, skip=skip), 32, 32, seed), f"{name} {skip}")
+        compare_images(reference, renders(scene, bdpt(depth, skip=skip), 32, 32, seed), f"{name} {skip}")
         for skip, seed in (("none", 1000), ("auto", 2000))
     ]
     assert_agree(Comparisons.join(family), at_least=2 * 8)
@@ -112,8 +114,7 @@ def test_choices_do_not_change_the_image(name):
         ours = renders(scene, bdpt(depth, **parameters), 24, 32, 1000 * seed)
         family.append(compare_images(everything, ours, f"{name} {parameters}"))
     if name != "lamp_behind_glass":
-        no_connections = renders(
-            scene, bdpt(depth, skip="none", connections="none"), 24, 64, 4000)
+        no_connections = renders(scene, bdpt(depth, skip="none", connections="none"), 24, 64, 4000)
         family.append(compare_images(everything, no_connections, f"{name} n1c0"))
     assert_agree(Comparisons.join(family), at_least=30)
 
@@ -129,11 +130,13 @@ def test_light_of_delta_lamps_through_glass():
     """
     scene = load("lamp_behind_glass")
     means = {}
-    for seed, (label, integrator, spp) in enumerate((
-        ("n1c1", bdpt(4, skip="none"), 128),
-        ("n1c0", bdpt(4, skip="none", connections="none"), 128),
-        ("path", path(4), 128),
-    )):
+    for seed, (label, integrator, spp) in enumerate(
+        (
+            ("n1c1", bdpt(4, skip="none"), 128),
+            ("n1c0", bdpt(4, skip="none", connections="none"), 128),
+            ("path", path(4), 128),
+        )
+    ):
         images = renders(scene, integrator, 16, spp, 1000 * seed).mean(1)
         means[label] = images.mean(), images.std(ddof=1) / 4
     (full, e_full), (light, e_light) = means["n1c1"], means["n1c0"]
@@ -155,40 +158,65 @@ def bumpy_scene(nested, lamp, spp=64):
         return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(values.astype(np.float32))}
 
     t = mi.ScalarTransform4f
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": {
-            "type": "perspective", "fov": 45.0,
-            "to_world": t().look_at(origin=[-2.5, -2.5, 1.6], target=[0.2, 0.2, 0.3], up=[0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"},
-                     "pixel_format": "rgb", "component_format": "float32"},
-            "sampler": {"type": "independent", "sample_count": spp},
-        },
-        "floor": {"type": "rectangle", "to_world": t().scale(1.5),
-                  "bsdf": {"type": "bumpmap", "scale": 0.15, "t": bitmap(waves[..., None]),
-                           "nested": nested}},
-        "wall": {"type": "rectangle",
-                 "to_world": t().translate([1.2, 0, 0.8]) @ t().rotate([0, 1, 0], -90),
-                 "bsdf": {"type": "normalmap", "normalmap": bitmap(0.5 + 0.5 * normal),
-                          "nested": nested}},
-        "lamp": lamp,
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 45.0,
+                "to_world": t().look_at(origin=[-2.5, -2.5, 1.6], target=[0.2, 0.2, 0.3], up=[0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 16,
+                    "height": 16,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "independent", "sample_count": spp},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": t().scale(1.5),
+                "bsdf": {
+                    "type": "bumpmap",
+                    "scale": 0.15,
+                    "t": bitmap(waves[..., None]),
+                    "nested": nested,
+                },
+            },
+            "wall": {
+                "type": "rectangle",
+                "to_world": t().translate([1.2, 0, 0.8]) @ t().rotate([0, 1, 0], -90),
+                "bsdf": {
+                    "type": "normalmap",
+                    "normalmap": bitmap(0.5 + 0.5 * normal),
+                    "nested": nested,
+                },
+            },
+            "lamp": lamp,
+        }
+    )
 
 
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}
 GLOSSY = {"type": "roughconductor", "alpha": 0.3}
-POINT = {"type": "point", "position": [-0.6, 0.5, 0.6],
-         "intensity": {"type": "rgb", "value": 3.0}}
+POINT = {"type": "point", "position": [-0.6, 0.5, 0.6], "intensity": {"type": "rgb", "value": 3.0}}
 
 
 def sphere_lamp():
-    return {"type": "sphere", "center": [-0.6, 0.5, 0.6], "radius": 0.15,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 40.0}}}
+    return {
+        "type": "sphere",
+        "center": [-0.6, 0.5, 0.6],
+        "radius": 0.15,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 40.0}},
+    }
 
 
 @pytest.mark.parametrize(
-    "nested, lamp", [(GREY, "area"), (GLOSSY, "point")], ids=["matte-area", "glossy-point"])
+    "nested, lamp", [(GREY, "area"), (GLOSSY, "point")], ids=["matte-area", "glossy-point"]
+)
 def test_bumped_surfaces_equal_path(nested, lamp):
     """Light subpaths on bump- and normal-mapped surfaces agree with ``path``, the reference.
 
@@ -209,10 +237,12 @@ def test_bumped_surfaces_equal_path(nested, lamp):
         direct = renders(scene, path(2), 24, 64, 4000)
         images = bdpt(2, skip="none", strategy_images=True)
         start = 3 + 2 * 6 + 2 * 6 + 3 + 1  # RGB, k = 1, (0,3) and (1,2), weighted (2,1), green
-        splats = np.stack([
-            tile_means(mi.render(scene, integrator=images, spp=32, seed=5000 + i), TILES)[:, start]
-            for i in range(24)
-        ])
+        splats = np.stack(
+            [
+                tile_means(mi.render(scene, integrator=images, spp=32, seed=5000 + i), TILES)[:, start]
+                for i in range(24)
+            ]
+        )
         family.append(compare_images(direct, splats, "light tracing"))
     assert_agree(Comparisons.join(family), at_least=16)
 
@@ -229,10 +259,11 @@ def test_shapes_that_cannot_emit(tmp_path):
     ball = np.sqrt((x - 0.5) ** 2 + (y - 0.5) ** 2 + (z - 0.5) ** 2) - 0.3
     scene = {k: v for k, v in mi.cornell_box().items() if k not in ("small-box", "large-box")}
     scene["sensor"]["film"].update(width=16, height=16, rfilter={"type": "box"})
-    scene["curve"] = {"type": "bsplinecurve", "filename": str(tmp_path / "curve.txt"),
-                      "bsdf": GLOSSY}
+    scene["curve"] = {"type": "bsplinecurve", "filename": str(tmp_path / "curve.txt"), "bsdf": GLOSSY}
     scene["grid"] = {
-        "type": "sdfgrid", "grid": mi.TensorXf(ball[..., None].astype(np.float32)), "bsdf": GREY,
+        "type": "sdfgrid",
+        "grid": mi.TensorXf(ball[..., None].astype(np.float32)),
+        "bsdf": GREY,
         "to_world": mi.ScalarTransform4f().translate([-0.6, -1, -0.5]) @ mi.ScalarTransform4f().scale(0.9),
     }
     scene = mi.load_dict(scene)

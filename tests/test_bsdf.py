@@ -27,7 +27,9 @@ def bumps(nested):
     x = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     waves = 0.5 + 0.5 * np.sin(x)[:, None] * np.cos(x)[None, :]
     texture = {
-        "type": "bitmap", "raw": True, "wrap_mode": "repeat",
+        "type": "bitmap",
+        "raw": True,
+        "wrap_mode": "repeat",
         "bitmap": mi.Bitmap(waves.astype(np.float32)[..., None]),
     }
     return {"type": "bumpmap", "scale": 0.1, "texture": texture, "nested": nested}
@@ -64,13 +66,28 @@ PLUGINS = {
     "roughplastic": lambda: {**PLASTIC, "type": "roughplastic", "alpha": 0.2},
     "pplastic": lambda: {"type": "pplastic", "alpha": 0.2},
     "principled": lambda: {
-        "type": "principled", "metallic": 0.3, "roughness": 0.4, "anisotropic": 0.5,
-        "clearcoat": 0.5, "clearcoat_gloss": 0.3, "sheen": 0.4, "spec_tint": 0.4},
+        "type": "principled",
+        "metallic": 0.3,
+        "roughness": 0.4,
+        "anisotropic": 0.5,
+        "clearcoat": 0.5,
+        "clearcoat_gloss": 0.3,
+        "sheen": 0.4,
+        "spec_tint": 0.4,
+    },
     "principled transmissive": lambda: {
-        "type": "principled", "metallic": 0.2, "roughness": 0.4, "spec_trans": 0.6},
+        "type": "principled",
+        "metallic": 0.2,
+        "roughness": 0.4,
+        "spec_trans": 0.6,
+    },
     "principledthin": lambda: {
-        "type": "principledthin", "roughness": 0.4, "spec_trans": 0.4, "diff_trans": 0.8,
-        "sheen": 0.3},
+        "type": "principledthin",
+        "roughness": 0.4,
+        "spec_trans": 0.4,
+        "diff_trans": 0.8,
+        "sheen": 0.3,
+    },
     "hair": lambda: {"type": "hair"},
     "null": lambda: {"type": "null"},
     "mask": lambda: {"type": "mask", "opacity": 0.4, "nested": GREY},
@@ -93,10 +110,10 @@ PLUGINS = {
 # Mitsuba's own error, seen in `path` alike: blendbsdf accepts directions that the nested BSDF has
 # rejected, so its samples carry 11-13 % more than an integral of eval() does.
 BLEND_OF_REJECTED = pytest.mark.xfail(
-    reason="Mitsuba 3.9.1: blendbsdf keeps samples that roughdielectric rejects", strict=True)
+    reason="Mitsuba 3.9.1: blendbsdf keeps samples that roughdielectric rejects", strict=True
+)
 EXACT = [
-    pytest.param(name, marks=BLEND_OF_REJECTED if name == "blendbsdf frosted" else ())
-    for name in PLUGINS
+    pytest.param(name, marks=BLEND_OF_REJECTED if name == "blendbsdf frosted" else ()) for name in PLUGINS
 ]
 
 # Class names that Mitsuba 3.9.1 has besides; they need data files or polarized variants.
@@ -131,7 +148,7 @@ def surface(draw, n: int, tilt: float = 0.0):
 def take_step(take, plugin, draw, si):
     """``take`` as a subpath calls it: `bsdf.sample` or `bsdf.sample_adjoint`."""
     full, round_trip = bsdf.needs_full_pdf([plugin]), bsdf.needs_round_trip([plugin])
-    return take(plugin, si, draw.one(), draw.two(), mi.Bool(True), full, round_trip)
+    return take(mi.BSDFPtr(plugin), si, draw.one(), draw.two(), mi.Bool(True), full, round_trip)
 
 
 def in_numpy(n, *values):
@@ -206,11 +223,36 @@ def test_every_plugin_is_covered():
     from pathlib import Path
 
     shipped = {p.stem for p in Path(mi.__file__).parent.joinpath("plugins").glob("*.so")}
-    bsdfs = {n for n in shipped if n in {
-        "diffuse", "conductor", "roughconductor", "dielectric", "thindielectric",
-        "roughdielectric", "plastic", "roughplastic", "pplastic", "principled", "principledthin",
-        "hair", "null", "mask", "blendbsdf", "bumpmap", "normalmap", "twosided", "measured",
-        "measured_polarized", "circular", "polarizer", "retarder"}}
+    bsdfs = {
+        n
+        for n in shipped
+        if n
+        in {
+            "diffuse",
+            "conductor",
+            "roughconductor",
+            "dielectric",
+            "thindielectric",
+            "roughdielectric",
+            "plastic",
+            "roughplastic",
+            "pplastic",
+            "principled",
+            "principledthin",
+            "hair",
+            "null",
+            "mask",
+            "blendbsdf",
+            "bumpmap",
+            "normalmap",
+            "twosided",
+            "measured",
+            "measured_polarized",
+            "circular",
+            "polarizer",
+            "retarder",
+        }
+    }
     assert bsdfs - NOT_COVERED == {name.split()[0] for name in PLUGINS}
 
 
@@ -229,15 +271,21 @@ def test_step_is_evaluation_over_density(name):
     draw = Draw(n, 3)
     si = surface(draw, n, tilt=0.4)
     active = mi.Bool(True)
-    for take, evaluate in (
-        (bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)
-    ):
+    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)):
         step = take_step(take, plugin, draw, si)
-        ev = evaluate(plugin, si, step.wo, active)
+        ev = evaluate(mi.BSDFPtr(plugin), si, step.wo, active)
         use = ~step.delta & (dr.max(step.weight) > 0)
         use, weight, value, fwd, rev, ev_fwd, ev_rev, cos = in_numpy(
-            n, mi.Float(dr.select(use, 1, 0)), step.weight, ev.value, step.pdf_fwd, step.pdf_rev,
-            ev.pdf_fwd, ev.pdf_rev, step.cos_out)
+            n,
+            mi.Float(dr.select(use, 1, 0)),
+            step.weight,
+            ev.value,
+            step.pdf_fwd,
+            step.pdf_rev,
+            ev.pdf_fwd,
+            ev.pdf_rev,
+            step.cos_out,
+        )
         use = use > 0
         normal, outgoing, wi = (np.array(v, dtype=np.float64) for v in (si.n, step.wo, si.wi))
         own_cos = np.abs((normal * outgoing).sum(0))
@@ -338,31 +386,58 @@ def pane_scene(spp):
     move, scale = mi.ScalarTransform4f().translate, mi.ScalarTransform4f().scale
     x = (np.arange(8) + 0.5) / 8 * 2 * np.pi
     slope = 0.35 * np.stack(
-        [np.sin(x)[None, :] + 0 * x[:, None], np.cos(2 * x)[:, None] + 0 * x[None, :]], -1)
+        [np.sin(x)[None, :] + 0 * x[:, None], np.cos(2 * x)[:, None] + 0 * x[None, :]], -1
+    )
     normals = np.concatenate([slope, np.ones((8, 8, 1))], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     bitmap = mi.Bitmap((0.5 + 0.5 * normals).astype(np.float32))
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": 3.0}}
     black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": {
-            "type": "perspective", "fov": 40.0,
-            "to_world": lookat(origin=[0, -2.2, 0.9], target=[0, 0, 0.1], up=[0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"},
-                     "pixel_format": "rgb", "component_format": "float32"},
-            "sampler": {"type": "independent", "sample_count": spp},
-        },
-        "floor": {"type": "rectangle", "to_world": scale([20.0, 20.0, 1.0]),
-                  "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}},
-        "pane": {"type": "rectangle", "to_world": move([0, 0, 1.5]) @ scale(1.5),
-                 "bsdf": {"type": "normalmap", "nested": GLASS,
-                          "normalmap": {"type": "bitmap", "raw": True, "bitmap": bitmap}}},
-        "above": {"type": "rectangle", "bsdf": black, "emitter": lamp,
-                  "to_world": move([0.3, 0.2, 2.5]) @ rotate([1, 0, 0], 180) @ scale(1.2)},
-        "beside": {"type": "rectangle", "bsdf": black, "emitter": lamp,
-                   "to_world": move([-1.8, 0, 0.4]) @ rotate([0, 1, 0], 30) @ scale(0.6)},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 40.0,
+                "to_world": lookat(origin=[0, -2.2, 0.9], target=[0, 0, 0.1], up=[0, 0, 1]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 16,
+                    "height": 16,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+                "sampler": {"type": "independent", "sample_count": spp},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": scale([20.0, 20.0, 1.0]),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}},
+            },
+            "pane": {
+                "type": "rectangle",
+                "to_world": move([0, 0, 1.5]) @ scale(1.5),
+                "bsdf": {
+                    "type": "normalmap",
+                    "nested": GLASS,
+                    "normalmap": {"type": "bitmap", "raw": True, "bitmap": bitmap},
+                },
+            },
+            "above": {
+                "type": "rectangle",
+                "bsdf": black,
+                "emitter": lamp,
+                "to_world": move([0.3, 0.2, 2.5]) @ rotate([1, 0, 0], 180) @ scale(1.2),
+            },
+            "beside": {
+                "type": "rectangle",
+                "bsdf": black,
+                "emitter": lamp,
+                "to_world": move([-1.8, 0, 0.4]) @ rotate([0, 1, 0], 30) @ scale(0.6),
+            },
+        }
+    )
 
 
 def test_normal_mapped_glass_from_both_sides():

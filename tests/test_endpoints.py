@@ -25,9 +25,9 @@ def integrator(kind="bdpt", **parameters):
 
 def render(scene, method, seeds, spp, **keywords):
     """Images, stacked: (seeds, height, width, channels)."""
-    return np.stack([
-        np.array(method.render(scene, seed=seed, spp=spp, **keywords), dtype=np.float64)
-        for seed in seeds])
+    return np.stack(
+        [np.array(method.render(scene, seed=seed, spp=spp, **keywords), dtype=np.float64) for seed in seeds]
+    )
 
 
 def tiles(images, size=4):
@@ -47,7 +47,8 @@ def agree(a, b, relative):
     variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
     error = np.sqrt(sum(variance))
     freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
-        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120)
+        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120
+    )
     level = 1 - (1 - SIGNIFICANCE) ** (1 / a.shape[1])
     scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
     reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + ROUNDING * scale
@@ -56,18 +57,19 @@ def agree(a, b, relative):
     assert not bad.any(), "\n".join(
         f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
         f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
-        for i in np.flatnonzero(bad)[-20:])
+        for i in np.flatnonzero(bad)[-20:]
+    )
     assert scale[-1] > 0
     assert reach[-1] < relative * scale[-1], (
-        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}")
+        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}"
+    )
 
 
 def same_image(scene, relative=0.02, seeds=10, spp=(128, 256), method=None, size=4, **parameters):
     """Assert that we and `path` agree on ``scene``; ``spp`` ours and `path`'s."""
     depth = parameters.pop("max_depth", 4)
     ours = method or integrator(max_depth=depth, skip="none", **parameters)
-    path = integrator("path", max_depth=depth,
-                      hide_emitters=parameters.get("hide_emitters", False))
+    path = integrator("path", max_depth=depth, hide_emitters=parameters.get("hide_emitters", False))
     a = render(scene, ours, range(seeds), spp[0])
     b = render(scene, path, range(100, 100 + seeds), spp[1])
     assert a.shape == b.shape
@@ -83,28 +85,42 @@ def layer(images, bdpt, name):
 
 
 def film(size=16, rfilter="box", **keys):
-    return {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
-            "component_format": "float32", "rfilter": {"type": rfilter}} | keys
+    return {
+        "type": "hdrfilm",
+        "width": size,
+        "height": size,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": rfilter},
+    } | keys
 
 
 def perspective(origin=(0, 2, 5), target=(0, 0.3, 0), fov=40, keys=None, **film_keys):
     return {
-        "type": "perspective", "fov": fov,
+        "type": "perspective",
+        "fov": fov,
         "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
-        "sampler": {"type": "independent"}, "film": film(**film_keys)} | (keys or {})
+        "sampler": {"type": "independent"},
+        "film": film(**film_keys),
+    } | (keys or {})
 
 
 def thinlens(aperture=0.15, focus=4.5, **keys):
     return perspective(**keys) | {
-        "type": "thinlens", "aperture_radius": aperture, "focus_distance": focus}
+        "type": "thinlens",
+        "aperture_radius": aperture,
+        "focus_distance": focus,
+    }
 
 
 SENSORS = {"perspective": perspective, "thinlens": thinlens}
 
 
 def grey(value):
-    return {"type": "twosided", "bsdf": {
-        "type": "diffuse", "reflectance": {"type": "rgb", "value": [value] * 3}}}
+    return {
+        "type": "twosided",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [value] * 3}},
+    }
 
 
 def sky_bitmap():
@@ -122,49 +138,96 @@ def texture():
 
 EMITTERS = {
     "rectangle": lambda: {
-        "type": "rectangle", "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.4),
-        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 6.0}},
+        "type": "rectangle",
+        "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.4),
+        "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": 6.0},
+    },
     "disk": lambda: {
-        "type": "disk", "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 100).scale(0.4),
-        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 8.0}},
+        "type": "disk",
+        "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 100).scale(0.4),
+        "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": 8.0},
+    },
     "sphere": lambda: {
-        "type": "sphere", "center": [-1, 1.6, 0.5], "radius": 0.3, "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": 5.0}},
+        "type": "sphere",
+        "center": [-1, 1.6, 0.5],
+        "radius": 0.3,
+        "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": 5.0},
+    },
     "cylinder": lambda: {
-        "type": "cylinder", "p0": [-1.2, 1.5, 0], "p1": [1, 2, 0.4], "radius": 0.15,
-        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 4.0}},
+        "type": "cylinder",
+        "p0": [-1.2, 1.5, 0],
+        "p1": [1, 2, 0.4],
+        "radius": 0.15,
+        "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": 4.0},
+    },
     "cube": lambda: {
-        "type": "cube", "to_world": T().translate([1, 1.6, 0.4]).rotate([1, 1, 0], 30).scale(0.25),
-        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 5.0}},
+        "type": "cube",
+        "to_world": T().translate([1, 1.6, 0.4]).rotate([1, 1, 0], 30).scale(0.25),
+        "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": 5.0},
+    },
     "textured": lambda: {
-        "type": "rectangle", "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.5),
-        "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": texture()}},
+        "type": "rectangle",
+        "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.5),
+        "bsdf": grey(0.1),
+        "emitter": {"type": "area", "radiance": texture()},
+    },
     "point": lambda: {"type": "point", "position": [0.7, 2.2, 1], "intensity": 5.0},
     "spot": lambda: {
-        "type": "spot", "intensity": 12.0, "cutoff_angle": 35, "beam_width": 20,
-        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1])},
+        "type": "spot",
+        "intensity": 12.0,
+        "cutoff_angle": 35,
+        "beam_width": 20,
+        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1]),
+    },
     "textured spot": lambda: {
-        "type": "spot", "intensity": 12.0, "cutoff_angle": 35, "texture": texture(),
-        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1])},
+        "type": "spot",
+        "intensity": 12.0,
+        "cutoff_angle": 35,
+        "texture": texture(),
+        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1]),
+    },
     "directional": lambda: {"type": "directional", "direction": [-1, -2, -0.7], "irradiance": 3.0},
     "constant": lambda: {"type": "constant", "radiance": 0.7},
     "envmap": lambda: {"type": "envmap", "bitmap": sky_bitmap(), "scale": 0.8},
     "rotated envmap": lambda: {
-        "type": "envmap", "bitmap": sky_bitmap(), "to_world": T().rotate([1, 2, 3], 70)},
+        "type": "envmap",
+        "bitmap": sky_bitmap(),
+        "to_world": T().rotate([1, 2, 3], 70),
+    },
 }
 
 
 def room(sensor=None, **more):
     """A floor, a back wall, a ball and a box. Shapes of unequal BSDFs, so that Mitsuba merges none."""
     return {
-        "type": "scene", "sensor": sensor or perspective(),
-        "floor": {"type": "rectangle", "bsdf": grey(0.6),
-                  "to_world": T().rotate([1, 0, 0], -90).scale(2)},
-        "back": {"type": "rectangle", "bsdf": grey(0.55), "to_world": T().translate([0, 1, -2]).scale(2)},
-        "ball": {"type": "sphere", "center": [-0.6, 0.5, 0.4], "radius": 0.5,
-                 "bsdf": {"type": "roughplastic", "alpha": 0.3}},
-        "box": {"type": "cube", "bsdf": grey(0.5),
-                "to_world": T().translate([0.8, 0.4, -0.3]).rotate([0, 1, 0], 25).scale(0.4)},
+        "type": "scene",
+        "sensor": sensor or perspective(),
+        "floor": {
+            "type": "rectangle",
+            "bsdf": grey(0.6),
+            "to_world": T().rotate([1, 0, 0], -90).scale(2),
+        },
+        "back": {
+            "type": "rectangle",
+            "bsdf": grey(0.55),
+            "to_world": T().translate([0, 1, -2]).scale(2),
+        },
+        "ball": {
+            "type": "sphere",
+            "center": [-0.6, 0.5, 0.4],
+            "radius": 0.5,
+            "bsdf": {"type": "roughplastic", "alpha": 0.3},
+        },
+        "box": {
+            "type": "cube",
+            "bsdf": grey(0.5),
+            "to_world": T().translate([0.8, 0.4, -0.3]).rotate([0, 1, 0], 25).scale(0.4),
+        },
     } | more
 
 
@@ -178,8 +241,7 @@ def emission(name, count, **others):
     rng = np.random.default_rng(11)
     u = [mi.Float(rng.random(count, dtype=np.float32)) for _ in range(4)]
     like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
-    e = emitters.sample_emission(
-        mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
     return scene, emitters, e, rng
 
 
@@ -215,7 +277,8 @@ def test_emission_density_integrates_to_one(name):
     scene, emitters, e, _ = emission(name, 100_000)
     n = 100_000
     first, second, cos = (
-        np.broadcast_to(np.array(x, dtype=np.float64), n) for x in (e.pdf_first, e.pdf_second, e.cos))
+        np.broadcast_to(np.array(x, dtype=np.float64), n) for x in (e.pdf_first, e.pdf_second, e.cos)
+    )
     disk = np.pi * float(emitters.radius[0]) ** 2
     keep = cos > 0.02
     values = np.where(keep, 1 / np.maximum(first * second, 1e-30), 0)
@@ -235,8 +298,9 @@ def test_emission_density_integrates_to_one(name):
     assert abs(values.mean() - measure) < 5 * error + 1e-3 * measure
 
 
-@pytest.mark.parametrize("name", [k for k in EMITTERS if k not in ("point", "spot", "textured spot",
-                                                                  "directional")])
+@pytest.mark.parametrize(
+    "name", [k for k in EMITTERS if k not in ("point", "spot", "textured spot", "directional")]
+)
 def test_emission_agrees_with_hits(name):
     """Rationale: light that is emitted towards the scene must be what a ray in the other direction
     sees, weight x density = radiance x cosine, and the densities must be those that a hit computes.
@@ -347,15 +411,19 @@ def test_emitters_are_chosen_by_sampling_weight():
     """
     lamps = {
         "a": EMITTERS["point"]() | {"sampling_weight": 0.5},
-        "b": EMITTERS["sphere"]() | {"emitter": {
-            "type": "area", "radiance": 5.0, "sampling_weight": 3.0}},
-        "c": {"type": "spot", "intensity": 1.0, "sampling_weight": 0.0}}
+        "b": EMITTERS["sphere"]() | {"emitter": {"type": "area", "radiance": 5.0, "sampling_weight": 3.0}},
+        "c": {"type": "spot", "intensity": 1.0, "sampling_weight": 0.0},
+    }
     scene = mi.load_dict(room() | lamps)
     emitters = Emitters(scene)
     rng = np.random.default_rng(11)
     u = [mi.Float(rng.random(100_000, dtype=np.float32)) for _ in range(4)]
-    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]),
-                                 Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1)), mi.Bool(True))
+    e = emitters.sample_emission(
+        mi.Point2f(u[0], u[1]),
+        mi.Point2f(u[2], u[3]),
+        Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1)),
+        mi.Bool(True),
+    )
     names = [x.class_name() for x in scene.emitters()]
     share = np.bincount(np.array(e.index), minlength=3) / 100_000
     weights = np.array([{"PointLight": 0.5, "AreaLight": 3.0, "SpotLight": 0.0}[n] for n in names])
@@ -406,18 +474,26 @@ def test_rotated_environment_by_light_tracing_alone():
 
 CAMERAS = {
     "plain": perspective,
-    "crop": lambda: perspective(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16,
-                                crop_height=16),
-    "off axis": lambda: perspective(keys={"principal_point_offset_x": 0.2,
-                                          "principal_point_offset_y": -0.15}),
+    "crop": lambda: perspective(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16),
+    "off axis": lambda: perspective(
+        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15}
+    ),
     "off axis, crop": lambda: perspective(
-        size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16,
-        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15}),
-    **{f"fov {axis}": (lambda axis=axis: perspective(height=24, keys={"fov_axis": axis}))
-       for axis in ("x", "y", "diagonal", "smaller", "larger")},
+        size=32,
+        crop_offset_x=10,
+        crop_offset_y=3,
+        crop_width=16,
+        crop_height=16,
+        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15},
+    ),
+    **{
+        f"fov {axis}": (lambda axis=axis: perspective(height=24, keys={"fov_axis": axis}))
+        for axis in ("x", "y", "diagonal", "smaller", "larger")
+    },
     "thinlens": thinlens,
-    "thinlens, crop": lambda: thinlens(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16,
-                                       crop_height=16),
+    "thinlens, crop": lambda: thinlens(
+        size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
+    ),
     "sample_border": lambda: perspective(rfilter="gaussian", sample_border=True),
 }
 
@@ -495,10 +571,17 @@ def test_near_and_far_clip():
     seen by t = 1 either. All strategies equal `path`. Tolerance: the confidence interval, below
     2 %; t = 1 alone against s = 1 alone 10 %. Statistic: Welch over tiles.
     """
-    scene = mi.load_dict(room(perspective(keys={"near_clip": 1.0, "far_clip": 6.0})) | {
-        "lamp": EMITTERS["point"](),
-        "blocker": {"type": "disk", "bsdf": grey(0.3),
-                    "to_world": T().look_at([0, 1.8, 4.4], [0, 2, 5], [0, 1, 0]).scale(0.15)}})
+    scene = mi.load_dict(
+        room(perspective(keys={"near_clip": 1.0, "far_clip": 6.0}))
+        | {
+            "lamp": EMITTERS["point"](),
+            "blocker": {
+                "type": "disk",
+                "bsdf": grey(0.3),
+                "to_world": T().look_at([0, 1.8, 4.4], [0, 2, 5], [0, 1, 0]).scale(0.15),
+            },
+        }
+    )
     bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
     a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
     agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
@@ -533,8 +616,8 @@ def test_hide_emitters_and_alpha(hide, lamp):
     """
     scene = room(perspective(origin=(0, 2, 7), fov=50, pixel_format="rgba")) | {
         "lamp": EMITTERS[lamp](),
-        "glass": {"type": "sphere", "center": [1, 1.5, 0.5], "radius": 0.4,
-                  "bsdf": {"type": "null"}}}
+        "glass": {"type": "sphere", "center": [1, 1.5, 0.5], "radius": 0.4, "bsdf": {"type": "null"}},
+    }
     a, b = same_image(mi.load_dict(scene), 0.03, hide_emitters=hide, max_depth=3)
     assert a.shape[-1] == 4
     np.testing.assert_allclose(a[..., 3].mean(0), b[..., 3].mean(0), atol=0.05)
@@ -547,21 +630,36 @@ SURFACES = {
     "null": lambda: {"type": "null"},
     "one-sided": lambda: {"type": "diffuse"},
     "two-sided, two kinds": lambda: {
-        "type": "twosided", "front": {"type": "diffuse"},
-        "back": {"type": "roughconductor", "alpha": 0.3}},
+        "type": "twosided",
+        "front": {"type": "diffuse"},
+        "back": {"type": "roughconductor", "alpha": 0.3},
+    },
     "glass": lambda: {"type": "dielectric"},
     "thin glass": lambda: {"type": "thindielectric"},
     "rough glass": lambda: {"type": "roughdielectric", "alpha": 0.3},
     "mirror": lambda: {"type": "conductor"},
     "plastic": lambda: {"type": "plastic", "diffuse_reflectance": 0.5},
-    "blend": lambda: {"type": "blendbsdf", "weight": 0.4, "a": {"type": "diffuse"},
-                      "b": {"type": "roughconductor", "alpha": 0.25}},
+    "blend": lambda: {
+        "type": "blendbsdf",
+        "weight": 0.4,
+        "a": {"type": "diffuse"},
+        "b": {"type": "roughconductor", "alpha": 0.25},
+    },
     "principled": lambda: {"type": "principled", "roughness": 0.4, "metallic": 0.4},
     "textured": lambda: {"type": "diffuse", "reflectance": texture()},
-    "bump map": lambda: {"type": "bumpmap", "texture": {
-        "type": "bitmap", "raw": True, "bitmap": mi.Bitmap(
-            (0.1 * np.sin(np.linspace(0, 20, 32))[:, None, None] * np.ones((32, 32, 1))).astype(
-                np.float32))}, "bsdf": grey(0.6)["bsdf"]},
+    "bump map": lambda: {
+        "type": "bumpmap",
+        "texture": {
+            "type": "bitmap",
+            "raw": True,
+            "bitmap": mi.Bitmap(
+                (0.1 * np.sin(np.linspace(0, 20, 32))[:, None, None] * np.ones((32, 32, 1))).astype(
+                    np.float32
+                )
+            ),
+        },
+        "bsdf": grey(0.6)["bsdf"],
+    },
 }
 
 
@@ -573,9 +671,14 @@ def test_every_surface_between_lamp_and_camera(name):
     """
     scene = room()
     scene["ball"]["bsdf"] = SURFACES[name]()
-    scene |= {"lamp": EMITTERS["rectangle"](), "card": {
-        "type": "rectangle", "bsdf": SURFACES[name](),
-        "to_world": T().translate([0.3, 0.7, 1]).rotate([0, 1, 0], 40).scale([0.5, 0.7, 1])}}
+    scene |= {
+        "lamp": EMITTERS["rectangle"](),
+        "card": {
+            "type": "rectangle",
+            "bsdf": SURFACES[name](),
+            "to_world": T().translate([0.3, 0.7, 1]).rotate([0, 1, 0], 40).scale([0.5, 0.7, 1]),
+        },
+    }
     same_image(mi.load_dict(scene), 0.04, max_depth=4)
 
 
@@ -586,14 +689,22 @@ def test_instances(tmp_path):
     """
     scene = room() | {
         "lamp": EMITTERS["rectangle"](),
-        "group": {"type": "shapegroup",
-                  "a": {"type": "sphere", "radius": 0.3, "bsdf": {"type": "roughplastic"}},
-                  "b": {"type": "cube", "bsdf": grey(0.4),
-                        "to_world": T().translate([0.5, 0, 0]).scale(0.2)}},
-        "one": {"type": "instance", "group": {"type": "ref", "id": "group"},
-                "to_world": T().translate([-0.2, 1.3, 0.5]).rotate([0, 1, 1], 50)},
-        "two": {"type": "instance", "group": {"type": "ref", "id": "group"},
-                "to_world": T().translate([0.4, 0.4, 1.2]).scale([1, 1.3, 0.8])}}
+        "group": {
+            "type": "shapegroup",
+            "a": {"type": "sphere", "radius": 0.3, "bsdf": {"type": "roughplastic"}},
+            "b": {"type": "cube", "bsdf": grey(0.4), "to_world": T().translate([0.5, 0, 0]).scale(0.2)},
+        },
+        "one": {
+            "type": "instance",
+            "group": {"type": "ref", "id": "group"},
+            "to_world": T().translate([-0.2, 1.3, 0.5]).rotate([0, 1, 1], 50),
+        },
+        "two": {
+            "type": "instance",
+            "group": {"type": "ref", "id": "group"},
+            "to_world": T().translate([0.4, 0.4, 1.2]).scale([1, 1.3, 0.8]),
+        },
+    }
     same_image(mi.load_dict(scene), 0.04, max_depth=4)
 
 
@@ -609,20 +720,22 @@ def test_every_reconstruction_filter(rfilter, border):
     """
     if border and rfilter in ("tent", "catmullrom"):
         pytest.skip("covered by the other filters")
-    scene = mi.load_dict(room(perspective(rfilter=rfilter, sample_border=border))
-                         | {"lamp": EMITTERS["sphere"]()})
+    scene = mi.load_dict(
+        room(perspective(rfilter=rfilter, sample_border=border)) | {"lamp": EMITTERS["sphere"]()}
+    )
     same_image(scene, 0.02, max_depth=3, size=2)
 
 
-@pytest.mark.parametrize("pixel_format, channels", [
-    ("rgb", 3), ("rgba", 4), ("luminance", 1), ("luminance_alpha", 2), ("xyz", 3), ("xyza", 4)])
+@pytest.mark.parametrize(
+    "pixel_format, channels",
+    [("rgb", 3), ("rgba", 4), ("luminance", 1), ("luminance_alpha", 2), ("xyz", 3), ("xyza", 4)],
+)
 def test_pixel_formats(pixel_format, channels):
     """Rationale: the film converts on development; our block must be what it expects. Expected: the
     number of channels, and equality with `path`. Tolerance: the confidence interval, below 3 %.
     Statistic: Welch over tiles.
     """
-    scene = mi.load_dict(room(perspective(pixel_format=pixel_format)) | {
-        "lamp": EMITTERS["sphere"]()})
+    scene = mi.load_dict(room(perspective(pixel_format=pixel_format)) | {"lamp": EMITTERS["sphere"]()})
     a, _ = same_image(scene, 0.03, max_depth=2)
     assert a.shape[-1] == channels
 
@@ -631,8 +744,7 @@ def test_pixel_formats(pixel_format, channels):
 def test_component_formats(component, tmp_path):
     """Rationale and expected: the film writes its file in the component format asked for, with the
     values that develop() gives (half precision: 1e-3)."""
-    scene = mi.load_dict(room(perspective(component_format=component)) | {
-        "lamp": EMITTERS["point"]()})
+    scene = mi.load_dict(room(perspective(component_format=component)) | {"lamp": EMITTERS["point"]()})
     bdpt = integrator(max_depth=2)
     image = np.array(bdpt.render(scene, spp=16))
     film = scene.sensors()[0].film()
@@ -643,5 +755,8 @@ def test_component_formats(component, tmp_path):
     assert str(bitmap.component_format()).lower().endswith(component)
     if component != "uint32":
         np.testing.assert_allclose(
-            np.array(bitmap.convert(component_format=mi.Struct.Type.Float32)), image,
-            rtol=1e-3, atol=1e-3)
+            np.array(bitmap.convert(component_format=mi.Struct.Type.Float32)),
+            image,
+            rtol=1e-3,
+            atol=1e-3,
+        )

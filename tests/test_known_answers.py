@@ -36,27 +36,40 @@ def check(samples, expected, relative):
     bad = np.abs(mean - expected) > reach
     assert not bad.any(), "\n".join(
         f"value {i}: {mean[i]:.6f} +- {error[i]:.6f}, expected {expected[i]:.6f}"
-        for i in np.flatnonzero(bad)[:20])
+        for i in np.flatnonzero(bad)[:20]
+    )
     blind = reach > relative * np.abs(expected)
     assert not blind.any(), (
         f"too noisy to see an error of {relative}: "
-        f"{np.max(reach[blind] / np.maximum(np.abs(expected[blind]), 1e-12)):.2e}")
+        f"{np.max(reach[blind] / np.maximum(np.abs(expected[blind]), 1e-12)):.2e}"
+    )
 
 
 def camera(origin=(0, 0, 0.5), target=(0.2, 0.1, -1), fov=60, size=16, rfilter="box", **film):
     return {
-        "type": "perspective", "fov": fov, "near_clip": 1e-3,
+        "type": "perspective",
+        "fov": fov,
+        "near_clip": 1e-3,
         "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
         "sampler": {"type": "independent"},
-        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
-                 "component_format": "float32", "rfilter": {"type": rfilter}, **film},
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": rfilter},
+            **film,
+        },
     }
 
 
 def diffuse(reflectance):
     """Two-sided: inside and outside of a shape look alike."""
-    return {"type": "twosided", "bsdf": {
-        "type": "diffuse", "reflectance": {"type": "rgb", "value": [reflectance] * 3}}}
+    return {
+        "type": "twosided",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [reflectance] * 3}},
+    }
 
 
 def sphere_lit_by(kind, sensor=None):
@@ -80,8 +93,7 @@ def integrator(**parameters):
 
 def render(scene, bdpt, seeds, spp):
     """Images, stacked: (seeds, height, width, channels)."""
-    return np.stack([
-        np.array(bdpt.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
+    return np.stack([np.array(bdpt.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
 
 
 def layers(images, bdpt, base=3):
@@ -110,9 +122,13 @@ CONFIGURATIONS = {
 
 
 @pytest.mark.parametrize("kind", ["point", "emission"])
-@pytest.mark.parametrize("name", [
-    *list(CONFIGURATIONS)[:5],
-    *(pytest.param(name, marks=pytest.mark.slow) for name in list(CONFIGURATIONS)[5:])])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *list(CONFIGURATIONS)[:5],
+        *(pytest.param(name, marks=pytest.mark.slow) for name in list(CONFIGURATIONS)[5:]),
+    ],
+)
 def test_every_path_length_in_the_unit_sphere(kind, name):
     """Rationale: inside a sphere the geometry term is constant, so each strategy alone has finite
     variance and each path length a known radiance. Expected: per path length k the weighted
@@ -127,8 +143,7 @@ def test_every_path_length_in_the_unit_sphere(kind, name):
     images = render(scene, bdpt, range(16), 256)
     found = layers(images, bdpt)
     lengths = range(1 if kind == "emission" else 2, depth + 1)
-    sums = np.stack([
-        sum(found["weighted", s, k + 1 - s] for s in range(k + 1)) for k in lengths], axis=1)
+    sums = np.stack([sum(found["weighted", s, k + 1 - s] for s in range(k + 1)) for k in lengths], axis=1)
     check(sums, [answer(k) for k in lengths], tolerance)
     # The layers add up to the image.
     np.testing.assert_allclose(sums.sum(1), images[..., :3].mean((1, 2, 3)), rtol=1e-4)
@@ -138,9 +153,14 @@ def test_every_path_length_in_the_unit_sphere(kind, name):
         if sort == "weighted" or answer(k) == 0:
             continue
         off = (
-            (s == 0 or (s == 1 and t == 1)) and kind == "point"
-            or (s >= 2 or (s, t) == (1, 1)) and (name == "light_paths=0" or k > stored)
-            or name == "no connections" and s >= 2 and t >= 2)
+            (s == 0 or (s == 1 and t == 1))
+            and kind == "point"
+            or (s >= 2 or (s, t) == (1, 1))
+            and (name == "light_paths=0" or k > stored)
+            or name == "no connections"
+            and s >= 2
+            and t >= 2
+        )
         if off:
             assert np.all(values == 0), (s, t)
         else:
@@ -153,22 +173,31 @@ def test_maximum_heuristic_in_the_unit_sphere():
     not tie, and the radiance after two reflections still is 1/4 everywhere. Tolerance: the
     confidence interval, below 1e-2. Statistic: t-test over 16 seeds.
     """
-    scene = mi.load_dict({
-        "type": "scene", "sensor": camera(), "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
-        "lamp": {"type": "point", "position": [0.2, -0.5, -0.1], "intensity": float(np.pi)}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera(),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+            "lamp": {"type": "point", "position": [0.2, -0.5, -0.1], "intensity": float(np.pi)},
+        }
+    )
     bdpt = integrator(max_depth=3, strategy_images=True, skip="none", heuristic="maximum")
     found = layers(render(scene, bdpt, range(16), 256), bdpt)
     check(sum(found["weighted", s, 4 - s] for s in range(4)), 0.25, 1e-2)
 
 
 @pytest.mark.parametrize("kind", ["point", "emission"])
-@pytest.mark.parametrize("parameters", [
-    {},
-    {"skip": "none"},
-    {"skip": "none", "stored_vertices": 2},
-    {"points": "independent"},
-    {"skip": "impossible", "light_paths": "1/16", "connections": "all", "heuristic": "power"},
-], ids=lambda p: ",".join(f"{k}={v}" for k, v in p.items()) or "default")
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {},
+        {"skip": "none"},
+        {"skip": "none", "stored_vertices": 2},
+        {"points": "independent"},
+        {"skip": "impossible", "light_paths": "1/16", "connections": "all", "heuristic": "power"},
+    ],
+    ids=lambda p: ",".join(f"{k}={v}" for k, v in p.items()) or "default",
+)
 def test_all_bounces_in_the_unit_sphere_add_up_to_one(kind, parameters):
     """Rationale: the whole estimator as users run it: unlimited depth, Russian roulette in both
     walks and before visibility, one connection drawn. Expected: 1 everywhere. Tolerance: the
@@ -208,27 +237,48 @@ def furnace(shapes, **film):
 WHITE = {
     "diffuse": {
         "ball": {"type": "sphere", "radius": 0.8, "center": [-0.7, 0.3, 0], "bsdf": diffuse(1)},
-        "box": {"type": "cube", "bsdf": diffuse(1),
-                "to_world": T().translate([0.9, -0.4, 0.3]).rotate([1, 1, 0], 30).scale(0.5)},
-        "floor": {"type": "rectangle", "bsdf": diffuse(1),
-                  "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(3)},
+        "box": {
+            "type": "cube",
+            "bsdf": diffuse(1),
+            "to_world": T().translate([0.9, -0.4, 0.3]).rotate([1, 1, 0], 30).scale(0.5),
+        },
+        "floor": {
+            "type": "rectangle",
+            "bsdf": diffuse(1),
+            "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(3),
+        },
     },
     "glass": {
-        "ball": {"type": "sphere", "radius": 0.8, "center": [-0.7, 0.3, 0],
-                 "bsdf": {"type": "dielectric", "int_ior": 1.5}},
-        "mirror": {"type": "sphere", "radius": 0.6, "center": [0.9, 0, 0],
-                   "bsdf": {"type": "conductor", "material": "none"}},
-        "pane": {"type": "rectangle", "bsdf": {"type": "thindielectric"},
-                 "to_world": T().translate([0.3, 0.4, 1]).rotate([0, 1, 0], 30).scale(0.6)},
-        "floor": {"type": "rectangle", "bsdf": diffuse(1),
-                  "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(3)},
+        "ball": {
+            "type": "sphere",
+            "radius": 0.8,
+            "center": [-0.7, 0.3, 0],
+            "bsdf": {"type": "dielectric", "int_ior": 1.5},
+        },
+        "mirror": {
+            "type": "sphere",
+            "radius": 0.6,
+            "center": [0.9, 0, 0],
+            "bsdf": {"type": "conductor", "material": "none"},
+        },
+        "pane": {
+            "type": "rectangle",
+            "bsdf": {"type": "thindielectric"},
+            "to_world": T().translate([0.3, 0.4, 1]).rotate([0, 1, 0], 30).scale(0.6),
+        },
+        "floor": {
+            "type": "rectangle",
+            "bsdf": diffuse(1),
+            "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(3),
+        },
     },
 }
 
 
 @pytest.mark.parametrize("objects", WHITE)
-@pytest.mark.parametrize("parameters", [{"skip": "none"}, {"heuristic": "power"}],
-                         ids=["everything", "power"])
+@pytest.mark.parametrize(
+    "parameters", [{"skip": "none"}, {"heuristic": "power"}], ids=["everything", "power"]
+)
 def test_white_furnace(objects, parameters):
     """Rationale: an error in any weight, density or adjoint makes white objects visible in front of
     a white environment. Expected: 1 in every pixel. Tolerance: the confidence interval,
@@ -273,8 +323,12 @@ def test_borders_of_the_white_furnace_are_flat(rfilter):
     """
     scene = furnace(WHITE["diffuse"], rfilter=rfilter)
     images = render(scene, integrator(skip="none"), range(16), 128)[..., :3].mean(-1)
-    rows = [images[:, 0].mean(1), images[:, -1].mean(1),
-            images[:, :, 0].mean(1), images[:, :, -1].mean(1)]
+    rows = [
+        images[:, 0].mean(1),
+        images[:, -1].mean(1),
+        images[:, :, 0].mean(1),
+        images[:, :, -1].mean(1),
+    ]
     check(np.stack(rows, axis=1), 1, 1.5e-2)
     check(images[:, 1:-1, 1:-1].mean((1, 2)), 1, 6e-3)
 
@@ -289,9 +343,13 @@ def test_an_environment_without_shapes_is_the_environment(rfilter, skip):
     constant environment s = 0 and (1,1) meet in each pixel, each with noise of its own. Tolerance: the
     confidence interval, below 5e-3 for the mean, 0.1 a pixel. Statistic: t-test over 16 seeds.
     """
-    scene = mi.load_dict({
-        "type": "scene", "sensor": camera(rfilter=rfilter),
-        "environment": {"type": "constant", "radiance": 0.7}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera(rfilter=rfilter),
+            "environment": {"type": "constant", "radiance": 0.7},
+        }
+    )
     images = render(scene, integrator(skip=skip), range(16), 128)[..., :3].mean(-1)
     check(images.mean((1, 2)), 0.7, 5e-3)
     check(images, 0.7, 0.1)
@@ -315,23 +373,40 @@ def glass_lamp(**film):
     beside the ball. Light leaves the ball unbent; with max_depth 3 only t = 1 can make the image.
     The wall's radiance is 1."""
     transmittance = 1 - ((1.5 - 1) / (1.5 + 1)) ** 2
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": camera((0, 0, -0.4), (0, 0, -1), fov=60, **film),
-        "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
-        "glass": {"type": "sphere", "radius": 0.3,
-                  "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}},
-        "lamp": {"type": "spot", "cutoff_angle": 40, "beam_width": 39.99,
-                 "intensity": float(2 * np.pi / transmittance),
-                 "to_world": T().look_at([0, 0, 0], [0, 0, -1], [0, 1, 0])},
-    })
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 0, -0.4), (0, 0, -1), fov=60, **film),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+            "glass": {
+                "type": "sphere",
+                "radius": 0.3,
+                "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0},
+            },
+            "lamp": {
+                "type": "spot",
+                "cutoff_angle": 40,
+                "beam_width": 39.99,
+                "intensity": float(2 * np.pi / transmittance),
+                "to_world": T().look_at([0, 0, 0], [0, 0, -1], [0, 1, 0]),
+            },
+        }
+    )
 
 
-@pytest.mark.parametrize("rfilter, border", [
-    ("gaussian", False), ("gaussian", True), ("mitchell", False), ("mitchell", True),
-    pytest.param("box", False, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("spp, size, seeds, tolerance", [
-    (1, 128, 16, 2e-2), (4, 128, 24, 6e-3), (10, 192, 16, 2.5e-3)])
+@pytest.mark.parametrize(
+    "rfilter, border",
+    [
+        ("gaussian", False),
+        ("gaussian", True),
+        ("mitchell", False),
+        ("mitchell", True),
+        pytest.param("box", False, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize(
+    "spp, size, seeds, tolerance", [(1, 128, 16, 2e-2), (4, 128, 24, 6e-3), (10, 192, 16, 2.5e-3)]
+)
 def test_splats_alone_are_unbiased_at_few_samples(spp, size, seeds, tolerance, rfilter, border):
     """Rationale: a splat divided by the sum of the camera samples' filter weights is biased, for
     E[1/W] > 1/E[W]: by +5.7, +1.3 and +0.5 % at 1, 4 and 10 spp with the gaussian filter, +11 % at
@@ -355,14 +430,22 @@ def squares_form_factor(h):
     """Between two unit squares, parallel and coaxial, at the distance ``h``."""
     x = 1 / h
     root = np.sqrt(1 + x * x)
-    return 2 / (np.pi * x * x) * (
-        np.log((1 + x * x) / np.sqrt(1 + 2 * x * x))
-        + 2 * x * root * np.arctan(x / root) - 2 * x * np.arctan(x))
+    return (
+        2
+        / (np.pi * x * x)
+        * (
+            np.log((1 + x * x) / np.sqrt(1 + 2 * x * x))
+            + 2 * x * root * np.arctan(x / root)
+            - 2 * x * np.arctan(x)
+        )
+    )
 
 
-@pytest.mark.parametrize("parameters, h", [
-    *(({"skip": "none"}, h) for h in (1e-3, 1e-2, 1, 100)),
-    ({"heuristic": "power"}, 1e-2), ({}, 0.1)], ids=str)
+@pytest.mark.parametrize(
+    "parameters, h",
+    [*(({"skip": "none"}, h) for h in (1e-3, 1e-2, 1, 100)), ({"heuristic": "power"}, 1e-2), ({}, 0.1)],
+    ids=str,
+)
 def test_form_factor_of_parallel_plates(parameters, h):
     """Rationale: from touching plates (only hits of the emitter work) to distant ones (only its
     samples do), and brightness must not depend on the scale of the distance. A white plate is seen
@@ -370,14 +453,19 @@ def test_form_factor_of_parallel_plates(parameters, h):
     fills exactly. Expected: the mean is the form factor. Tolerance: the confidence
     interval, below 6e-3. Statistic: t-test over 16 seeds.
     """
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": camera((0, 0, 2), (0, 0, 0), fov=float(np.rad2deg(2 * np.arctan(0.25)))),
-        "plate": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": diffuse(1)},
-        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": 1.0},
-                 "bsdf": {"type": "diffuse", "reflectance": 0.0},
-                 "to_world": T().translate([0, 0, h]).rotate([1, 0, 0], 180).scale(0.5)},
-    })
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 0, 2), (0, 0, 0), fov=float(np.rad2deg(2 * np.arctan(0.25)))),
+            "plate": {"type": "rectangle", "to_world": T().scale(0.5), "bsdf": diffuse(1)},
+            "lamp": {
+                "type": "rectangle",
+                "emitter": {"type": "area", "radiance": 1.0},
+                "bsdf": {"type": "diffuse", "reflectance": 0.0},
+                "to_world": T().translate([0, 0, h]).rotate([1, 0, 0], 180).scale(0.5),
+            },
+        }
+    )
     bdpt = integrator(max_depth=2, hide_emitters=True, **parameters)
     images = render(scene, bdpt, range(16), 256)
     check(images[..., :3].mean((1, 2, 3)), squares_form_factor(h), 6e-3)

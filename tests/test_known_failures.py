@@ -23,8 +23,7 @@ def integrator(kind="bdpt", **parameters):
 
 def render(scene, method, seeds, spp):
     """Images, stacked: (seeds, height, width, channels)."""
-    return np.stack([
-        np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
+    return np.stack([np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
 
 
 def tiles(images, size=4):
@@ -44,7 +43,8 @@ def agree(a, b, relative):
     variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
     error = np.sqrt(sum(variance))
     freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
-        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120)
+        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120
+    )
     level = 1 - (1 - SIGNIFICANCE) ** (1 / a.shape[1])
     scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
     reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + ROUNDING * scale
@@ -53,10 +53,12 @@ def agree(a, b, relative):
     assert not bad.any(), "\n".join(
         f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
         f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
-        for i in np.flatnonzero(bad)[-20:])
+        for i in np.flatnonzero(bad)[-20:]
+    )
     assert scale[-1] > 0
     assert reach[-1] < relative * scale[-1], (
-        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}")
+        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}"
+    )
 
 
 def layer(images, bdpt, name):
@@ -68,11 +70,20 @@ def layer(images, bdpt, name):
 
 def camera(origin, target, fov=45, size=16, up=(0, 1, 0), rfilter="box", **film):
     return {
-        "type": "perspective", "fov": fov, "near_clip": 1e-3,
+        "type": "perspective",
+        "fov": fov,
+        "near_clip": 1e-3,
         "to_world": T().look_at(list(origin), list(target), list(up)),
         "sampler": {"type": "independent"},
-        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
-                 "component_format": "float32", "rfilter": {"type": rfilter}, **film},
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": rfilter},
+            **film,
+        },
     }
 
 
@@ -85,8 +96,12 @@ def bumps():
     """Three sines, as the height field of a bump map."""
     y, x = np.mgrid[0:64, 0:64] / 64 * 2 * np.pi
     height = 0.5 + 0.15 * (np.sin(6 * x) + np.sin(5 * y) + np.sin(3 * x + 4 * y))
-    return {"type": "bitmap", "bitmap": mi.Bitmap(height.astype(np.float32)[..., None]),
-            "raw": True, "wrap_mode": "repeat"}
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(height.astype(np.float32)[..., None]),
+        "raw": True,
+        "wrap_mode": "repeat",
+    }
 
 
 def normals(tilt):
@@ -101,17 +116,23 @@ def rough(kind):
     """A bumpy or normal-mapped wall. By default Mitsuba turns normals that face away from the camera
     side; a walk from the light then cannot sample all that the camera side sees."""
     flip = {"flip_invalid_normals": False} if kind.endswith("unflipped") else {}
-    texture = ({"type": "bumpmap", "height": bumps(), "scale": 0.3} if kind.startswith("bumpmap")
-               else {"type": "normalmap", "normalmap": normals(0.4)})
+    texture = (
+        {"type": "bumpmap", "height": bumps(), "scale": 0.3}
+        if kind.startswith("bumpmap")
+        else {"type": "normalmap", "normalmap": normals(0.4)}
+    )
     return {"type": "twosided", "bsdf": texture | flip | {"bsdf": diffuse(0.7, 1)}}
 
 
 def inside_of_a_sphere(bsdf):
-    return mi.load_dict({
-        "type": "scene",
-        "sensor": camera((0, -0.6, 0), (0.3, 0.2, -1), fov=70),
-        "wall": {"type": "sphere", "bsdf": bsdf},
-        "lamp": {"type": "point", "position": [0.1, 0.3, 0.2], "intensity": 3.0}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, -0.6, 0), (0.3, 0.2, -1), fov=70),
+            "wall": {"type": "sphere", "bsdf": bsdf},
+            "lamp": {"type": "point", "position": [0.1, 0.3, 0.2], "intensity": 3.0},
+        }
+    )
 
 
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap"])
@@ -132,8 +153,7 @@ def test_no_spikes_inside_a_bumpy_sphere(kind):
         assert np.max(pixels / around) < limit
 
 
-@pytest.mark.parametrize("kind", [
-    "bumpmap", "normalmap", "bumpmap unflipped", "normalmap unflipped"])
+@pytest.mark.parametrize("kind", ["bumpmap", "normalmap", "bumpmap unflipped", "normalmap unflipped"])
 def test_light_side_agrees_with_camera_side_on_bumpy_surfaces(kind):
     """17 (mitsuba3 42, 45): the light tracer was brighter than path on bumped surfaces. The
     reference is the camera side: Mitsuba's `path`. Expected: the unweighted images of every light-side
@@ -155,18 +175,55 @@ def test_light_side_agrees_with_camera_side_on_bumpy_surfaces(kind):
 def ball_mesh(path, subdivisions=2):
     """A coarse sphere of triangles with vertex normals, written as PLY."""
     t = (1 + 5**0.5) / 2
-    v = np.array([(-1, t, 0), (1, t, 0), (-1, -t, 0), (1, -t, 0), (0, -1, t), (0, 1, t),
-                  (0, -1, -t), (0, 1, -t), (t, 0, -1), (t, 0, 1), (-t, 0, -1), (-t, 0, 1)], float)
-    f = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4),
-                  (11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8),
-                  (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    v = np.array(
+        [
+            (-1, t, 0),
+            (1, t, 0),
+            (-1, -t, 0),
+            (1, -t, 0),
+            (0, -1, t),
+            (0, 1, t),
+            (0, -1, -t),
+            (0, 1, -t),
+            (t, 0, -1),
+            (t, 0, 1),
+            (-t, 0, -1),
+            (-t, 0, 1),
+        ],
+        float,
+    )
+    f = np.array(
+        [
+            (0, 11, 5),
+            (0, 5, 1),
+            (0, 1, 7),
+            (0, 7, 10),
+            (0, 10, 11),
+            (1, 5, 9),
+            (5, 11, 4),
+            (11, 10, 2),
+            (10, 7, 6),
+            (7, 1, 8),
+            (3, 9, 4),
+            (3, 4, 2),
+            (3, 2, 6),
+            (3, 6, 8),
+            (3, 8, 9),
+            (4, 9, 5),
+            (2, 4, 11),
+            (6, 2, 10),
+            (8, 6, 7),
+            (9, 8, 1),
+        ]
+    )
     for _ in range(subdivisions):
         corners = v[f]
         middles = (corners + np.roll(corners, -1, axis=1)) / 2
         a, b, c = corners.transpose(1, 0, 2)
         ab, bc, ca = middles.transpose(1, 0, 2)
-        triangles = np.concatenate([
-            np.stack(x, axis=1) for x in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+        triangles = np.concatenate(
+            [np.stack(x, axis=1) for x in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
         v, f = np.unique(triangles.reshape(-1, 3).round(9), axis=0, return_inverse=True)
         f = f.reshape(-1, 3)
     v /= np.linalg.norm(v, axis=1, keepdims=True)
@@ -186,26 +243,45 @@ def test_shading_normals_of_a_coarse_mesh(tmp_path):
     and s = 1 alone agree, and everything agrees with `path` at depth 4. Tolerance: the confidence
     interval, below 3 %. Statistic: Welch, 16 seeds a side.
     """
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": camera((0, 1, 5), (0, 0, 0), fov=35),
-        "ball": ball_mesh(tmp_path / "ball.ply", 1) | {"bsdf": diffuse(0.8)},
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.5),
-                  "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(2)},
-        "lamp": {"type": "spot", "intensity": 40.0, "cutoff_angle": 25,
-                 "to_world": T().look_at([3, 4, 1], [0, -0.5, 0], [0, 1, 0])}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 1, 5), (0, 0, 0), fov=35),
+            "ball": ball_mesh(tmp_path / "ball.ply", 1) | {"bsdf": diffuse(0.8)},
+            "floor": {
+                "type": "rectangle",
+                "bsdf": diffuse(0.5),
+                "to_world": T().translate([0, -1.2, 0]).rotate([1, 0, 0], -90).scale(2),
+            },
+            "lamp": {
+                "type": "spot",
+                "intensity": 40.0,
+                "cutoff_angle": 25,
+                "to_world": T().look_at([3, 4, 1], [0, -0.5, 0], [0, 1, 0]),
+            },
+        }
+    )
     bdpt = integrator(max_depth=4, rr_depth=50, skip="none", strategy_images=True)
     images, others = render(scene, bdpt, range(16), 256), render(scene, bdpt, range(50, 66), 256)
-    agree(tiles(layer(images, bdpt, "unweighted.s2t1")),
-          tiles(layer(others, bdpt, "unweighted.s1t2")), 0.03)
+    agree(
+        tiles(layer(images, bdpt, "unweighted.s2t1")),
+        tiles(layer(others, bdpt, "unweighted.s1t2")),
+        0.03,
+    )
     path = integrator("path", max_depth=4, rr_depth=50)
     agree(tiles(images[..., :3]), tiles(render(scene, path, range(50, 66), 512)), 0.02)
 
 
-@pytest.mark.parametrize("transform, flip", [
-    (T(), False), (T().scale([-1, 1, 1]), False), (T().scale([-1, 1, 1]), True),
-    (T().rotate([1, 2, 3], 40).scale([0.7, -1.2, 1]), False)],
-    ids=["plain", "mirrored", "mirrored, flipped", "mirrored, stretched"])
+@pytest.mark.parametrize(
+    "transform, flip",
+    [
+        (T(), False),
+        (T().scale([-1, 1, 1]), False),
+        (T().scale([-1, 1, 1]), True),
+        (T().rotate([1, 2, 3], 40).scale([0.7, -1.2, 1]), False),
+    ],
+    ids=["plain", "mirrored", "mirrored, flipped", "mirrored, stretched"],
+)
 @pytest.mark.parametrize("inside", [False, True], ids=["outside", "inside"])
 def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
     """3 and 16 (pbrt-v3 229, mitsuba3 1952): a mirrored emitter mesh with vertex normals emitted on
@@ -215,15 +291,27 @@ def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
     directly (k = 1); a side that is dark for one is dark for all. Tolerance: the confidence
     interval, below 20 % on the bright side. Statistic: Welch, 12 seeds a side.
     """
-    scene = mi.load_dict({
-        "type": "scene",
-        "sensor": camera((0, 0, 0) if inside else (0, 1.5, 4), (0, -0.6, 0.3), fov=60, up=(0, 0, 1)),
-        "lamp": ball_mesh(tmp_path / "lamp.ply", 0) | {
-            "to_world": T().scale(1.5 if inside else 0.5) @ transform, "flip_normals": flip,
-            "bsdf": diffuse(0), "emitter": {"type": "area", "radiance": 2.0}},
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.8),
-                  "to_world": T().translate([0, -0.45 if inside else -1.4, 0])
-                  .rotate([1, 0, 0], -90).scale(0.2 if inside else 2)}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 0, 0) if inside else (0, 1.5, 4), (0, -0.6, 0.3), fov=60, up=(0, 0, 1)),
+            "lamp": ball_mesh(tmp_path / "lamp.ply", 0)
+            | {
+                "to_world": T().scale(1.5 if inside else 0.5) @ transform,
+                "flip_normals": flip,
+                "bsdf": diffuse(0),
+                "emitter": {"type": "area", "radiance": 2.0},
+            },
+            "floor": {
+                "type": "rectangle",
+                "bsdf": diffuse(0.8),
+                "to_world": T()
+                .translate([0, -0.45 if inside else -1.4, 0])
+                .rotate([1, 0, 0], -90)
+                .scale(0.2 if inside else 2),
+            },
+        }
+    )
     bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
     images, others = render(scene, bdpt, range(12), 256), render(scene, bdpt, range(50, 62), 256)
     hit = layer(images, bdpt, "unweighted.s0t3")
@@ -244,12 +332,22 @@ def test_emitter_meshes_are_lit_on_one_side():
     estimation and emission alike.
     """
     for transform, flip, lit in (
-        (T(), False, True), (T(), True, False), (T().scale([-1, 1, 1]), False, None),
+        (T(), False, True),
+        (T(), True, False),
+        (T().scale([-1, 1, 1]), False, None),
     ):
-        scene = mi.load_dict({
-            "type": "scene", "sensor": camera((0, 0, 4), (0, 0, 0)),
-            "lamp": {"type": "rectangle", "to_world": transform, "flip_normals": flip,
-                     "emitter": {"type": "area", "radiance": 1.0}}})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": camera((0, 0, 4), (0, 0, 0)),
+                "lamp": {
+                    "type": "rectangle",
+                    "to_world": transform,
+                    "flip_normals": flip,
+                    "emitter": {"type": "area", "radiance": 1.0},
+                },
+            }
+        )
         bdpt = integrator(max_depth=1, skip="none", strategy_images=True)
         images = render(scene, bdpt, range(2), 64)
         hit, sampled = (layer(images, bdpt, f"unweighted.s{s}t{2 - s}").mean() for s in (0, 1))
@@ -270,29 +368,43 @@ def test_point_light_in_a_cornell_box_has_no_hot_pixel():
         scene["lamp"] = {"type": "point", "position": [0.1, 0.5, 0.1], "intensity": 1.0}
         scene = mi.load_dict(scene)
         image, reference = (
-            render(scene, integrator(kind, max_depth=5), [3], 256)[0].mean(-1)
-            for kind in ("bdpt", "path"))
+            render(scene, integrator(kind, max_depth=5), [3], 256)[0].mean(-1) for kind in ("bdpt", "path")
+        )
         assert image.max() < 1.2 * reference.max()
         assert abs(np.median(image) / np.median(reference) - 1) < 0.05
 
 
-@pytest.mark.parametrize("environment", [
-    {"type": "constant", "radiance": 0.8},
-    {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.8, np.float32))}],
-    ids=["constant", "envmap"])
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"type": "constant", "radiance": 0.8},
+        {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), 0.8, np.float32))},
+    ],
+    ids=["constant", "envmap"],
+)
 def test_environment_does_not_depend_on_other_objects(environment):
     """5 (Mitsuba 0.6 80): brightness depended on other objects in the scene. A grey disk under a sky
     of 0.8, alone, and with a small sphere far away, out of its sight, that makes the scene 30 times
     larger. Expected: t = 1 alone, and everything, give 0.8 x 0.5 on the disk. Tolerance: the
     confidence interval, below 5 %, for t = 1 in the large scene 50 %. Statistic: t-test, 16 seeds.
     """
-    for far, tolerance in (({}, 0.05), ({"far": {
-            "type": "sphere", "center": [0, -60, 0], "bsdf": diffuse(0)}}, 0.5)):
-        scene = mi.load_dict({
-            "type": "scene", "sensor": camera((0, 3, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
-            "disk": {"type": "disk", "bsdf": diffuse(0.5, 1),
-                     "to_world": T().rotate([1, 0, 0], -90).scale(2)},
-            "sky": environment} | far)
+    for far, tolerance in (
+        ({}, 0.05),
+        ({"far": {"type": "sphere", "center": [0, -60, 0], "bsdf": diffuse(0)}}, 0.5),
+    ):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": camera((0, 3, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
+                "disk": {
+                    "type": "disk",
+                    "bsdf": diffuse(0.5, 1),
+                    "to_world": T().rotate([1, 0, 0], -90).scale(2),
+                },
+                "sky": environment,
+            }
+            | far
+        )
         bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
         images = render(scene, bdpt, range(16), 256)
         splat = layer(images, bdpt, "unweighted.s2t1").mean((1, 2, 3))
@@ -304,7 +416,8 @@ def known(samples, expected, relative, allowed=ROUNDING):
     """t-test of seeds against a known value, with a systematic error of up to ``allowed`` (relative);
     the interval must be narrower than ``relative``."""
     reach = stats.t.isf(SIGNIFICANCE / 2, len(samples) - 1) * samples.std(ddof=1) / len(
-        samples) ** 0.5 + allowed * abs(expected)
+        samples
+    ) ** 0.5 + allowed * abs(expected)
     assert abs(samples.mean() - expected) < reach, (samples.mean(), expected, reach)
     assert reach < relative * abs(expected), f"too noisy: {reach / abs(expected):.2e}"
 
@@ -318,18 +431,27 @@ def test_crop_window_equals_the_region_of_the_whole(rfilter):
     confidence interval; bounded at 3 % for the sum, 0.3 for single strategies. Statistic: Welch, 16
     seeds a side.
     """
+
     def scene(**film):
-        return mi.load_dict({
-            "type": "scene",
-            "sensor": camera((0, 0, 0.5), (0.3, 0.1, -1), fov=60, size=24, rfilter=rfilter, **film),
-            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
-            "lamp": {"type": "sphere", "radius": 0.1, "center": [0.2, 0.3, -0.4],
-                     "emitter": {"type": "area", "radiance": 5.0}}})
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": camera((0, 0, 0.5), (0.3, 0.1, -1), fov=60, size=24, rfilter=rfilter, **film),
+                "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+                "lamp": {
+                    "type": "sphere",
+                    "radius": 0.1,
+                    "center": [0.2, 0.3, -0.4],
+                    "emitter": {"type": "area", "radiance": 5.0},
+                },
+            }
+        )
 
     bdpt = integrator(max_depth=3, skip="none", strategy_images=True)
     whole = render(scene(), bdpt, range(16), 128)[:, 5:15, 9:21]
-    part = render(scene(crop_offset_x=7, crop_offset_y=3, crop_width=16, crop_height=14), bdpt,
-                  range(50, 66), 128)[:, 2:12, 2:14]
+    part = render(
+        scene(crop_offset_x=7, crop_offset_y=3, crop_width=16, crop_height=14), bdpt, range(50, 66), 128
+    )[:, 2:12, 2:14]
     assert part.shape == whole.shape
     agree(tiles(part[..., :3], 2), tiles(whole[..., :3], 2), 0.03)
     for k in (1, 2, 3):
@@ -345,17 +467,29 @@ def test_narrow_spot_on_a_matte_floor():
     from 64 seeds, summed over the lit pixels: 5 % noise). Statistic: ratio of summed variances.
     """
     spp = 16
-    scene = mi.load_dict({
-        "type": "scene", "sensor": camera((0, 4, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
-        "floor": {"type": "rectangle", "bsdf": diffuse(0.5),
-                  "to_world": T().rotate([1, 0, 0], -90).scale(3)},
-        "lamp": {"type": "spot", "cutoff_angle": 6, "intensity": 30.0,
-                 "to_world": T().look_at([1, 4, 1], [0, 0, 0], [0, 0, 1])}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 4, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
+            "floor": {
+                "type": "rectangle",
+                "bsdf": diffuse(0.5),
+                "to_world": T().rotate([1, 0, 0], -90).scale(3),
+            },
+            "lamp": {
+                "type": "spot",
+                "cutoff_angle": 6,
+                "intensity": 30.0,
+                "to_world": T().look_at([1, 4, 1], [0, 0, 0], [0, 0, 1]),
+            },
+        }
+    )
     bdpt = integrator(max_depth=2, skip="none", strategy_images=True, points="independent")
     images = render(scene, bdpt, range(64), spp)
     mean, total = images[..., :3].mean(0), images[..., :3].var(0, ddof=1).sum()
     splats, direct = (
-        layer(images, bdpt, f"unweighted.{name}").var(0, ddof=1).sum() for name in ("s2t1", "s1t2"))
+        layer(images, bdpt, f"unweighted.{name}").var(0, ddof=1).sum() for name in ("s2t1", "s1t2")
+    )
     assert splats > 2 * direct  # the scene shows what it is meant to show
     assert total < splats
     assert total < 1.1 * (direct + np.sum(mean**2) / spp)
@@ -368,20 +502,34 @@ def test_borders_of_a_uniform_furnace(rfilter):
     pixels has the radiance 0.75 of depth 2, as has the rest. Tolerance: the confidence interval,
     below 1 %. Statistic: t-test over 16 seeds.
     """
-    scene = mi.load_dict({
-        "type": "scene", "sensor": camera((0, 0, 0.5), (0, 0.1, -1), fov=60, rfilter=rfilter),
-        "wall": {"type": "sphere", "flip_normals": True, "bsdf": diffuse(0.5),
-                 "emitter": {"type": "area", "radiance": 0.5}}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 0, 0.5), (0, 0.1, -1), fov=60, rfilter=rfilter),
+            "wall": {
+                "type": "sphere",
+                "flip_normals": True,
+                "bsdf": diffuse(0.5),
+                "emitter": {"type": "area", "radiance": 0.5},
+            },
+        }
+    )
     image = render(scene, integrator(max_depth=2, skip="none"), range(16), 256).mean(-1)
     for border in (image[:, 0], image[:, -1], image[:, :, 0], image[:, :, -1]):
         known(border.mean(1), 0.75, 0.01)
 
 
-@pytest.mark.parametrize("lamp_pane, camera_pane, emitter", [
-    (True, False, "point"), (False, True, "point"), (True, True, "point"), (True, True, "area"),
-    (True, False, "area")])
-def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(
-        lamp_pane, camera_pane, emitter):
+@pytest.mark.parametrize(
+    "lamp_pane, camera_pane, emitter",
+    [
+        (True, False, "point"),
+        (False, True, "point"),
+        (True, True, "point"),
+        (True, True, "area"),
+        (True, False, "area"),
+    ],
+)
+def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(lamp_pane, camera_pane, emitter):
     """9 (LuxCore 678): brightness depended on the distance for certain paths. Removable panes force
     strategies: one around the lamp leaves t = 1 and inner connections, with a lamp of area s = 0;
     one around the camera leaves s = 1 and inner; both leave inner alone (after two reflections), or
@@ -391,28 +539,41 @@ def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(
     plus the 0.15 % that panes of radius 0.01 at most take out of the light between lamp and
     walls. Statistic: t-test over 16 seeds.
     """
-    for lamp, eye in (((0, 0, 0.7), (0, 0.1, 0.5)), ((0.3, 0.5, 0.4), (0.3, 0, 0.2)),
-                      ((-0.6, 0.1, 0.3), (0.2, -0.6, 0.1))):
+    for lamp, eye in (
+        ((0, 0, 0.7), (0, 0.1, 0.5)),
+        ((0.3, 0.5, 0.4), (0.3, 0, 0.2)),
+        ((-0.6, 0.1, 0.3), (0.2, -0.6, 0.1)),
+    ):
         edges = 3 + lamp_pane + camera_pane
         scene = {
-            "type": "scene", "sensor": camera(eye, (0.1, 0.1, -1), fov=50, size=8),
-            "wall": {"type": "sphere", "bsdf": diffuse(0.5)}}
+            "type": "scene",
+            "sensor": camera(eye, (0.1, 0.1, -1), fov=50, size=8),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+        }
         if emitter == "point":
             scene["lamp"] = {"type": "point", "position": list(lamp), "intensity": float(np.pi)}
         else:  # flux 4 pi^2: area 4 pi 0.005^2, radiance flux / (area pi)
-            scene["lamp"] = {"type": "sphere", "radius": 0.005, "center": list(lamp),
-                             "bsdf": {"type": "null"},
-                             "emitter": {"type": "area", "radiance": 1 / 0.005**2}}
+            scene["lamp"] = {
+                "type": "sphere",
+                "radius": 0.005,
+                "center": list(lamp),
+                "bsdf": {"type": "null"},
+                "emitter": {"type": "area", "radiance": 1 / 0.005**2},
+            }
         for there, place in ((lamp_pane, lamp), (camera_pane, eye)):
             if there:
                 scene[f"pane{place is eye}"] = {
-                    "type": "sphere", "radius": 0.01, "center": list(place),
-                    "bsdf": {"type": "null"}}
+                    "type": "sphere",
+                    "radius": 0.01,
+                    "center": list(place),
+                    "bsdf": {"type": "null"},
+                }
         scene = mi.load_dict(scene)
         bdpt = integrator(max_depth=edges, rr_depth=50, skip="none", strategy_images=True)
         images = render(scene, bdpt, range(16), 512)
-        total = sum(layer(images, bdpt, f"weighted.s{s}t{edges + 1 - s}").mean((1, 2, 3))
-                    for s in range(edges + 1))
+        total = sum(
+            layer(images, bdpt, f"weighted.s{s}t{edges + 1 - s}").mean((1, 2, 3)) for s in range(edges + 1)
+        )
         known(total, 0.25, 0.04, allowed=0.0015)
 
 
@@ -424,12 +585,20 @@ def test_emitters_with_unequal_sampling_weights(weights):
     at k = 3, and together they give the known radiance. Tolerance: the confidence interval, below
     6 % (single strategies), 1 % (all). Statistic: t-test over 16 seeds.
     """
-    scene = mi.load_dict({
-        "type": "scene", "sensor": camera((0, 0, 0.5), (0, 0.1, -1), fov=60),
-        "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
-        "one": {"type": "point", "intensity": float(np.pi) / 2, "sampling_weight": weights[0]},
-        "two": {"type": "point", "position": [0.3, 0.2, -0.1], "intensity": float(np.pi) / 2,
-                "sampling_weight": weights[1]}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 0, 0.5), (0, 0.1, -1), fov=60),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+            "one": {"type": "point", "intensity": float(np.pi) / 2, "sampling_weight": weights[0]},
+            "two": {
+                "type": "point",
+                "position": [0.3, 0.2, -0.1],
+                "intensity": float(np.pi) / 2,
+                "sampling_weight": weights[1],
+            },
+        }
+    )
     bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
     images = render(scene, bdpt, range(16), 256)
     for s in (1, 2, 3):
@@ -446,12 +615,22 @@ def test_directional_light_on_a_wide_floor():
     """
     expected = 0.5 * 3 * np.cos(np.deg2rad(40)) / np.pi
     for size in (3, 6):
-        scene = mi.load_dict({
-            "type": "scene", "sensor": camera((0, 4, 0), (0, 0, 0), fov=40, up=(0, 0, 1)),
-            "floor": {"type": "rectangle", "bsdf": diffuse(0.5),
-                      "to_world": T().rotate([1, 0, 0], -90).scale(size)},
-            "sun": {"type": "directional", "irradiance": 3.0,
-                    "direction": [float(np.sin(np.deg2rad(40))), -float(np.cos(np.deg2rad(40))), 0]}})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": camera((0, 4, 0), (0, 0, 0), fov=40, up=(0, 0, 1)),
+                "floor": {
+                    "type": "rectangle",
+                    "bsdf": diffuse(0.5),
+                    "to_world": T().rotate([1, 0, 0], -90).scale(size),
+                },
+                "sun": {
+                    "type": "directional",
+                    "irradiance": 3.0,
+                    "direction": [float(np.sin(np.deg2rad(40))), -float(np.cos(np.deg2rad(40))), 0],
+                },
+            }
+        )
         bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
         images = render(scene, bdpt, range(16), 256)
         known(layer(images, bdpt, "unweighted.s1t2").mean((1, 2, 3)), expected, 1e-3)
@@ -471,13 +650,21 @@ def test_point_light_in_a_glass_shell_lights_the_room():
     (multiple reflections within the shell at higher depth). Tolerance: the confidence interval,
     below 4 %. Statistic: t-test over 16 seeds.
     """
-    scene = mi.load_dict({
-        "type": "scene", "sensor": camera((0, 0, 0.6), (0, 0.5, 1), fov=50, size=8),
-        "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
-        "outer": {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric", "int_ior": 1.5}},
-        "inner": {"type": "sphere", "radius": 0.25, "flip_normals": False,
-                  "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}},
-        "lamp": {"type": "point", "intensity": float(np.pi)}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera((0, 0, 0.6), (0, 0.5, 1), fov=50, size=8),
+            "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
+            "outer": {"type": "sphere", "radius": 0.3, "bsdf": {"type": "dielectric", "int_ior": 1.5}},
+            "inner": {
+                "type": "sphere",
+                "radius": 0.25,
+                "flip_normals": False,
+                "bsdf": {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5},
+            },
+            "lamp": {"type": "point", "intensity": float(np.pi)},
+        }
+    )
     assert render(scene, integrator("path", max_depth=6), [1], 16).max() == 0
     transmittance = (1 - ((1.5 - 1) / (1.5 + 1)) ** 2) ** 2
     for skip in ("none", "auto"):

@@ -64,10 +64,18 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
     cos_light = cosines()
     cos_light[kind != AREA, 0] = 1
     return Paths(
-        dist2=dist2, cos_light=cos_light, cos_camera=cosines(),
-        to_camera=spread((n, k + 1), decades), to_light=spread((n, k + 1), decades), delta=flags,
-        kind=kind, first=spread(n, decades), second=spread(n, decades),
-        direct=spread(n, decades), lens=lens, lens_pdf=np.where(lens, spread(n, decades), 1),
+        dist2=dist2,
+        cos_light=cos_light,
+        cos_camera=cosines(),
+        to_camera=spread((n, k + 1), decades),
+        to_light=spread((n, k + 1), decades),
+        delta=flags,
+        kind=kind,
+        first=spread(n, decades),
+        second=spread(n, decades),
+        direct=spread(n, decades),
+        lens=lens,
+        lens_pdf=np.where(lens, spread(n, decades), 1),
         sensor_pdf=spread(n, decades),
     )
 
@@ -79,28 +87,40 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     """Weights of all strategies by ``mis.py``, shape (n, k + 1); meaningful where in use."""
     k, h, f = paths.k, mis.Heuristic(name), mi.Float
     ratio = paths.first.astype(np.float64) * paths.second / paths.direct
-    ratio /= np.where(paths.kind == AREA, paths.cos_light[:, 0],
-                      np.where(paths.kind == POSITION, paths.dist2[:, 0], 1))
+    ratio /= np.where(
+        paths.kind == AREA,
+        paths.cos_light[:, 0],
+        np.where(paths.kind == POSITION, paths.dist2[:, 0], 1),
+    )
     with np.errstate(over="ignore"):
         ratio = f(ratio.astype(np.float32))
     column = {
         field: [f(getattr(paths, field)[:, i].astype(np.float32)) for i in range(width)]
-        for field, width in (("dist2", k), ("cos_light", k), ("cos_camera", k),
-                             ("to_camera", k + 1), ("to_light", k + 1))
+        for field, width in (
+            ("dist2", k),
+            ("cos_light", k),
+            ("cos_camera", k),
+            ("to_camera", k + 1),
+            ("to_light", k + 1),
+        )
     }
     d2, cl, cc = column["dist2"], column["cos_light"], column["cos_camera"]
     to_camera, to_light = column["to_camera"], column["to_light"]
     delta = [mi.Bool(paths.delta[:, i]) for i in range(k + 1)]
     first, second, direct, sensor = (
-        f(x.astype(np.float32)) for x in (paths.first, paths.second, paths.direct, paths.sensor_pdf))
+        f(x.astype(np.float32)) for x in (paths.first, paths.second, paths.direct, paths.sensor_pdf)
+    )
     area, position = mi.Bool(paths.kind == AREA), mi.Bool(paths.kind == POSITION)
     infinite, unhittable = mi.Bool(paths.infinite), mi.Bool(paths.delta_emitter)
 
     def fold(partial, coefficient, pdf_fwd, pdf_rev, cos_out, is_delta):
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
-            pdf_fwd=dr.select(is_delta, 0, pdf_fwd), pdf_rev=dr.select(is_delta, 0, pdf_rev),
-            cos_out=cos_out, delta=is_delta)
+            pdf_fwd=dr.select(is_delta, 0, pdf_fwd),
+            pdf_rev=dr.select(is_delta, 0, pdf_rev),
+            cos_out=cos_out,
+            delta=is_delta,
+        )
         return mis.scatter(h, partial, coefficient, step)
 
     # Light subpath (kernel._light_subpath, subpath._arrive and _leave): light[e] at y_e = x_e.
@@ -113,8 +133,7 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
             partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
         partial = mis.arrive(h, partial, 1 if e == 1 else d2[e - 1], cc[e - 1])
         light.append(partial)
-        partial = fold(partial, 1.0 if e == 1 else kappa.inner, to_camera[e], to_light[e], cl[e],
-                       delta[e])
+        partial = fold(partial, 1.0 if e == 1 else kappa.inner, to_camera[e], to_light[e], cl[e], delta[e])
     # Camera subpath: camera[e] at z_e = x_{k-e}.
     partial = mis.Partial(h.start(dr.rcp(sensor)), f(0))
     camera = [None]
@@ -124,8 +143,14 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
         partial = dr.select(infinite, partial, arrived) if e == k else arrived
         camera.append(partial)
         if e < k:
-            partial = fold(partial, kappa.splat if e == 1 else kappa.inner, to_light[x],
-                           to_camera[x], cc[x - 1], delta[x])
+            partial = fold(
+                partial,
+                kappa.splat if e == 1 else kappa.inner,
+                to_light[x],
+                to_camera[x],
+                cc[x - 1],
+                delta[x],
+            )
 
     def of_light(e):
         return 1.0 if e == 1 else kappa.inner
@@ -137,8 +162,7 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     # s = 0 (connect.hit_emitter)
     connected = dr.select(area, direct * cl[0] / d2[0], direct)
     newest = kappa.endpoints * first if k == 1 else connected
-    camera_side = h.combine(
-        h.scale(camera[k].d_vcm, newest), h.scale(camera[k].d_vc, first * second))
+    camera_side = h.combine(h.scale(camera[k].d_vcm, newest), h.scale(camera[k].d_vc, first * second))
     result[0] = h.weight(1, f(0), camera_side)
     if k == 1:  # connect.join_endpoints
         geometry = dr.select(infinite, 1, cl[0] / d2[0])
@@ -153,14 +177,17 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     for s in range(2, k):  # connect.inner
         if kappa.inner == 0:
             break
-        light_side = mis.alternatives(h, light[s - 1], of_light(s - 1), to_light[s - 1],
-                                      to_light[s] * cl[s - 1] / d2[s - 1])
-        camera_side = mis.alternatives(h, camera[k - s], of_camera(k - s), to_camera[s],
-                                       to_camera[s - 1] * cc[s - 1] / d2[s - 1])
+        light_side = mis.alternatives(
+            h, light[s - 1], of_light(s - 1), to_light[s - 1], to_light[s] * cl[s - 1] / d2[s - 1]
+        )
+        camera_side = mis.alternatives(
+            h, camera[k - s], of_camera(k - s), to_camera[s], to_camera[s - 1] * cc[s - 1] / d2[s - 1]
+        )
         result[s] = h.weight(kappa.inner, light_side, camera_side)
     if kappa.splat > 0:  # t = 1 (connect.splat)
-        light_side = mis.alternatives(h, light[k - 1], of_light(k - 1), to_light[k - 1],
-                                      sensor * cl[k - 1] / d2[k - 1])
+        light_side = mis.alternatives(
+            h, light[k - 1], of_light(k - 1), to_light[k - 1], sensor * cl[k - 1] / d2[k - 1]
+        )
         result[k] = h.weight(kappa.splat, light_side, f(0))
     return columns(result, len(paths.kind))
 
@@ -179,7 +206,8 @@ def check(paths, kappa, name, weights, relative):
     keep = ~tied if name == "maximum" else np.ones(len(tied), dtype=bool)
     # A relative bound tests small weights as sharply as large ones; below 1e-30 float32 ends.
     np.testing.assert_allclose(
-        weights[keep], expected[keep], rtol=relative, atol=1e-30, err_msg=f"k={paths.k}")
+        weights[keep], expected[keep], rtol=relative, atol=1e-30, err_msg=f"k={paths.k}"
+    )
     possible = used.any(1) & keep
     np.testing.assert_allclose(weights[possible].sum(1), 1, atol=1e-4)
     return int((~keep).sum())
@@ -330,8 +358,7 @@ class World:
         si.script = self, i
         si.p, si.n = self.point(i), self.v(mi.Normal3f, self.normal[:, i])
         # A shading frame that has nothing to do with the geometric normal.
-        si.sh_frame = mi.Frame3f(dr.normalize(self.v(
-            mi.Normal3f, self.rng.normal(size=(self.n, 3)))))
+        si.sh_frame = mi.Frame3f(dr.normalize(self.v(mi.Normal3f, self.rng.normal(size=(self.n, 3)))))
         si.t = mi.Float(1)
         if i == 0:
             si.t = dr.select(mi.Bool(self.paths.infinite), dr.inf, 1)
@@ -359,18 +386,23 @@ class Scattering:
             return mi.Float(1)
         w = si.to_world(w)
         near = dr.dot(w, self.world.towards(self.i, self.i + 1)) > dr.dot(
-            w, self.world.towards(self.i, self.i - 1))
+            w, self.world.towards(self.i, self.i - 1)
+        )
         return dr.select(near, camera, light)
 
     def _pdf(self, si, wo):
         paths = self.world.paths
-        return self._choose(si, wo, self.world.f(paths.to_camera[:, self.i]),
-                            self.world.f(paths.to_light[:, self.i]))
+        return self._choose(
+            si, wo, self.world.f(paths.to_camera[:, self.i]), self.world.f(paths.to_light[:, self.i])
+        )
 
     def flags(self):
         joinable = ~self.world.paths.delta[:, self.i] | self.world.mixed[:, self.i]
-        return dr.select(mi.Bool(joinable), mi.UInt32(int(mi.BSDFFlags.Smooth)),
-                         mi.UInt32(int(mi.BSDFFlags.DeltaReflection)))
+        return dr.select(
+            mi.Bool(joinable),
+            mi.UInt32(int(mi.BSDFFlags.Smooth)),
+            mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
+        )
 
     def pdf(self, ctx, si, wo, active=True):
         return self._pdf(si, wo)
@@ -389,8 +421,11 @@ class Scattering:
         # Probabilities of delta events mean nothing to the weights.
         bs.pdf = dr.select(delta, 0.125, self._pdf(si, bs.wo))
         bs.eta = mi.Float(1)
-        bs.sampled_type = dr.select(delta, mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
-                                    mi.UInt32(int(mi.BSDFFlags.GlossyReflection)))
+        bs.sampled_type = dr.select(
+            delta,
+            mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
+            mi.UInt32(int(mi.BSDFFlags.GlossyReflection)),
+        )
         return bs, mi.Spectrum(1)
 
 
@@ -441,14 +476,22 @@ class Lights:
         w = self.world
         n = dr.select(self.area, w.v(mi.Normal3f, w.normal[:, 0]), 0)
         return emitters.Emission(
-            weight=mi.Spectrum(1), d=w.towards(0, 1),
+            weight=mi.Spectrum(1),
+            d=w.towards(0, 1),
             anchor=rays.Anchor(w.point(0), n, mi.Float(0), mi.Float(0)),
-            cos=self.cos, pdf_first=self.first, pdf_second=self.second, infinite=self.infinite,
-            delta=self.delta, index=mi.UInt32(0), si=w.interaction(0, from_light=True))
+            cos=self.cos,
+            pdf_first=self.first,
+            pdf_second=self.second,
+            infinite=self.infinite,
+            delta=self.delta,
+            index=mi.UInt32(0),
+            si=w.interaction(0, from_light=True),
+        )
 
     def connection_density(self, emission, si, active):
-        return dr.select(self.area, self.direct * self.cos,
-                         dr.select(self.at, self.direct * self.dist2, self.direct))
+        return dr.select(
+            self.area, self.direct * self.cos, dr.select(self.at, self.direct * self.dist2, self.direct)
+        )
 
     def radiance_towards(self, emission, d, active):
         return mi.Spectrum(1)
@@ -464,13 +507,24 @@ class Lights:
 
     def sample_direct(self, si, u, active):
         w = self.world
-        ratio = self.first * self.second / dr.select(
-            self.area, self.direct * self.cos, dr.select(self.at, self.direct * self.dist2,
-                                                         self.direct))
+        ratio = (
+            self.first
+            * self.second
+            / dr.select(
+                self.area,
+                self.direct * self.cos,
+                dr.select(self.at, self.direct * self.dist2, self.direct),
+            )
+        )
         return emitters.Direct(
-            weight=mi.Spectrum(1), pdf=self.direct, d=w.towards(1, 0),
-            anchor=rays.free_anchor(w.point(0)), infinite=self.infinite, delta=self.delta,
-            emission_ratio=ratio)
+            weight=mi.Spectrum(1),
+            pdf=self.direct,
+            d=w.towards(1, 0),
+            anchor=rays.free_anchor(w.point(0)),
+            infinite=self.infinite,
+            delta=self.delta,
+            emission_ratio=ratio,
+        )
 
 
 class Sensor:
@@ -489,15 +543,24 @@ class Sensor:
         w = self.world
         ray = mi.Ray3f(w.point(w.k), w.towards(w.k, w.k - 1), mi.Float(0), mi.Color0f())
         return sensors.CameraStart(
-            ray=ray, weight=mi.Spectrum(1), p=w.point(w.k), pdf_w=self.density,
-            position=mi.Point2f(0.5), pixel=mi.Point2f(0.5))
+            ray=ray,
+            weight=mi.Spectrum(1),
+            p=w.point(w.k),
+            pdf_w=self.density,
+            position=mi.Point2f(0.5),
+            pixel=mi.Point2f(0.5),
+        )
 
     def join(self, p, u_lens):
         w = self.world
         return sensors.CameraJoin(
-            anchor=rays.free_anchor(w.point(w.k)), d=w.towards(w.k - 1, w.k),
-            dist2=w.f(w.paths.dist2[:, -1]), importance=self.density,
-            position=mi.Point2f(0.5), valid=mi.Bool(True))
+            anchor=rays.free_anchor(w.point(w.k)),
+            d=w.towards(w.k - 1, w.k),
+            dist2=w.f(w.paths.dist2[:, -1]),
+            importance=self.density,
+            position=mi.Point2f(0.5),
+            valid=mi.Bool(True),
+        )
 
     def join_direction(self, d, u_lens):
         join = self.join(None, u_lens)
@@ -548,20 +611,39 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     k, scene = world.k, Scene(world)
     u32, f = mi.UInt32, mi.Float
     plan = SimpleNamespace(
-        hit=True, direct=True, splat=kappa.splat > 0, endpoints=kappa.endpoints > 0, light=True,
-        connections="all" if kappa.inner > 0 else "none", served=1, roulette=False,
-        hide_emitters=False)
+        hit=True,
+        direct=True,
+        splat=kappa.splat > 0,
+        endpoints=kappa.endpoints > 0,
+        light=True,
+        connections="all" if kappa.inner > 0 else "none",
+        served=1,
+        roulette=False,
+        hide_emitters=False,
+    )
     k_ = SimpleNamespace(
-        scene=scene, camera=Sensor(world), emitters=Lights(world), plan=plan,
-        heuristic=mis.Heuristic(name), full_pdf=False, round_trip=False,
+        scene=scene,
+        camera=Sensor(world),
+        emitters=Lights(world),
+        plan=plan,
+        heuristic=mis.Heuristic(name),
+        full_pdf=False,
+        round_trip=False,
         strategy_images=False,
-        max_depth=u32(k), rr_depth=u32(10**6), last_stored=u32(k - 2 if k > 2 else 0),
-        last_inner=u32(k), last_light=u32(k - 1), count_light=f(1),
-        coefficient_splat=f(kappa.splat), coefficient_endpoints=f(kappa.endpoints),
-        coefficient_inner=f(kappa.inner), points=Nothing(),
+        max_depth=u32(k),
+        rr_depth=u32(10**6),
+        last_stored=u32(k - 2 if k > 2 else 0),
+        last_inner=u32(k),
+        last_light=u32(k - 1),
+        count_light=f(1),
+        coefficient_splat=f(kappa.splat),
+        coefficient_endpoints=f(kappa.endpoints),
+        coefficient_inner=f(kappa.inner),
+        points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
         quadrics=Flat(),
-        to_rgb=lambda value, wavelengths: mi.Color3f(value))
+        to_rgb=lambda value, wavelengths: mi.Color3f(value),
+    )
     result = [f(0)] * (k + 1)
     stored = []
 
@@ -574,6 +656,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
                 result[s] = c.weight
                 world.demands.append((c.s == s) & (c.t == k + 1 - s))
             return out
+
         return recorded
 
     def edges(vertex):
@@ -604,22 +687,23 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     counters = kernel.Counters(*(u32(0) for _ in kernel.Counters.__dataclass_fields__))
     scene.begin(from_light=True)
     monkeypatch.setattr(dr, "while_loop", python_loop(k - 1))
-    path, counters = kernel._light_subpath(
-        k_, Nothing(), k_.points.stream(), shared, None, counters)
+    path, counters = kernel._light_subpath(k_, Nothing(), k_.points.stream(), shared, None, counters)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
-    kernel._camera_subpath(
-        k_, Nothing(), place, u32(0), shared, path, counters, mi.Bool(True))
+    kernel._camera_subpath(k_, Nothing(), place, u32(0), shared, path, counters, mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
     return columns(result, world.n)
 
 
-@pytest.mark.parametrize("name, classes", [
-    *((name, "odd") for name in mis.HEURISTICS),
-    *(("balance", classes) for classes in ("n1c1", "n1c0-half", "n0c1", "n0c0")),
-])
+@pytest.mark.parametrize(
+    "name, classes",
+    [
+        *((name, "odd") for name in mis.HEURISTICS),
+        *(("balance", classes) for classes in ("n1c1", "n1c0-half", "n0c1", "n0c0")),
+    ],
+)
 @pytest.mark.parametrize("lens", [False, True], ids=["pinhole", "lens"])
 def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
     """Rationale: right arithmetic with the wrong argument is still wrong; see the module.
@@ -645,14 +729,20 @@ T = mi.ScalarTransform4f
 
 
 def lamp(shape, weight=1.0):
-    return {**shape, "bsdf": {"type": "diffuse", "reflectance": 0.0},
-            "emitter": {"type": "area", "radiance": 3.0, "sampling_weight": weight}}
+    return {
+        **shape,
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": 3.0, "sampling_weight": weight},
+    }
 
 
 def sky_map():
     pixels = np.random.default_rng(5).uniform(0.2, 2, (8, 16, 3)).astype(np.float32)
-    return {"type": "envmap", "bitmap": mi.Bitmap(pixels),
-            "to_world": T().rotate([1, 0, 0], 50).rotate([0, 1, 0], 30)}
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(pixels),
+        "to_world": T().rotate([1, 0, 0], 50).rotate([0, 1, 0], 30),
+    }
 
 
 TURN = T().translate([0.3, 0.2, -0.4]).rotate([0, 1, 0], 25)
@@ -668,18 +758,25 @@ EMITTERS = {
     "several": [
         lamp({"type": "sphere", "center": [-1, 0.5, 0], "radius": 0.3}, 0.7),
         lamp({"type": "rectangle", "to_world": T().translate([1, 0, 0]).scale(0.4)}, 3.0),
-        {"type": "point", "position": [0, 1.5, 0], "intensity": 1.0}, sky_map()],
+        {"type": "point", "position": [0, 1.5, 0], "intensity": 1.0},
+        sky_map(),
+    ],
 }
 
 
 def real_scene(name):
     """The emitters between a floor and a ball."""
-    return mi.load_dict({
-        "type": "scene",
-        "floor": {"type": "rectangle", "to_world": T().translate([0, -2, 0]).rotate(
-            [1, 0, 0], -90).scale(4)},
-        "ball": {"type": "sphere", "center": [0.5, 0, 2.5], "radius": 0.8},
-        **{f"emitter {i}": e for i, e in enumerate(EMITTERS[name])}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().translate([0, -2, 0]).rotate([1, 0, 0], -90).scale(4),
+            },
+            "ball": {"type": "sphere", "center": [0.5, 0, 2.5], "radius": 0.8},
+            **{f"emitter {i}": e for i, e in enumerate(EMITTERS[name])},
+        }
+    )
 
 
 def relative_gap(a, b, mask):
@@ -750,10 +847,17 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
     """
     more = {"aperture_radius": 0.1, "focus_distance": 2.5} if kind == "thinlens" else {}
     window = {"crop_width": 20, "crop_height": 10, "crop_offset_x": 7, "crop_offset_y": 11}
-    sensor = mi.load_dict({
-        "type": kind, "fov": 70, "near_clip": 0.05, "far_clip": 100,
-        "to_world": T().look_at([1, 2, 3], [0.2, 0.1, -1], [0, 1, 0.1]),
-        "film": {"type": "hdrfilm", "width": 40, "height": 30, **(window if crop else {})}, **more})
+    sensor = mi.load_dict(
+        {
+            "type": kind,
+            "fov": 70,
+            "near_clip": 0.05,
+            "far_clip": 100,
+            "to_world": T().look_at([1, 2, 3], [0.2, 0.1, -1], [0, 1, 0.1]),
+            "film": {"type": "hdrfilm", "width": 40, "height": 30, **(window if crop else {})},
+            **more,
+        }
+    )
     camera = sensors.Camera(sensor)
     like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
     rng = mi.PCG32(4096)

@@ -23,31 +23,56 @@ def integrator(**parameters):
 
 
 def diffuse(reflectance=0.5):
-    return {"type": "twosided", "bsdf": {
-        "type": "diffuse", "reflectance": {"type": "rgb", "value": [reflectance] * 3}}}
+    return {
+        "type": "twosided",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [reflectance] * 3}},
+    }
 
 
 def sensor(size=16, spp=4, sampler="independent", keys=None, **film):
     return {
-        "type": "perspective", "fov": 60, "near_clip": 1e-3,
+        "type": "perspective",
+        "fov": 60,
+        "near_clip": 1e-3,
         "to_world": T().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0]),
         "sampler": {"type": sampler, "sample_count": spp},
-        "film": {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgb",
-                 "component_format": "float32", "rfilter": {"type": "box"}, **film}} | (keys or {})
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+            **film,
+        },
+    } | (keys or {})
 
 
 def glowing_sphere(**keys):
-    return mi.load_dict({
-        "type": "scene", "sensor": sensor(**keys),
-        "wall": {"type": "sphere", "flip_normals": True, "bsdf": diffuse(),
-                 "emitter": {"type": "area", "radiance": 0.5}}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(**keys),
+            "wall": {
+                "type": "sphere",
+                "flip_normals": True,
+                "bsdf": diffuse(),
+                "emitter": {"type": "area", "radiance": 0.5},
+            },
+        }
+    )
 
 
 def lamp_in_a_sphere(**keys):
     """Radiance 1 everywhere, 2^-m after m reflections."""
-    return mi.load_dict({
-        "type": "scene", "sensor": sensor(**keys), "wall": {"type": "sphere", "bsdf": diffuse()},
-        "lamp": {"type": "point", "intensity": float(np.pi)}})
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(**keys),
+            "wall": {"type": "sphere", "bsdf": diffuse()},
+            "lamp": {"type": "point", "intensity": float(np.pi)},
+        }
+    )
 
 
 def image(bdpt, scene, **keywords):
@@ -57,31 +82,35 @@ def image(bdpt, scene, **keywords):
 # -- parameters -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("parameters, message", [
-    ({"max_depth": -2}, "max_depth=-2"),
-    ({"max_depth": 1.5}, "max_depth=1.5"),
-    ({"max_depth": "deep"}, "max_depth='deep'"),
-    ({"max_depth": True}, "max_depth=True"),
-    ({"rr_depth": 0}, "rr_depth=0"),
-    ({"hide_emitters": 1}, "hide_emitters=1"),
-    ({"heuristic": "best"}, "heuristic='best'.*balance, power, maximum, uniform"),
-    ({"skip": "all"}, "skip='all'.*auto, impossible, none"),
-    ({"light_paths": 3}, "light_paths=3.*1/16"),
-    ({"light_paths": "1/3"}, "light_paths='1/3'"),
-    ({"light_paths": "many"}, "light_paths='many'"),
-    ({"light_paths": "1/0"}, "light_paths='1/0'"),
-    ({"light_paths": -1}, "light_paths=-1"),
-    ({"connections": "two"}, "connections='two'.*all, one, none"),
-    ({"points": "halton"}, "points='halton'.*sobol, sampler, independent"),
-    ({"stored_vertices": 0}, "stored_vertices=0"),
-    ({"spp_per_pass": -1}, "spp_per_pass=-1"),
-    ({"timeout": "soon"}, "timeout='soon'"),
-    ({"timeout": float("nan")}, "timeout=nan"),
-    ({"strategy_images": True}, "strategy_images.*max_depth"),
-    ({"strategy_images": True, "max_depth": 0}, "strategy_images.*max_depth"),
-    ({"strategy_images": "yes"}, "strategy_images='yes'"),
-    ({"max_deph": 3}, "max_deph"),
-], ids=str)
+@pytest.mark.parametrize(
+    "parameters, message",
+    [
+        ({"max_depth": -2}, "max_depth=-2"),
+        ({"max_depth": 1.5}, "max_depth=1.5"),
+        ({"max_depth": "deep"}, "max_depth='deep'"),
+        ({"max_depth": True}, "max_depth=True"),
+        ({"rr_depth": 0}, "rr_depth=0"),
+        ({"hide_emitters": 1}, "hide_emitters=1"),
+        ({"heuristic": "best"}, "heuristic='best'.*balance, power, maximum, uniform"),
+        ({"skip": "all"}, "skip='all'.*auto, impossible, none"),
+        ({"light_paths": 3}, "light_paths=3.*1/16"),
+        ({"light_paths": "1/3"}, "light_paths='1/3'"),
+        ({"light_paths": "many"}, "light_paths='many'"),
+        ({"light_paths": "1/0"}, "light_paths='1/0'"),
+        ({"light_paths": -1}, "light_paths=-1"),
+        ({"connections": "two"}, "connections='two'.*all, one, none"),
+        ({"points": "halton"}, "points='halton'.*sobol, sampler, independent"),
+        ({"stored_vertices": 0}, "stored_vertices=0"),
+        ({"spp_per_pass": -1}, "spp_per_pass=-1"),
+        ({"timeout": "soon"}, "timeout='soon'"),
+        ({"timeout": float("nan")}, "timeout=nan"),
+        ({"strategy_images": True}, "strategy_images.*max_depth"),
+        ({"strategy_images": True, "max_depth": 0}, "strategy_images.*max_depth"),
+        ({"strategy_images": "yes"}, "strategy_images='yes'"),
+        ({"max_deph": 3}, "max_deph"),
+    ],
+    ids=str,
+)
 def test_bad_values_are_named(parameters, message):
     """Expected: an error that names the parameter and the value, and what can be used instead."""
     with pytest.raises((ValueError, TypeError, RuntimeError), match=f"(?s){message}"):
@@ -142,9 +171,14 @@ def test_light_roulette_does_not_depend_on_the_unit_of_radiance():
     """
     images, rays = [], []
     for scale in (1e-6, 1.0, 1e6):
-        scene = mi.load_dict({
-            "type": "scene", "sensor": sensor(), "wall": {"type": "sphere", "bsdf": diffuse()},
-            "lamp": {"type": "point", "intensity": float(np.pi) * scale}})
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "sensor": sensor(),
+                "wall": {"type": "sphere", "bsdf": diffuse()},
+                "lamp": {"type": "point", "intensity": float(np.pi) * scale},
+            }
+        )
         bdpt = integrator(skip="none", rr_depth=2)
         images.append(image(bdpt, scene, spp=16) / scale)
         rays.append(bdpt.statistics["rays"]["light"])
@@ -197,17 +231,23 @@ def test_points_are_unbiased(points):
 
 def test_sensor_is_an_index_or_an_object():
     """Expected: both name the same view; another index another view; a wrong one is named."""
-    scene = mi.load_dict({
-        "type": "scene", "a": sensor(), "b": sensor(size=8),
-        "wall": {"type": "sphere", "bsdf": diffuse()},
-        "lamp": {"type": "point", "intensity": 1.0}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "a": sensor(),
+            "b": sensor(size=8),
+            "wall": {"type": "sphere", "bsdf": diffuse()},
+            "lamp": {"type": "point", "intensity": 1.0},
+        }
+    )
     bdpt = integrator(max_depth=2, skip="none")
     by_index = image(bdpt, scene, sensor=1, spp=4)
     by_object = image(bdpt, scene, sensor=scene.sensors()[1], spp=4)
     np.testing.assert_allclose(by_index, by_object, rtol=1e-4)
     assert by_index.shape != image(bdpt, scene, spp=4).shape
     np.testing.assert_allclose(
-        np.array(mi.render(scene, integrator=bdpt, sensor=1, spp=4)), by_index, rtol=1e-4)
+        np.array(mi.render(scene, integrator=bdpt, sensor=1, spp=4)), by_index, rtol=1e-4
+    )
     with pytest.raises(ValueError, match="sensor=2 does not exist.*2 sensor"):
         bdpt.render(scene, sensor=2)
 
@@ -344,6 +384,7 @@ def test_interruption_keeps_what_is_done(rfilter):
     holds the first two of five passes correctly normalised (0.5 exactly for direct light; with splats
     the radiance 1 within 5 %, four standard errors), statistics say so, and the next render is whole.
     """
+
     def interrupt(report):
         if report.spp_done >= 8:
             raise KeyboardInterrupt
@@ -387,11 +428,16 @@ def test_scenes_one_after_the_other():
 
 def test_moving_lamp_and_camera_are_seen():
     """Expected: after an edit of positions through mi.traverse the image is that of a scene built so."""
+
     def scene(lamp, eye):
-        return mi.load_dict({
-            "type": "scene", "wall": {"type": "sphere", "bsdf": diffuse()},
-            "sensor": sensor(keys={"to_world": T().look_at(eye, [0, 0, -1], [0, 1, 0])}),
-            "lamp": {"type": "point", "position": lamp, "intensity": 1.0}})
+        return mi.load_dict(
+            {
+                "type": "scene",
+                "wall": {"type": "sphere", "bsdf": diffuse()},
+                "sensor": sensor(keys={"to_world": T().look_at(eye, [0, 0, -1], [0, 1, 0])}),
+                "lamp": {"type": "point", "position": lamp, "intensity": 1.0},
+            }
+        )
 
     bdpt = integrator(max_depth=3, skip="none")
     moved = scene([0, 0, 0], [0, 0, 0.5])
@@ -404,12 +450,20 @@ def test_moving_lamp_and_camera_are_seen():
             params[key] = mi.Transform4f().look_at([0, 0.2, 0.4], [0, 0, -1], [0, 1, 0])
     params.update()
     built = scene([0.3, 0.2, 0.1], [0, 0.2, 0.4])
-    np.testing.assert_allclose(
-        image(bdpt, moved, spp=8), image(bdpt, built, spp=8), rtol=2e-3, atol=1e-4)
+    np.testing.assert_allclose(image(bdpt, moved, spp=8), image(bdpt, built, spp=8), rtol=2e-3, atol=1e-4)
 
 
-KEYS = {"seconds", "rays", "connections", "skipped", "decisions", "passes", "non_finite", "kernels",
-        "peak_memory"}
+KEYS = {
+    "seconds",
+    "rays",
+    "connections",
+    "skipped",
+    "decisions",
+    "passes",
+    "non_finite",
+    "kernels",
+    "peak_memory",
+}
 
 
 def test_statistics():
@@ -475,10 +529,15 @@ def test_explain():
     assert "hide_emitters" in text
     scene = mi.load_dict({"type": "scene", "sensor": sensor()})
     assert "no emitter" in integrator().explain(scene)
-    glass = mi.load_dict({
-        "type": "scene", "sensor": sensor(), "lamp": {"type": "point"},
-        "ball": {"type": "sphere", "bsdf": {"type": "dielectric"}},
-        "wall": {"type": "sphere", "radius": 3, "bsdf": diffuse()}})
+    glass = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(),
+            "lamp": {"type": "point"},
+            "ball": {"type": "sphere", "bsdf": {"type": "dielectric"}},
+            "wall": {"type": "sphere", "radius": 3, "bsdf": diffuse()},
+        }
+    )
     assert "lost: " in integrator(light_paths=0).explain(glass)
 
 
@@ -491,13 +550,19 @@ def test_strategy_images_name_every_strategy():
     """
     bdpt = integrator(max_depth=3, strategy_images=True, skip="none")
     names = bdpt.aov_names()
-    expected = {f"{kind}.s{s}t{k + 1 - s}.{c}" for kind in ("weighted", "unweighted")
-                for k in (1, 2, 3) for s in range(k + 1) for c in "RGB"}
+    expected = {
+        f"{kind}.s{s}t{k + 1 - s}.{c}"
+        for kind in ("weighted", "unweighted")
+        for k in (1, 2, 3)
+        for s in range(k + 1)
+        for c in "RGB"
+    }
     assert set(names) == expected and len(names) == len(expected)
     result = image(bdpt, glowing_sphere(), spp=8)
     assert result.shape == (16, 16, 3 + len(names))
-    total = sum(result[..., 3 + i] for i, n in enumerate(names) if n.startswith("weighted")
-                and n.endswith("R"))
+    total = sum(
+        result[..., 3 + i] for i, n in enumerate(names) if n.startswith("weighted") and n.endswith("R")
+    )
     np.testing.assert_allclose(total, result[..., 0], rtol=1e-4, atol=1e-5)
     assert integrator(max_depth=3).aov_names() == []
 
@@ -515,9 +580,14 @@ def test_strategy_images_check_their_memory():
 def test_scenes_that_are_refused():
     """Expected: one sentence that names the object and what to do."""
     bdpt = integrator()
-    fog = mi.load_dict({
-        "type": "scene", "sensor": sensor(), "lamp": {"type": "point"},
-        "cloud": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}})
+    fog = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(),
+            "lamp": {"type": "point"},
+            "cloud": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}},
+        }
+    )
     with pytest.raises(NotImplementedError, match="cloud.*participating medium.*volpath"):
         bdpt.render(fog)
     with pytest.raises(NotImplementedError, match="volpath"):
@@ -527,11 +597,18 @@ def test_scenes_that_are_refused():
         bdpt.render(empty)
 
 
-@pytest.mark.parametrize("emitter, kind", [
-    ({"type": "projector", "irradiance": 1.0}, "Projector"),
-    ({"type": "sunsky"}, "SunskyEmitter"),
-    ({"type": "rectangle", "emitter": {"type": "directionalarea", "radiance": 1.0}}, "DirectionalArea"),
-], ids=["projector", "sunsky", "directionalarea"])
+@pytest.mark.parametrize(
+    "emitter, kind",
+    [
+        ({"type": "projector", "irradiance": 1.0}, "Projector"),
+        ({"type": "sunsky"}, "SunskyEmitter"),
+        (
+            {"type": "rectangle", "emitter": {"type": "directionalarea", "radiance": 1.0}},
+            "DirectionalArea",
+        ),
+    ],
+    ids=["projector", "sunsky", "directionalarea"],
+)
 def test_unsupported_emitters_are_refused(emitter, kind):
     """Expected: the kind and the supported ones are named. (Run on its own scene: a living
     directionalarea breaks calls to other emitters in Mitsuba, so it is deleted at once.)
@@ -549,8 +626,7 @@ def test_unsupported_emitters_are_refused(emitter, kind):
 def test_unsupported_sensors_are_refused(kind):
     """Expected: the kind and the supported ones are named."""
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    scene = mi.load_dict({"type": "scene", "sensor": {"type": kind, "film": film},
-                          "lamp": {"type": "point"}})
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": kind, "film": film}, "lamp": {"type": "point"}})
     with pytest.raises(NotImplementedError, match="not supported.*PerspectiveCamera"):
         integrator().render(scene)
 
@@ -558,8 +634,10 @@ def test_unsupported_sensors_are_refused(kind):
 def test_derivatives_are_refused():
     """Expected: a sentence that names what to use, for both modes."""
     scene, bdpt = lamp_in_a_sphere(), integrator()
-    for call in (lambda: bdpt.render_forward(scene, None),
-                 lambda: bdpt.render_backward(scene, None, None)):
+    for call in (
+        lambda: bdpt.render_forward(scene, None),
+        lambda: bdpt.render_backward(scene, None, None),
+    ):
         with pytest.raises(NotImplementedError, match="prb"):
             call()
 
@@ -579,14 +657,23 @@ def test_variants():
             with pytest.raises(NotImplementedError, match=f"{variant} is polarized"):
                 mi.load_dict({"type": "bdpt"})
         else:
-            scene = mi.load_dict({
-                "type": "scene",
-                "sensor": sensor() | {"to_world": mi.ScalarTransform4f().look_at(
-                    [0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0])},
-                "wall": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {
-                    "type": "diffuse", "reflectance": 0.5}}},
-                "lamp": {"type": "point", "intensity": {"type": "uniform", "value": float(np.pi)}
-                         if mi.is_spectral else float(np.pi)}})
+            scene = mi.load_dict(
+                {
+                    "type": "scene",
+                    "sensor": sensor()
+                    | {"to_world": mi.ScalarTransform4f().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0])},
+                    "wall": {
+                        "type": "sphere",
+                        "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}},
+                    },
+                    "lamp": {
+                        "type": "point",
+                        "intensity": {"type": "uniform", "value": float(np.pi)}
+                        if mi.is_spectral
+                        else float(np.pi),
+                    },
+                }
+            )
             result = np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=256))
             expected = 1
             if mi.is_spectral:  # a flat spectrum is not white in sRGB
@@ -600,12 +687,16 @@ def test_variants():
 # -- registration -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("code", [
-    "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb')",
-    "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import mitsuba_bdpt",
-    "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.set_variant('scalar_rgb');"
-    " mi.set_variant('llvm_ad_rgb')",
-], ids=["import first", "import last", "back and forth"])
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb')",
+        "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import mitsuba_bdpt",
+        "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.set_variant('scalar_rgb');"
+        " mi.set_variant('llvm_ad_rgb')",
+    ],
+    ids=["import first", "import last", "back and forth"],
+)
 def test_registration(code):
     """Rationale: plugins are registered per variant. Expected: the plugin loads whenever the package was
     imported, before or after the variant was set. (A process of its own for each order.)
@@ -615,13 +706,15 @@ def test_registration(code):
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(mitsuba_bdpt.llvm_choice.path)}
     script = f"{code}\nprint(type(mi.load_dict({{'type': 'bdpt'}})).__name__)"
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=120)
+        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=120
+    )
     assert done.stdout.strip() == "BDPTIntegrator", done.stderr
 
 
 def test_xml():
     """Expected: the plugin in a scene file, typed parameters and `$` defaults included."""
-    scene = mi.load_string("""
+    scene = mi.load_string(
+        """
         <scene version="3.0.0">
             <default name="depth" value="2"/>
             <integrator type="bdpt">
@@ -636,7 +729,9 @@ def test_xml():
                 </film>
             </sensor>
             <shape type="sphere"><emitter type="area"/></shape>
-        </scene>""", depth=3)
+        </scene>""",
+        depth=3,
+    )
     bdpt = scene.integrator()
     assert bdpt.max_depth == 3 and bdpt.settings.light_paths == 0.5
     assert bdpt.settings.hide_emitters

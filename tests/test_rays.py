@@ -5,13 +5,13 @@ Known failure 13: offsets of 8.9e-5 (1 + max|p|) swallow small scenes and leave 
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from welch import assert_agree, compare_images, tile_means
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import rays
+from welch import assert_agree, compare_images, tile_means
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -59,8 +59,11 @@ def _sdf(transform):
     z, y, x = np.meshgrid(x, x, x, indexing="ij")
     distance = np.sqrt((x - 0.5) ** 2 + (y - 0.5) ** 2 + (z - 0.5) ** 2) - 0.4
     centred = transform @ mi.ScalarTransform4f().scale(2) @ mi.ScalarTransform4f().translate(-0.5)
-    return {"type": "sdfgrid", "grid": mi.TensorXf(distance[..., None].astype(np.float32)),
-            "to_world": centred}
+    return {
+        "type": "sdfgrid",
+        "grid": mi.TensorXf(distance[..., None].astype(np.float32)),
+        "to_world": centred,
+    }
 
 
 def shape_scene(kind, place, folder):
@@ -78,13 +81,22 @@ def shape_scene(kind, place, folder):
     elif kind == "instance":
         shape = {
             "group": {"type": "shapegroup", "ball": _mesh(folder, turn)},
-            "shape": {"type": "instance", "group": {"type": "ref", "id": "group"},
-                      "to_world": t().translate([shift] * 3) @ t().scale(scale)},
+            "shape": {
+                "type": "instance",
+                "group": {"type": "ref", "id": "group"},
+                "to_world": t().translate([shift] * 3) @ t().scale(scale),
+            },
         }
     elif kind == "cylinder":
         ends = np.array([[-0.3, 0.2, -1], [0.3, -0.1, 1]]) * scale + shift
-        shape = {"shape": {"type": kind, "p0": ends[0].tolist(), "p1": ends[1].tolist(),
-                           "radius": 0.6 * scale}}
+        shape = {
+            "shape": {
+                "type": kind,
+                "p0": ends[0].tolist(),
+                "p1": ends[1].tolist(),
+                "radius": 0.6 * scale,
+            }
+        }
     else:
         shape = {"shape": {"type": kind, "to_world": transform}}
     return mi.load_dict({"type": "scene", **shape})
@@ -137,8 +149,18 @@ def bad_rays(kind, place, folder, n, seed=0):
     return own, leaks, total
 
 
-KINDS = ["sphere", "cylinder", "disk", "rectangle", "cube", "mesh", "instance", "bsplinecurve",
-         "linearcurve", "sdfgrid"]
+KINDS = [
+    "sphere",
+    "cylinder",
+    "disk",
+    "rectangle",
+    "cube",
+    "mesh",
+    "instance",
+    "bsplinecurve",
+    "linearcurve",
+    "sdfgrid",
+]
 # Hits per kind of shape, over all places (two rays each). SDF grids take 50 times longer a ray.
 HITS = {"sdfgrid": 100_000}
 
@@ -245,8 +267,10 @@ def test_thin_walls_block_and_ends_do_not(place, tmp_path):
     gap = 0.01 * wide
     squares = {
         "below": {"type": "rectangle", "to_world": to_place @ t().translate([0, 0, -gap])},
-        "above": {"type": "rectangle",
-                  "to_world": to_place @ t().translate([0, 0, gap]) @ t().rotate([1, 0, 0], 180)},
+        "above": {
+            "type": "rectangle",
+            "to_world": to_place @ t().translate([0, 0, gap]) @ t().rotate([1, 0, 0], 180),
+        },
     }
     plate = {"type": "cube", "to_world": to_place @ t().scale([1.5, 1.5, 5e-4 * wide])}
     open_scene = mi.load_dict({"type": "scene", **squares})
@@ -316,8 +340,7 @@ def scaled_scene(name, scale, **parameters):
         clips = {f.get("name"): f for f in sensor.findall("float")}
         for clip, default in (("near_clip", 0.01), ("far_clip", 10000.0)):
             if clip not in clips:
-                clips[clip] = ElementTree.SubElement(
-                    sensor, "float", name=clip, value=str(default))
+                clips[clip] = ElementTree.SubElement(sensor, "float", name=clip, value=str(default))
             times(clips[clip], "value")
     for shape in root.iter("shape"):
         for file in shape.findall("string[@name='filename']"):
@@ -355,8 +378,9 @@ def test_scale_does_not_change_the_image(name):
     means = []
     for side, scale in enumerate((1.0, 1e-3, 1e3)):
         scene = scaled_scene(name, scale, resolution=16)
-        images = [mi.render(scene, integrator=integrator, spp=32, seed=100 * side + i).numpy()
-                  for i in range(12)]
+        images = [
+            mi.render(scene, integrator=integrator, spp=32, seed=100 * side + i).numpy() for i in range(12)
+        ]
         means.append([tile_means(image, 4)[:, 1] for image in images])
     for label, other in zip(("1e-3", "1e3"), means[1:], strict=True):
         assert_agree(compare_images(means[0], other, f"{name} x {label}"), at_least=8)

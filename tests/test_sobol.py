@@ -251,9 +251,7 @@ def test_symbolic_loop_and_literals():
         return i + 1, out
 
     with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-        _, out = dr.while_loop(
-            (mi.UInt32(0), dr.zeros(mi.Float, n * count)), lambda i, out: i < count, body
-        )
+        _, out = dr.while_loop((mi.UInt32(0), dr.zeros(mi.Float, n * count)), lambda i, out: i < count, body)
     sums = np.float32(want[..., 0]) + 2 * np.float32(want[..., 1])
     assert np.array_equal(out.numpy().reshape(n, count), sums)
 

@@ -19,12 +19,12 @@ Roulette is off (``rr_depth`` 100) except where it is the subject.
 
 from __future__ import annotations
 
-import welch as st
 from functools import cache
 
 import mitsuba as mi
 import numpy as np
 import pytest
+import welch as st
 from mitsuba_bdpt.strategies import strategies
 
 DEPTH = 5
@@ -37,11 +37,20 @@ T = mi.ScalarTransform4f
 
 def sensor(kind="perspective", origin=(0.1, -0.05, 0.5), target=(0, 0, -1), fov=60, **more):
     return {
-        "type": kind, "fov": fov, "near_clip": 0.05, "far_clip": 50,
+        "type": kind,
+        "fov": fov,
+        "near_clip": 0.05,
+        "far_clip": 50,
         "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
         "sampler": {"type": "independent"},
-        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"},
-                 "pixel_format": "rgb", "component_format": "float32"},
+        "film": {
+            "type": "hdrfilm",
+            "width": SIZE,
+            "height": SIZE,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        },
         **more,
     }
 
@@ -55,37 +64,60 @@ def gray(x):
 
 
 WALL = {"type": "sphere", "flip_normals": True, "bsdf": gray([0.7, 0.5, 0.3])}
-BALL_LAMP = {"type": "sphere", "center": [0.25, 0.3, -0.2], "radius": 0.2, "bsdf": gray(0.0),
-             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [5, 4, 3]}}}
-QUAD_LAMP = {"type": "rectangle", "bsdf": gray(0.0),
-             "to_world": T().translate([-0.2, 0.45, -0.2]).rotate([1, 0, 0], 70).scale(0.25),
-             "emitter": {"type": "area", "radiance": 6.0}}
-DISK_LAMP = {"type": "disk", "bsdf": gray(0.0),
-             "to_world": T().translate([-0.3, -0.4, -0.2]).rotate([1, 0, 0], -80).scale(0.25),
-             "emitter": {"type": "area", "radiance": 4.0, "sampling_weight": 2.5}}
+BALL_LAMP = {
+    "type": "sphere",
+    "center": [0.25, 0.3, -0.2],
+    "radius": 0.2,
+    "bsdf": gray(0.0),
+    "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [5, 4, 3]}},
+}
+QUAD_LAMP = {
+    "type": "rectangle",
+    "bsdf": gray(0.0),
+    "to_world": T().translate([-0.2, 0.45, -0.2]).rotate([1, 0, 0], 70).scale(0.25),
+    "emitter": {"type": "area", "radiance": 6.0},
+}
+DISK_LAMP = {
+    "type": "disk",
+    "bsdf": gray(0.0),
+    "to_world": T().translate([-0.3, -0.4, -0.2]).rotate([1, 0, 0], -80).scale(0.25),
+    "emitter": {"type": "area", "radiance": 4.0, "sampling_weight": 2.5},
+}
 POINT = {"type": "point", "position": [0.2, 0.3, -0.1], "intensity": 1.0}
-SPOT = {"type": "spot", "intensity": 4.0, "cutoff_angle": 50, "beam_width": 30,
-        "to_world": T().look_at([0.1, 0.3, 0.1], [-0.3, -0.5, -1], [0, 1, 0])}
+SPOT = {
+    "type": "spot",
+    "intensity": 4.0,
+    "cutoff_angle": 50,
+    "beam_width": 30,
+    "to_world": T().look_at([0.1, 0.3, 0.1], [-0.3, -0.5, -1], [0, 1, 0]),
+}
 SKY = {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.8, 1.1]}}
 SUN = {"type": "directional", "direction": [0.3, -1, -0.5], "irradiance": 3.0}
 
 
 MATTE = gray([0.7, 0.5, 0.3])
-ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx",
-         "specular_reflectance": 0.9}
+ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx", "specular_reflectance": 0.9}
 GLASS = {"type": "dielectric", "int_ior": 1.5}
 PLASTIC = {"type": "plastic", "diffuse_reflectance": 0.6}
-NEAR_LAMP = {"type": "sphere", "center": [0, 1.4, 0.6], "radius": 0.4, "bsdf": gray(0.0),
-             "emitter": {"type": "area", "radiance": 8.0}}
+NEAR_LAMP = {
+    "type": "sphere",
+    "center": [0, 1.4, 0.6],
+    "radius": 0.4,
+    "bsdf": gray(0.0),
+    "emitter": {"type": "area", "radiance": 8.0},
+}
 
 
 def inside(left, right=None):
     """Inside the wall with a ball lamp and one or two more balls, all well apart."""
-    scene = {"sensor": sensor(), "wall": WALL, "lamp": BALL_LAMP, "left": {
-        "type": "sphere", "center": [-0.35, -0.25, -0.25], "radius": 0.3, "bsdf": left}}
+    scene = {
+        "sensor": sensor(),
+        "wall": WALL,
+        "lamp": BALL_LAMP,
+        "left": {"type": "sphere", "center": [-0.35, -0.25, -0.25], "radius": 0.3, "bsdf": left},
+    }
     if right:
-        scene["right"] = {
-            "type": "sphere", "center": [0.3, -0.3, -0.2], "radius": 0.2, "bsdf": right}
+        scene["right"] = {"type": "sphere", "center": [0.3, -0.3, -0.2], "radius": 0.2, "bsdf": right}
     return scene
 
 
@@ -103,9 +135,13 @@ def outside():
 # come in lumps too rare for tile means to be normal; beside delta surfaces none is compared.
 SCENES = {
     "quad and disk lamps": (
-        {"sensor": sensor(), "wall": WALL, "lamp": QUAD_LAMP, "other": DISK_LAMP}, 5),
-    "glowing wall": ({"sensor": sensor(), "wall": WALL | {
-        "emitter": {"type": "area", "radiance": 0.5}}}, 5),
+        {"sensor": sensor(), "wall": WALL, "lamp": QUAD_LAMP, "other": DISK_LAMP},
+        5,
+    ),
+    "glowing wall": (
+        {"sensor": sensor(), "wall": WALL | {"emitter": {"type": "area", "radiance": 0.5}}},
+        5,
+    ),
     "spot": ({"sensor": sensor(), "wall": WALL, "lamp": SPOT}, 5),
     "point and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": POINT}, 5),
     "ball lamp and thin lens": ({"sensor": thinlens(), "wall": WALL, "lamp": BALL_LAMP}, 5),
@@ -128,9 +164,12 @@ def bdpt(**more):
 
 def renders(scene, integrator, spp, first_seed, seeds=SEEDS):
     """Tile means of ``seeds`` renders, (seeds, tiles, channels)."""
-    return np.stack([
-        st.tile_means(mi.render(scene, integrator=integrator, spp=spp, seed=first_seed + i), TILES)
-        for i in range(seeds)])
+    return np.stack(
+        [
+            st.tile_means(mi.render(scene, integrator=integrator, spp=spp, seed=first_seed + i), TILES)
+            for i in range(seeds)
+        ]
+    )
 
 
 def layers(tiles):
@@ -155,9 +194,10 @@ def path_lengths(name):
     `techniques`.
     """
     tiles = [0] + [
-        renders(load(name), mi.load_dict({"type": "path", "max_depth": k, "rr_depth": 100}), 64,
-                5000) @ CHANNELS
-        for k in range(1, DEPTH + 1)]
+        renders(load(name), mi.load_dict({"type": "path", "max_depth": k, "rr_depth": 100}), 64, 5000)
+        @ CHANNELS
+        for k in range(1, DEPTH + 1)
+    ]
     return {k: tiles[k] - tiles[k - 1] for k in range(1, DEPTH + 1)}
 
 
@@ -180,7 +220,8 @@ def unweighted_family(a, b, name):
         usable = [s for s in range(k + 1) if possible(name, k, s)]
         family += [
             st.compare_images(a[k, s, k + 1 - s][1], b[k, u, k + 1 - u][1], f"k={k} s={s} vs s={u}")
-            for s, u in zip(usable, usable[1:], strict=False)]
+            for s, u in zip(usable, usable[1:], strict=False)
+        ]
     return st.Comparisons.join(family)
 
 
@@ -199,8 +240,7 @@ def test_unweighted_strategies_agree(name):
     st.assert_agree(family, at_least=25)
 
 
-@pytest.mark.parametrize("name", [
-    name for name in SCENES if name not in ("glowing wall", "glass and metal")])
+@pytest.mark.parametrize("name", [name for name in SCENES if name not in ("glowing wall", "glass and metal")])
 def test_weighted_strategies_add_up_to_path(name):
     """Rationale: see the module. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
 
@@ -228,8 +268,7 @@ def test_glowing_wall_is_known():
     for k in range(1, DEPTH + 1):
         known = 0.5 * np.array([0.7, 0.5, 0.3]) ** (k - 1) @ CHANNELS
         family.append(st.compare_known(weighted_sum(images, k), known, f"k={k} weighted"))
-        family += [st.compare_known(images[k, s, k + 1 - s][1], known, f"k={k} s={s}")
-                   for s in range(k + 1)]
+        family += [st.compare_known(images[k, s, k + 1 - s][1], known, f"k={k} s={s}") for s in range(k + 1)]
     st.assert_agree(st.Comparisons.join(family), at_least=100)
 
 
@@ -260,8 +299,10 @@ def path_image(name):
 LONGER = ("three vertices", "impossible, power", "independent")  # each a variation of another
 
 
-@pytest.mark.parametrize("options", [
-    pytest.param(name, marks=[pytest.mark.slow] if name in LONGER else []) for name in OPTIONS])
+@pytest.mark.parametrize(
+    "options",
+    [pytest.param(name, marks=[pytest.mark.slow] if name in LONGER else []) for name in OPTIONS],
+)
 def test_images_agree_with_path(options):
     """Rationale: any heuristic, counts, coefficients and roulette leave the image's mean alone.
 
@@ -273,8 +314,7 @@ def test_images_agree_with_path(options):
     st.assert_agree(st.compare_images(ours, path_image(name)), at_least=16)
 
 
-@pytest.mark.parametrize("heuristic", [
-    "balance", pytest.param("maximum", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("heuristic", ["balance", pytest.param("maximum", marks=pytest.mark.slow)])
 def test_unweighted_strategies_ignore_counts_and_coefficients(heuristic):
     """Rationale: an unweighted layer is the strategy's own estimate, whatever the settings.
 
@@ -282,17 +322,26 @@ def test_unweighted_strategies_ignore_counts_and_coefficients(heuristic):
     with all of them. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
     """
     options = (("light_paths", 0.25), ("skip", "impossible"), ("heuristic", heuristic))
-    thinned = layers(renders(load("rough metal"), bdpt(strategy_images=True, **dict(options)), 64,
-                             11000))
+    thinned = layers(renders(load("rough metal"), bdpt(strategy_images=True, **dict(options)), 64, 11000))
     full = techniques("rough metal", 0)
-    family = [st.compare_images(thinned[key][1], full[key][1], f"s={key[1]} t={key[2]}")
-              for key in strategies(DEPTH)]
+    family = [
+        st.compare_images(thinned[key][1], full[key][1], f"s={key[1]} t={key[2]}")
+        for key in strategies(DEPTH)
+    ]
     st.assert_agree(st.Comparisons.join(family), at_least=100)
 
 
-@pytest.mark.parametrize("options", [
-    {}, {"light_paths": 0.25}, {"heuristic": "power"}, {"skip": "impossible"},
-    {"light_paths": 0}, {"connections": "none"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"light_paths": 0.25},
+        {"heuristic": "power"},
+        {"skip": "impossible"},
+        {"light_paths": 0},
+        {"connections": "none"},
+    ],
+)
 def test_weighted_layers_are_the_image(options):
     """Rationale: layers and image are two records of the same contributions.
 

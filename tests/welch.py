@@ -66,8 +66,10 @@ def welch(a, b, label="", labels=None) -> Comparisons:
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.maximum(np.abs(mean_a - mean_b) - floor, 0) / error
         dof = (var_a + var_b) ** 2 / (var_a**2 / (len(a) - 1) + var_b**2 / (len(b) - 1))
-        t, dof = np.where(error > 0, t, np.where(floor < np.abs(mean_a - mean_b), np.inf, 0)), (
-            np.where(np.isfinite(dof), dof, 1))
+        t, dof = (
+            np.where(error > 0, t, np.where(floor < np.abs(mean_a - mean_b), np.inf, 0)),
+            (np.where(np.isfinite(dof), dof, 1)),
+        )
     return _comparisons(a, b, t, dof, error > 10 * floor, label, labels, mean_a, mean_b, error)
 
 
@@ -79,19 +81,19 @@ def one_sample(a, expected, label="", labels=None) -> Comparisons:
     floor = ROUNDING * np.abs(expected)
     gap = np.abs(mean - expected)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(error > 0, np.maximum(gap - floor, 0) / error,
-                     np.where(gap > floor, np.inf, 0))
+        t = np.where(error > 0, np.maximum(gap - floor, 0) / error, np.where(gap > floor, np.inf, 0))
     always = np.ones_like(a)
-    return _comparisons(
-        a, always, t, len(a) - 1.0, error > 10 * floor, label, labels, mean, expected, error)
+    return _comparisons(a, always, t, len(a) - 1.0, error > 10 * floor, label, labels, mean, expected, error)
 
 
 def _comparisons(a, b, t, dof, noisy, label, labels, mean_a, mean_b, error):
     p = 2 * stats.t.sf(t, dof)
     common = np.maximum((a != 0).mean(0), (b != 0).mean(0)) >= 0.9
     names = labels or [f"tile {i}" for i in range(a.shape[1])]
-    text = [f"{label} {name}: {x:.6g} vs {y:.6g} +- {e:.2g}"
-            for name, x, y, e in zip(names, mean_a, mean_b, error, strict=True)]
+    text = [
+        f"{label} {name}: {x:.6g} vs {y:.6g} +- {e:.2g}"
+        for name, x, y, e in zip(names, mean_a, mean_b, error, strict=True)
+    ]
     return Comparisons(np.where(common, p, 1.0), text, noisy & common)
 
 

@@ -66,9 +66,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--integrator", metavar="TYPE", help=text)
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
     text = "value of a parameter $KEY of the scene; may be repeated"
-    add(
-        "-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text
-    )
+    add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
     text = "property of the integrator, such as skip=none; may be repeated"
     add(
         "-P",

@@ -56,6 +56,13 @@ def with_wi(si, wi):
     return other
 
 
+def _ask(bsdf, question, *args):
+    """All questions to a BSDF in one virtual call: its arguments go through memory."""
+    if isinstance(bsdf, mi.BSDF):
+        return question(bsdf, *args)
+    return dr.dispatch(bsdf, question, *args)
+
+
 def connectible(bsdf):
     """Mask: the BSDF has a lobe that is not delta."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -69,8 +76,7 @@ def evaluate(bsdf, si, wo, active) -> Evaluation:
         value, pdf_fwd = self.eval_pdf(ctx, si, wo, active)
         return value, pdf_fwd, self.pdf(ctx, with_wi(si, wo), si.wi, active)
 
-    # All questions in one virtual call: its arguments go through memory.
-    return Evaluation(*dr.dispatch(bsdf, ask, si, wo, active))
+    return Evaluation(*_ask(bsdf, ask, si, wo, active))
 
 
 def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
@@ -85,7 +91,7 @@ def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
         value, pdf_rev = self.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
         return value, self.pdf(ctx, si, wo, active), pdf_rev
 
-    value, pdf_fwd, pdf_rev = dr.dispatch(bsdf, ask, si, wo, active)
+    value, pdf_fwd, pdf_rev = _ask(bsdf, ask, si, wo, active)
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
     return Evaluation(value * cos_ratio, pdf_fwd, pdf_rev)
@@ -116,7 +122,7 @@ def sample(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -
             reversible = ~delta | back
         return bs, weight, pdf_fwd, pdf_rev, reversible
 
-    bs, weight, pdf_fwd, pdf_rev, reversible = dr.dispatch(bsdf, ask, si, u1, u2, active)
+    bs, weight, pdf_fwd, pdf_rev, reversible = _ask(bsdf, ask, si, u1, u2, active)
     step = _step(si, bs, weight, pdf_fwd, pdf_rev)
     if round_trip:  # no alternative that would have to make this event from the other side
         step.cos_out = dr.select(reversible, step.cos_out, 0)
@@ -127,8 +133,7 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
     """Continue a light subpath; the adjoint factor is part of ``weight``. Arguments as `sample`."""
 
     def ask(self, si, u1, u2, active):
-        bs, mitsuba_weight = self.sample(
-            mi.BSDFContext(mi.TransportMode.Importance), si, u1, u2, active)
+        bs, mitsuba_weight = self.sample(mi.BSDFContext(mi.TransportMode.Importance), si, u1, u2, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         smooth = active & ~delta
         ctx = mi.BSDFContext()
@@ -144,7 +149,7 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
         weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd)
         return bs, dr.select(valid, weight, 0), pdf_fwd, pdf_rev
 
-    bs, weight, pdf_fwd, pdf_rev = dr.dispatch(bsdf, ask, si, u1, u2, active)
+    bs, weight, pdf_fwd, pdf_rev = _ask(bsdf, ask, si, u1, u2, active)
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
     weight = dr.select(dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0, weight * cos_ratio, 0)
     return _step(si, bs, weight, pdf_fwd, pdf_rev)

@@ -1,8 +1,9 @@
 """One function per class of strategies: the path it builds, its contribution and its weight.
 
 All return a `Contribution`: the full *unweighted* estimate f / p of the strategy, divided by the
-class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone. Densities and cosines are geometric, throughputs contain
-everything up to and including the edge to the vertex. Equation numbers: Georgiev 2012, see `mis`.
+class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone.
+Densities and cosines are geometric, throughputs contain everything up to and including the edge to
+the vertex. Equation numbers: Georgiev 2012, see `mis`.
 """
 
 from __future__ import annotations
@@ -16,15 +17,14 @@ from . import bsdf, mis, rays
 from .points import Purpose
 from .subpath import Vertex, newest_coefficient
 
-
 # kappa of s = 0 and s = 1: a sample each per camera vertex.
 NEXT_EVENT = HIT = 1.0
 
 
 @dataclass
 class Contribution:
-    """``value`` unweighted estimate, ``weight`` in [0, 1], numbers of light vertices ``s`` and
-    camera vertices ``t``, ``active``."""
+    """``value`` unweighted estimate (a spectrum), ``weight`` in [0, 1], numbers of light vertices
+    ``s`` and camera vertices ``t``, ``active``."""
 
     value: object
     weight: object
@@ -107,7 +107,7 @@ def sees_emitter(kernel, z: Vertex):
 
 
 def hit_emitter(kernel, z: Vertex) -> Contribution:
-    """s = 0: the camera subpath has hit an emitter (eq. 44)."""
+    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43)."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
     active = sees_emitter(kernel, z)
@@ -128,7 +128,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
 
 
 def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
-    """s = 1: an emitter is sampled for the camera vertex (eqs. 42, 43)."""
+    """s = 1: an emitter is sampled for the camera vertex (eqs. 44, 45)."""
     h = kernel.heuristic
     k = z.edges + 1
     active = z.hit & (k <= kernel.max_depth) & bsdf.connectible(z.bsdf)
@@ -145,7 +145,10 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
     newest = newest_coefficient(kernel, kernel.coefficient_splat, z.edges)
     newest = dr.select(kernel.within_store(k), newest, 0)
     camera_side = mis.alternatives(
-        h, mis.Partial(z.partial.d_vcm, older), newest, f.pdf_rev,
+        h,
+        mis.Partial(z.partial.d_vcm, older),
+        newest,
+        f.pdf_rev,
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
     weight = h.weight(NEXT_EVENT, light_side, camera_side)
@@ -171,12 +174,9 @@ def join_endpoints(kernel, emission, stream, counters, active):
     if kernel.camera.delta:
         active &= ~emission.delta  # measure zero: `path` sees nothing either
     radiance = kernel.emitters.radiance_towards(emission, join.d, active)
-    cos = dr.select(
-        emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d))
-    )
+    cos = dr.select(emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d)))
     geometry = cos / join.dist2
-    value = radiance * (
-        geometry * join.importance / (emission.pdf_first * kernel.count_light))
+    value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
     active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
     # s = 0: the camera hits the same point.
     ratio = join.importance * geometry / emission.pdf_first
@@ -217,7 +217,8 @@ def splat(kernel, y: Vertex, stream, counters):
     weight = h.weight(kernel.coefficient_splat, light_side, mi.Float(0))
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
-    active, survival = _roulette(kernel, Contribution(value, weight, None, None, active).weighted(), u, active, counters)
+    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active)
+    active, survival = _roulette(kernel, c.weighted(), u, active, counters)
     counters.shadow_t1 += _one(active)
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
@@ -225,7 +226,7 @@ def splat(kernel, y: Vertex, stream, counters):
         active &= ~pi.is_valid()
     else:
         active &= ~rays.occluded(scene, ray, active)
-    c = Contribution(value / survival, weight, y.edges + 1, mi.UInt32(1), active)
+    c.value, c.active = value / survival, active
     return c, join.position
 
 
@@ -249,11 +250,19 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     nonzero = active & (_size(value) > 0)
 
     light_side = mis.alternatives(
-        h, y.partial, newest_coefficient(kernel, NEXT_EVENT, y.edges), f_y.pdf_rev,
-        f_z.pdf_fwd * cos_y / dist2)
+        h,
+        y.partial,
+        newest_coefficient(kernel, NEXT_EVENT, y.edges),
+        f_y.pdf_rev,
+        f_z.pdf_fwd * cos_y / dist2,
+    )
     camera_side = mis.alternatives(
-        h, z.partial, newest_coefficient(kernel, kernel.coefficient_splat, z.edges), f_z.pdf_rev,
-        f_y.pdf_fwd * cos_z / dist2)
+        h,
+        z.partial,
+        newest_coefficient(kernel, kernel.coefficient_splat, z.edges),
+        f_z.pdf_rev,
+        f_y.pdf_fwd * cos_z / dist2,
+    )
     weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, nonzero)
 
@@ -321,8 +330,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     active, survival = _roulette(kernel, value, u, active, counters)
     counters.shadow_inner += _one(active)
     si = path.si.read(target, active)
-    anchor = rays.Anchor(
-        si.p, si.n, path.anchor.read(target, active), kernel.quadrics.ends(si.shape, active))
+    anchor = rays.Anchor(si.p, si.n, path.anchor.read(target, active), kernel.quadrics.ends(si.shape, active))
     active &= ~rays.occluded(kernel.scene, rays.segment(z.anchor, anchor, z.si), active)
     return dr.select(active, value / survival, 0)
 

@@ -110,9 +110,7 @@ def kernel_cache() -> Finding:
             return Finding("ok", "kernel cache", f"{folder} is writable")
     except OSError as error:
         text = f"{folder} is not writable ({error.strerror}): every process compiles anew. "
-        return Finding(
-            "note", "kernel cache", text + "Set DRJIT_CACHE_DIR to a writable directory."
-        )
+        return Finding("note", "kernel cache", text + "Set DRJIT_CACHE_DIR to a writable directory.")
 
 
 def render_in_child(

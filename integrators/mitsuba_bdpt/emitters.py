@@ -43,7 +43,7 @@ class Emission:
     """Start of a light subpath; all fields have the width of the lanes.
 
     ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start
-    of the ray; ``p``, ``n`` position and geometric normal of y_0 (``n`` zero unless on a surface);
+    of the ray, with position and geometric normal of y_0 (zero unless on a surface);
     ``cos`` geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the module;
     ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``index`` of the emitter;
     ``si`` the emitting point for Mitsuba's calls.
@@ -66,8 +66,8 @@ class Direct:
     """A sample of next-event estimation: y_0 for a given camera vertex.
 
     ``weight`` radiance / ``pdf``; ``pdf`` solid angle at the camera vertex with the selection, or
-    the selection alone where ``delta``; ``d`` unit direction to the emitter; ``ray`` the visibility
-    ray's far end is ``anchor`` (unused where ``infinite``); ``emission_ratio`` is
+    the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
+    the visibility ray (unused where ``infinite``); ``emission_ratio`` is
     pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
     geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
     """
@@ -104,8 +104,10 @@ class Emitters:
         sampling_weight = self._pointers.sampling_weight()
         pmf = sampling_weight / dr.sum(sampling_weight)
         area = mi.Float(
-            [dr.slice(e.get_shape().surface_area()) if k == AREA else 1.0
-             for e, k in zip(emitters, kinds, strict=True)]
+            [
+                dr.slice(e.get_shape().surface_area()) if k == AREA else 1.0
+                for e, k in zip(emitters, kinds, strict=True)
+            ]
         )
         frames = [_frame(e, k) for e, k in zip(emitters, kinds, strict=True)]
         columns = list(zip(*frames, strict=True))
@@ -116,8 +118,10 @@ class Emitters:
         self._pmf = pmf
         self._inv_area = dr.rcp(area)
         self._table = [mi.Float([float(x) for x in column]) for column in columns]
-        textured = [k == AREA and mi.has_flag(e.flags(), mi.EmitterFlags.SpatiallyVarying)
-                    for e, k in zip(emitters, kinds, strict=True)]
+        textured = [
+            k == AREA and mi.has_flag(e.flags(), mi.EmitterFlags.SpatiallyVarying)
+            for e, k in zip(emitters, kinds, strict=True)
+        ]
         self._any_textured = any(textured)
         self._textured = mi.Bool(textured)
         self._inverse = _inverse_table(self._pointers)
@@ -125,8 +129,9 @@ class Emitters:
         self._inward_spheres = any(frame[14] > 0 for frame in frames)
         self.center = mi.Point3f(sphere.center)
         self.radius = mi.Float(radius)
-        dr.make_opaque(self._kind, self._pmf, self._inv_area, self._table, self._inverse,
-                       self.center, self.radius)
+        dr.make_opaque(
+            self._kind, self._pmf, self._inv_area, self._table, self._inverse, self.center, self.radius
+        )
 
     # -- tables -----------------------------------------------------------------------------
 
@@ -247,8 +252,11 @@ class Emitters:
         p = mi.Point3f(*column[9:12])
         cos_cutoff = column[13]
         local = mi.warp.square_to_uniform_cone(u_direction, cos_cutoff)
-        d = (mi.Vector3f(*column[0:3]) * local.x + mi.Vector3f(*column[3:6]) * local.y
-             + mi.Vector3f(*column[6:9]) * local.z)
+        d = (
+            mi.Vector3f(*column[0:3]) * local.x
+            + mi.Vector3f(*column[3:6]) * local.y
+            + mi.Vector3f(*column[6:9]) * local.z
+        )
         intensity = self._intensity(emitter, p, d, like, active)
         pdf_second = column[12]
         si = dr.zeros(mi.SurfaceInteraction3f)
@@ -309,7 +317,11 @@ class Emitters:
         pmf = self._probability(emission.index, active)
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p, ds.n, ds.uv, ds.time = (
-            emission.si.p, emission.anchor.n, emission.si.uv, emission.si.time)
+            emission.si.p,
+            emission.anchor.n,
+            emission.si.uv,
+            emission.si.time,
+        )
         ds.d = -emission.d
         ds.dist = dr.norm(emission.si.p - si.p)
         ds.emitter = emitter
@@ -331,8 +343,7 @@ class Emitters:
             value = dr.select(mask, emitter.eval(si, mask), value)
         if self.kinds & {POINT, SPOT}:
             mask = self._is(emission.index, active, POINT, SPOT)
-            value = dr.select(
-                mask, self._intensity(emitter, emission.si.p, d, emission.si, mask), value)
+            value = dr.select(mask, self._intensity(emitter, emission.si.p, d, emission.si, mask), value)
         if INFINITE in self.kinds:
             mask = self._is(emission.index, active, INFINITE)
             si = mi.SurfaceInteraction3f(emission.si)
@@ -356,8 +367,7 @@ class Emitters:
         area = self._is(index, active, AREA)
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
         delta = self._is(index, active, POINT, SPOT, DIRECTIONAL)
-        on_surface = area
-        n = dr.select(on_surface, self.geometric_normal(ds, index, u, area), 0)
+        n = dr.select(area, self.geometric_normal(ds, index, u, area), 0)
         cos_shading = dr.dot(ds.n, -ds.d)
         cos = dr.abs(dr.dot(n, ds.d))
         # Mitsuba divides by the shading normal's cosine; the measure is the geometric one.
@@ -454,8 +464,11 @@ def _frame(emitter, kind):
     elif kind == SPOT:
         params = mi.traverse(emitter)
         to_world = params["to_world"]
-        axes = [x for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-                for x in dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))]
+        axes = [
+            x
+            for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+            for x in dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
+        ]
         p = dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
         cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
         density = 1 / (2 * dr.pi * (1 - cos_cutoff))

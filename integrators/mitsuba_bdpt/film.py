@@ -1,4 +1,4 @@
-"""Two raw accumulators, and how they become the film.
+"""Raw accumulators, and how they become the film.
 
 Camera samples go into one block with Mitsuba's filter weights W, splats (t = 1) into another. The
 weight that a splat must be divided by is analytic, W' = spp * integral of the filter over the region
@@ -44,8 +44,13 @@ class Accumulator:
 
     def _block(self, channels: int, height: int | None = None):
         return mi.ImageBlock(
-            [self.size[0], height or self.size[1]], self.offset, channels, rfilter=self.rfilter,
-            border=False, normalize=False, coalesce=False,
+            [self.size[0], height or self.size[1]],
+            self.offset,
+            channels,
+            rfilter=self.rfilter,
+            border=False,
+            normalize=False,
+            coalesce=False,
         )
 
     def put_camera(self, position, rgb, alpha, active):
@@ -86,8 +91,8 @@ class Accumulator:
     def mean(self, spp: int) -> float:
         """Mean of the image so far (largest channel), for the scale of roulette."""
         camera, light = (
-            np.array(s).reshape(-1, b.channel_count()) for s, b in
-            zip(self._sums[:2], (self.camera, self.light), strict=True)
+            np.array(s).reshape(-1, b.channel_count())
+            for s, b in zip(self._sums[:2], (self.camera, self.light), strict=True)
         )
         weight = max(camera[:, self.channels - 1].sum(), 1e-30)
         splat_weight = max(self._splat_weight(spp).sum(), 1e-30)
@@ -116,9 +121,7 @@ class Accumulator:
         w, h = self.size
         if spp == 0:
             return
-        camera, light = (
-            np.array(s).reshape(h, w, -1) for s in self._sums[:2]
-        )
+        camera, light = (np.array(s).reshape(h, w, -1) for s in self._sums[:2])
         camera = camera[..., : self.channels]
         to_film = camera[..., -1:] / self._splat_weight(spp)[..., None]
         camera[..., :3] += light[..., :3] * to_film
@@ -130,4 +133,3 @@ class Accumulator:
         values = np.concatenate(layers, axis=-1).astype(np.float32)
         block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
         self.film.put_block(block)
-

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from dataclasses import asdict, dataclass
 
@@ -14,7 +15,7 @@ from .emitters import Emitters
 from .film import Accumulator
 from .kernel import CONNECTIONS as CONNECTION_COUNTS
 from .kernel import RAYS, Batch, Kernel, trace
-from .plan import CONNECTIONS, LIGHT_PATHS, SKIP, UNLIMITED, Settings, plan, scene_bsdfs
+from .plan import CONNECTIONS, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings, plan, scene_bsdfs
 from .sensors import Camera
 from .strategies import strategy_count, strategy_names
 
@@ -98,12 +99,13 @@ emitters other than ``area``, ``point``, ``spot``, ``directional``, ``constant``
 """
 
 
-def _integer(props, name, default, low):
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or value != int(value):
+def _integer(value, name, low, high=UNLIMITED):
+    """``value`` as an int within [low, high]; raises ``TypeError`` and ``ValueError``."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or value != int(value):
         raise TypeError(f"bdpt: {name}={value!r} must be an integer")
-    if value < low:
-        raise ValueError(f"bdpt: {name}={value!r} must be {low} or greater")
+    if not low <= value <= high:
+        raise ValueError(f"bdpt: {name}={value!r} must be between {low} and {high}")
     return int(value)
 
 
@@ -125,6 +127,8 @@ def _light_paths(props):
     value = props.get("light_paths", "auto")
     if value == "auto":
         return value
+    if isinstance(value, bool):
+        raise TypeError(f"bdpt: light_paths={value!r} must be a number or 'auto'")
     try:
         if isinstance(value, str):
             top, _, bottom = value.partition("/")
@@ -135,34 +139,40 @@ def _light_paths(props):
         number = None
     if number not in LIGHT_PATHS:
         raise ValueError(
-            f"bdpt: light_paths={value!r} is not possible; use auto, 0, 1, 1/2, 1/4, 1/8 or 1/16")
+            f"bdpt: light_paths={value!r} is not possible; use auto, 0, 1, 1/2, 1/4, 1/8 or 1/16"
+        )
     return number
 
 
 def read_settings(props) -> Settings:
     """Read and check the plugin's parameters; raises ``TypeError`` and ``ValueError``."""
-    max_depth = _integer(props, "max_depth", -1, -1)
+    if "samples_per_pass" in props:
+        raise ValueError(
+            f"bdpt: samples_per_pass={props['samples_per_pass']!r} is deprecated in Mitsuba; use spp_per_pass"
+        )
+    max_depth = _integer(props.get("max_depth", -1), "max_depth", -1)
     timeout = props.get("timeout", -1.0)
     if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or timeout != timeout:
         raise TypeError(f"bdpt: timeout={timeout!r} must be a number of seconds, or -1 for none")
     settings = Settings(
         max_depth=UNLIMITED if max_depth < 0 else max_depth,
-        rr_depth=_integer(props, "rr_depth", 5, 1),
+        rr_depth=_integer(props.get("rr_depth", 5), "rr_depth", 1),
         hide_emitters=_boolean(props, "hide_emitters"),
         heuristic=_choice(props, "heuristic", mis.HEURISTICS),
         skip=_choice(props, "skip", SKIP),
         light_paths=_light_paths(props),
         connections=_choice(props, "connections", CONNECTIONS),
         points=_choice(props, "points", points.POINTS),
-        stored_vertices=_integer(props, "stored_vertices", 64, 1),
+        stored_vertices=_integer(props.get("stored_vertices", 64), "stored_vertices", 1, MAX_STORED),
         strategy_images=_boolean(props, "strategy_images"),
-        spp_per_pass=_integer(props, "spp_per_pass", 0, 0),
+        spp_per_pass=_integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
         timeout=float(timeout),
     )
     if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
         raise ValueError(
             f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
-            "set max_depth, for example to 5")
+            "set max_depth, for example to 5"
+        )
     return settings
 
 
@@ -172,20 +182,28 @@ def check_variant():
     if not variant.startswith(("llvm", "cuda")):
         raise NotImplementedError(
             f"bdpt: the variant {variant} is scalar; use a vectorised one, for example "
-            "mi.set_variant('llvm_ad_rgb')")
+            "mi.set_variant('llvm_ad_rgb')"
+        )
     if mi.is_polarized:
         raise NotImplementedError(
             f"bdpt: the variant {variant} is polarized, which is not supported; use "
-            f"{variant.replace('_polarized', '')}")
+            f"{variant.replace('_polarized', '')}"
+        )
 
 
-def check_scene(scene):
+def check_scene(scene, sensor):
     """Raise ``NotImplementedError`` for what the method cannot render."""
+    if sensor.get_medium() is not None:
+        raise NotImplementedError(
+            f"bdpt: sensor '{sensor.id()}' lies in a participating medium, which is not supported; "
+            "use integrator type 'volpath'"
+        )
     for shape in scene.shapes():
         if shape.is_medium_transition():
             raise NotImplementedError(
                 f"bdpt: shape '{shape.id()}' bounds a participating medium, which is not supported; "
-                "use integrator type 'volpath'")
+                "use integrator type 'volpath'"
+            )
 
 
 def pass_sizes(pixels: int, spp: int, settings: Settings) -> list[int]:
@@ -194,7 +212,8 @@ def pass_sizes(pixels: int, spp: int, settings: Settings) -> list[int]:
     A first pass of one sample gives roulette the scale of the image.
     """
     limit = PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
-    size = settings.spp_per_pass or max(limit // max(pixels, 1), 1)
+    # At most what one row of pixels can have in one launch, see `batches`.
+    size = min(settings.spp_per_pass or max(limit // max(pixels, 1), 1), limit)
     sizes = []
     if settings.points == "sampler":
         # Stratified samplers number the samples of a pixel; passes must cut them evenly.
@@ -208,11 +227,13 @@ def batches(camera: Camera, first_sample: int, samples: int, settings: Settings)
     """Cut a pass into bands of rows that one kernel launch can take."""
     limit = PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
     width, height = (int(x) for x in camera.region)
-    rows = height if settings.spp_per_pass == 0 and width * height * samples <= limit else max(
-        1, min(height, 4 * limit // max(width * samples, 1)))
+    rows = (
+        height
+        if settings.spp_per_pass == 0 and width * height * samples <= limit
+        else max(1, min(height, 4 * limit // max(width * samples, 1)))
+    )
     return [
-        Batch(y * width, min(rows, height - y) * width, first_sample, samples)
-        for y in range(0, height, rows)
+        Batch(y * width, min(rows, height - y) * width, first_sample, samples) for y in range(0, height, rows)
     ]
 
 
@@ -221,25 +242,28 @@ class Render:
 
     def __init__(self, scene, sensor, settings: Settings, seed):
         check_variant()
-        check_scene(scene)
+        check_scene(scene, sensor)
         self.started = time.perf_counter()
         self.scene, self.sensor, self.settings = scene, sensor, settings
         self.film = sensor.film()
         if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
             raise NotImplementedError(
                 f"bdpt: film '{self.film.id()}' of class {self.film.class_name()} is not supported; "
-                "use hdrfilm")
+                "use hdrfilm"
+            )
         self.camera = Camera(sensor)
         self.emitters = Emitters(scene)
         self.plan = plan(scene, self.emitters, self.camera, settings)
+        if not isinstance(seed, mi.UInt32):
+            seed = _integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)
         dr.make_opaque(self.seed)
         depth = settings.max_depth if settings.strategy_images else 0
         _check_strategy_memory(depth, self.film)
         self.accumulator = Accumulator(self.film, self.camera.border, depth)
         self.kernel = Kernel(
-            scene, self.camera, self.emitters, self.plan, settings,
-            mis.Heuristic(settings.heuristic))
+            scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
+        )
         self.passes, self.compiled, self.cached, self.compile_seconds = [], 0, 0, 0.0
 
     def run(self, spp: int, on_pass):
@@ -275,7 +299,8 @@ class Render:
             sampler.set_samples_per_wavefront(batch.samples)
             sampler.seed(
                 mi.sample_tea_32(self.seed, mi.UInt32(batch.first_pixel))[0],
-                batch.pixels * batch.samples)
+                batch.pixels * batch.samples,
+            )
             for _ in range(number):
                 sampler.advance()
         return points.Points(self.settings.points, self.seed, sampler)
@@ -297,20 +322,22 @@ class Render:
         """Progress so far, for ``on_pass``."""
         counts = self.kernel.counts
         return PassReport(
-            sum(self.passes), spp, time.perf_counter() - self.started,
-            int(counts[: len(RAYS)].sum()))
+            sum(self.passes), spp, time.perf_counter() - self.started, int(counts[: len(RAYS)].sum())
+        )
 
     def statistics(self) -> dict:
         """The render in numbers; plain values only."""
         counts = [int(x) for x in self.kernel.counts]
         rays = dict(zip(RAYS, counts, strict=False))
-        connections = dict(zip(CONNECTION_COUNTS, counts[len(RAYS):], strict=False))
+        connections = dict(zip(CONNECTION_COUNTS, counts[len(RAYS) :], strict=False))
         connections["traced"] = rays["shadow_inner"]
         total = time.perf_counter() - self.started
         return {
             "seconds": {
-                "compile": self.compile_seconds, "pilot": 0.0,
-                "render": total - self.compile_seconds, "total": total,
+                "compile": self.compile_seconds,
+                "pilot": 0.0,
+                "render": total - self.compile_seconds,
+                "total": total,
             },
             "rays": rays,
             "connections": connections,
@@ -331,7 +358,8 @@ def _check_strategy_memory(depth: int, film):
         raise ValueError(
             f"bdpt: strategy_images at {w}x{h} with max_depth={depth} needs about "
             f"{needed / 2**30:.1f} GiB, more than {STRATEGY_MEMORY / 2**30:.0f} GiB; use a smaller "
-            "film or max_depth")
+            "film or max_depth"
+        )
 
 
 def _make_class():
@@ -382,6 +410,12 @@ def _make_class():
                 dr.sync_thread()
             return result
 
+        def sample(self, *args, **kwargs):
+            raise NotImplementedError(
+                "bdpt: cannot be nested in another integrator (aov, moment, stokes): light subpaths "
+                "reach pixels other than their own; render with bdpt itself"
+            )
+
         def render_forward(self, *args, **kwargs):
             raise NotImplementedError(NO_DERIVATIVES)
 
@@ -390,6 +424,8 @@ def _make_class():
 
         def explain(self, scene, sensor=0, spp=None):
             """What will be done for ``scene`` and what is skipped, and why, as text."""
+            if spp is not None:
+                _integer(spp, "spp", 0)  # no pilot yet: the decisions do not depend on it
             return explain(scene, _resolve(scene, sensor), self.settings)
 
         def to_string(self):
@@ -402,60 +438,78 @@ def _make_class():
 
 NO_DERIVATIVES = (
     "bdpt: derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
-    "and render_backward")
+    "and render_backward"
+)
 
 
 def explain(scene, sensor, settings: Settings) -> str:
     """Text about the strategies in use for ``scene`` and those that are skipped."""
     check_variant()
-    check_scene(scene)
+    check_scene(scene, sensor)
     emitters, camera = Emitters(scene), Camera(sensor)
     p = plan(scene, emitters, camera, settings)
-    used = [name for name, on in (
-        ("s=0 (camera subpath hits an emitter)", p.hit),
-        ("s=1 (next-event estimation)", p.direct),
-        ("t=1 (light vertex seen by the sensor)", p.splat),
-        ("(1,1) (emitter point seen by the sensor)", p.endpoints),
-        (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
-    ) if on]
-    lines = [f"heuristic {settings.heuristic}, one light subpath per {p.served} camera subpaths"
-             if p.light else f"heuristic {settings.heuristic}, no light subpaths"]
+    used = [
+        name
+        for name, on in (
+            ("s=0 (camera subpath hits an emitter)", p.hit),
+            ("s=1 (next-event estimation)", p.direct),
+            ("t=1 (light vertex seen by the sensor)", p.splat),
+            ("(1,1) (emitter point seen by the sensor)", p.endpoints),
+            (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
+        )
+        if on
+    ]
+    lines = [
+        f"heuristic {settings.heuristic}, one light subpath per {p.served} camera subpaths"
+        if p.light
+        else f"heuristic {settings.heuristic}, no light subpaths"
+    ]
     lines += [f"used: {name}" for name in used]
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
-    lines += [f"lost: {text}" for text in lost_paths(scene, emitters, p)]
+    lines += [f"lost: {text}" for text in lost_paths(scene, emitters, p, settings)]
     return "\n".join(lines)
 
 
-def lost_paths(scene, emitters: Emitters, p) -> list[str]:
-    """Paths that no strategy in use can make."""
+def lost_paths(scene, emitters: Emitters, p, settings: Settings) -> list[str]:
+    """Paths that no strategy in use can make, one text each."""
     deltas = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in scene_bsdfs(scene))
+    if not (deltas and emitters.delta):
+        return []
     lost = []
-    if not deltas:
-        return lost
-    if emitters.delta and not (p.splat and p.connections != "none"):
-        lost.append("light of delta emitters that meets a delta surface first, as far as it needs "
-                    "t=1 or inner connections")
-    if emitters.delta:
-        lost.append("light of delta emitters seen through delta surfaces only on both sides of a "
-                    "single diffuse vertex (s=2 and t=2 cannot be joined across a delta vertex)")
+    if not p.splat:
+        lost.append("delta emitter, delta surfaces, a surface that the sensor sees (needs t=1)")
+    if p.connections == "none":
+        lost.append(
+            "delta emitter, delta surfaces, two other surfaces or more, delta surfaces, sensor "
+            "(needs inner connections)"
+        )
+    lost.append(
+        "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
+        "neighbours can be joined)"
+    )
+    if p.light and settings.stored_vertices < settings.max_depth:
+        lost.append(
+            "delta emitter, delta surface, ... on paths longer than "
+            f"{settings.stored_vertices} edges (stored_vertices)"
+        )
     return lost
 
 
 def _resolve(scene, sensor):
-    if not isinstance(sensor, int):
+    if isinstance(sensor, mi.Sensor):
         return sensor
+    if isinstance(sensor, bool) or not isinstance(sensor, int):
+        raise TypeError(f"bdpt: sensor={sensor!r} must be an index or a sensor")
     sensors = scene.sensors()
     if not sensors:
         raise ValueError("bdpt: the scene has no sensor; add one, for example of type perspective")
     if not 0 <= sensor < len(sensors):
-        raise ValueError(
-            f"bdpt: sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
+        raise ValueError(f"bdpt: sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
     return sensors[sensor]
 
 
 def _samples(sensor, spp, settings) -> int:
-    if spp < 0:
-        raise ValueError(f"bdpt: spp={spp} must be 0 (the sampler's sample_count) or greater")
+    spp = _integer(spp, "spp", 0)  # 0: the sampler's sample_count
     if settings.points != "sampler":
         return int(spp or sensor.sampler().sample_count())
     sampler = sensor.sampler().clone()
@@ -466,9 +520,11 @@ def _samples(sensor, spp, settings) -> int:
 
 def _log(statistics: dict):
     seconds = statistics["seconds"]
-    mi.Log(mi.LogLevel.Info, "bdpt: %d spp in %.2f s (compile %.2f s); %s" % (
-        sum(statistics["passes"]), seconds["total"], seconds["compile"],
-        json.dumps(statistics["rays"])))
+    mi.Log(
+        mi.LogLevel.Info,
+        f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
+        f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
+    )
 
 
 _classes = {}

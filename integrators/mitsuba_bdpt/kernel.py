@@ -1,24 +1,28 @@
-"""One pass as one kernel.
+"""One batch (a pass, or a band of its rows) as one kernel.
 
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
 subpaths that it serves, in S distant pixels; all strategies of a pair are evaluated by that lane.
-Nothing per lane lives in global memory: the footprint does not grow with samples or image size.
+Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples or
+image size.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log2
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from . import bsdf, connect, mis, rays
-from .plan import UNLIMITED, scene_bsdfs
+from .plan import MAX_STORED, UNLIMITED, scene_bsdfs
 from .points import Purpose
 from .subpath import Side, Walk, random_walk
 
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
+# Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
+STORE_SIZES = (64, MAX_STORED)
 CONNECTIONS = ("evaluated", "zero", "rouletted")
 
 
@@ -68,7 +72,7 @@ class Kernel:
         self.round_trip = bsdf.needs_round_trip(scene_bsdfs(scene))
         depth = min(settings.max_depth, UNLIMITED)
         reach = min(depth, settings.stored_vertices)
-        self.store_size = max(reach - 2, 1)
+        self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
         self.strategy_images = settings.strategy_images
         count = 1 / plan.served if plan.light else 0.0
         inner = 1.0 if plan.connections != "none" else 0.0
@@ -94,7 +98,7 @@ class Kernel:
     def set_threshold(self, mean: float):
         """Contributions below a tenth of the image's mean play roulette (a power of two, so that
         the order of atomic sums rarely changes a decision)."""
-        rounded = 2.0 ** round(_log2(0.1 * mean)) if mean > 0 else 0.0
+        rounded = 2.0 ** round(log2(0.1 * mean)) if mean > 0 else 0.0
         self.inverse_threshold = dr.opaque(mi.Float, 1 / rounded if rounded > 0 else dr.inf)
 
     def to_rgb(self, value, wavelengths):
@@ -183,7 +187,8 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
     e = emitters.sample_emission(
         points.draw_2d("light", stream, Purpose.EMISSION_POINT),
         points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
-        shared, mi.Bool(True),
+        shared,
+        mi.Bool(True),
     )
     if kernel.plan.endpoints:
         c, position = connect.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
@@ -196,8 +201,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         ray=ray,
         previous=mi.Point3f(e.si.p),
         throughput=mi.Spectrum(e.weight),
-        partial=mis.Partial(
-            h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse))),
+        partial=mis.Partial(h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse))),
         reference=dr.max(mi.unpolarized_spectrum(e.weight)),
         eta=mi.Float(1),
         edges=mi.UInt32(1),
@@ -205,7 +209,10 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         active=active,
     )
     side = Side(
-        "light", True, kernel.last_light, connect.NEXT_EVENT,
+        "light",
+        True,
+        kernel.last_light,
+        connect.NEXT_EVENT,
         complete=lambda si, first: emitters.connection_density(e, si, first),
     )
 
@@ -218,8 +225,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
             connect.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    (path, counters), _, traced = random_walk(
-        kernel, side, walk, stream, visit, (path, counters))
+    (path, counters), _, traced = random_walk(kernel, side, walk, stream, visit, (path, counters))
     counters.light += dr.select(active, traced, 0)
     return path, counters
 
@@ -235,8 +241,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
     active = active & (kernel.max_depth >= 1)
     ray = start.ray
     if plan.hide_emitters:
-        pi, ray = rays.intersect_past_emitters(
-            kernel.scene, kernel.quadrics, ray, active, coherent=True)
+        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.quadrics, ray, active, coherent=True)
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     walk = Walk(
@@ -254,7 +259,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
 
     def add(c, total):
         if kernel.strategy_images:
-            _deposit_strategy(kernel, film, c, start.pixel, shared)
+            _deposit_strategy(kernel, film, c, start.position, shared)
         return total + c.weighted()
 
     def visit(z, stream, state):
@@ -278,8 +283,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
 
     side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat)
     state = (dr.zeros(mi.Spectrum), counters)
-    (radiance, counters), seen, traced = random_walk(
-        kernel, side, walk, stream, visit, state)
+    (radiance, counters), seen, traced = random_walk(kernel, side, walk, stream, visit, state)
     counters.camera += dr.select(active, traced, 0)
     rgb = kernel.to_rgb(radiance, shared.wavelengths)
     finite = dr.all(dr.isfinite(rgb))
@@ -288,8 +292,11 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
     if not plan.hide_emitters and kernel.scene.environment() is not None:
         opaque = mi.Bool(True)  # `path`: a visible environment covers the image
     film.put_camera(
-        start.pixel, dr.select(finite, rgb, 0), dr.select(opaque, mi.Float(1), mi.Float(0)),
-        active if kernel.plan.served > 1 else mi.Bool(True))
+        start.position,
+        dr.select(finite, rgb, 0),
+        dr.select(opaque, mi.Float(1), mi.Float(0)),
+        active if kernel.plan.served > 1 else mi.Bool(True),
+    )
     return counters
 
 
@@ -317,14 +324,9 @@ def _record(kernel, counters: Counters):
     kernel.batch_counts = dr.zeros(mi.UInt32, len(values))
     for i, value in enumerate(values):
         dr.scatter_reduce(
-            dr.ReduceOp.Add, kernel.batch_counts, value, mi.UInt32(i), mode=dr.ReduceMode.Expand)
+            dr.ReduceOp.Add, kernel.batch_counts, value, mi.UInt32(i), mode=dr.ReduceMode.Expand
+        )
 
 
 def _opaque(kind):
     return lambda value: dr.opaque(kind, value)
-
-
-def _log2(x: float) -> float:
-    from math import log2
-
-    return log2(x)

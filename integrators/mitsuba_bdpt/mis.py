@@ -79,7 +79,7 @@ class Heuristic:
         """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
 
         ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
-        alternatives with fewer and with more light vertices (eqs. 37 and 38).
+        alternatives with fewer and with more light vertices (eq. 37).
         """
         if self.name == "maximum":
             # Of equal ones, that with the fewest light vertices counts. Rounding must not decide:
@@ -95,7 +95,7 @@ class Heuristic:
 
 
 def arrive(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
-    """Convert to the area measure at a new vertex (eqs. 31-34).
+    """Convert to the area measure at a new vertex (the part of eqs. 31-35 that is known at the hit).
 
     ``dist2`` squared length of the edge (1 where the edge keeps another measure: the first edge
     from an emitter at infinity), ``cos`` absolute geometric cosine at the new vertex.
@@ -107,7 +107,7 @@ def arrive(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
 
 
 def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partial:
-    """Fold the newest alternative and take a sampled direction (eqs. 35, 36, 53, 54).
+    """Fold the newest alternative and take a sampled direction (eqs. 34, 35; delta events 53, 54).
 
     ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
     ``pdf_fwd`` and ``pdf_rev`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``.
@@ -130,7 +130,7 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
 
 
 def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev, density):
-    """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40-47).
+    """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40, 41, 44-47).
 
     ``coefficient`` of the newest alternative's class; ``pdf_rev`` solid-angle density of sampling
     the vertex before the last from the last; ``density`` of making the last vertex from the other

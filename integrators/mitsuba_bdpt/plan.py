@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import mitsuba as mi
 
-from . import bsdf
-
 UNLIMITED = 2**32 - 1
+
+# Most light vertices per lane (a lane's local memory lies on a thread's stack).
+MAX_STORED = 1024
 
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
 CONNECTIONS = ("auto", "all", "one", "none")
@@ -85,8 +86,9 @@ def plan(scene, emitters, camera, settings: Settings) -> Plan:
     if endpoints and settings.hide_emitters:
         endpoints = skip("(1,1)", "impossible", "hide_emitters: emitters are not seen directly")
     elif endpoints and camera.delta and not emitters.hittable:
-        endpoints = skip("(1,1)", "impossible",
-                         "delta emitters are not seen by a sensor without area (measure zero)")
+        endpoints = skip(
+            "(1,1)", "impossible", "delta emitters are not seen by a sensor without area (measure zero)"
+        )
 
     light_paths, connections = _defaults(settings)
     if light_paths == 0:
@@ -94,11 +96,17 @@ def plan(scene, emitters, camera, settings: Settings) -> Plan:
         skip("t=1, (1,1), inner", "by hand", "light_paths=0")
     if inner and connections == "none":
         inner = skip("inner", "by hand", "connections=none")
-    if depth != UNLIMITED and settings.stored_vertices < depth or depth == UNLIMITED:
-        skip(f"t=1, (1,1), inner for paths longer than {settings.stored_vertices} edges",
-             "by hand", f"stored_vertices={settings.stored_vertices}: such paths use s=0 and s=1")
+    if light_paths and settings.stored_vertices < depth:
+        skip(
+            f"t=1 and inner for paths longer than {settings.stored_vertices} edges",
+            "worthless now",
+            f"stored_vertices={settings.stored_vertices}: such paths use s=0 and s=1",
+        )
     return Plan(
-        hit=hit, direct=direct, splat=splat, endpoints=endpoints,
+        hit=hit,
+        direct=direct,
+        splat=splat,
+        endpoints=endpoints,
         connections=connections if inner else "none",
         served=round(1 / light_paths) if light_paths else 1,
         splat_coefficient=1.0 if settings.skip == "none" else 0.25,

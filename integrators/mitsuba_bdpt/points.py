@@ -106,8 +106,7 @@ class Points:
         self._table = None
         if kind == "sampler":
             self._table = [
-                sampler.next_1d() if dims == 1 else sampler.next_2d()
-                for _, _, _, dims in _SAMPLER_TABLE
+                sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in _SAMPLER_TABLE
             ]
             dr.eval(self._table)
 
@@ -123,9 +122,7 @@ class Points:
         rng = mi.PCG32(1, state, mi.UInt64(low) << 32 | mi.UInt64(seed))
         first = {}
         if self._table is not None:
-            for (owner, purpose, vertex, dims), values in zip(
-                _SAMPLER_TABLE, self._table, strict=True
-            ):
+            for (owner, purpose, vertex, dims), values in zip(_SAMPLER_TABLE, self._table, strict=True):
                 if owner == side:
                     kind = mi.Float if dims == 1 else mi.Point2f
                     first[f"{purpose.name}{vertex}"] = dr.gather(kind, values, slot)

@@ -69,9 +69,7 @@ def run(options: Namespace) -> int:
 def prepare_output(output: Path) -> None:
     """Refuse an `output` that cannot be written in the end; create its directory."""
     if output.suffix.lower() != ".exr":
-        raise ValueError(
-            f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."
-        )
+        raise ValueError(f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case.")
     for path in (output, output.with_suffix(".png")):
         if not path.exists():
             continue
@@ -150,9 +148,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
         if hasattr(integrator, "on_pass"):
             integrator.on_pass = draw
         try:
-            integrator.render(
-                scene, options.sensor, options.seed, spp, develop=False, evaluate=True
-            )
+            integrator.render(scene, options.sensor, options.seed, spp, develop=False, evaluate=True)
             dr.sync_thread()
         except KeyboardInterrupt:
             interrupted = True
@@ -219,9 +215,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def write_images(
-    film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float
-) -> None:
+def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
     """Write the film as an EXR with these header `attributes`, and as a PNG beside it."""
     bitmap = film.bitmap()
     names = [channel.name for channel in bitmap.struct_()]

@@ -27,15 +27,14 @@ _KINDS = ("PerspectiveCamera", "ThinLensCamera")
 @dataclass
 class CameraStart:
     """Start of a camera subpath: ``ray`` (on the near plane), ``weight`` (wavelengths), ``p`` of z_0,
-    ``pdf_w`` density of the direction (solid angle), ``position`` on the film in pixels, ``pixel``
-    where a box filter counts it."""
+    ``pdf_w`` density of the direction (solid angle), ``position`` on the film in pixels (a box
+    filter counts it at the pixel's corner, as Mitsuba does)."""
 
     ray: object
     weight: object
     p: object
     pdf_w: object
     position: object
-    pixel: object
 
 
 @dataclass
@@ -85,8 +84,15 @@ class Camera:
         area = 1 / abs(np.linalg.det(to_film)) * np.prod(self.region / self.crop_size)
         margin = self.border / self.crop_size
         values = [
-            *np.linalg.inv(world)[:3].ravel(), *world[:3].ravel(), *to_film.ravel(), *origin, area,
-            *-margin, *(1 + margin), sensor.near_clip(), sensor.far_clip(),
+            *np.linalg.inv(world)[:3].ravel(),
+            *world[:3].ravel(),
+            *to_film.ravel(),
+            *origin,
+            area,
+            *-margin,
+            *(1 + margin),
+            sensor.near_clip(),
+            sensor.far_clip(),
             params["aperture_radius"] if self.lens else 0,
             sensor.focus_distance() if self.lens else 1,
         ]
@@ -120,8 +126,7 @@ class Camera:
             weight=like.weight,
             p=self._lens_point(u_lens),
             pdf_w=self._density(cos),
-            position=position,
-            pixel=mi.Point2f(pixel) if self.box else position,
+            position=mi.Point2f(pixel) if self.box else position,
         )
 
     def join(self, p, u_lens) -> CameraJoin:

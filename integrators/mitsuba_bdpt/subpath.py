@@ -92,7 +92,8 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
         (walk, stream, state),
         lambda walk, stream, state: walk.active,
         body,
-        label=f"{side.name} subpath",
+        # Dr.Jit's kernel cache does not tell sizes of local memory apart; the label does.
+        label=f"{side.name} subpath, {kernel.store_size} stored",
     )
     # The last step counts an edge but traces no ray.
     return state, walk.seen, dr.maximum(walk.edges, 2) - 1
