@@ -309,6 +309,7 @@ def test_passes_do_not_change_the_image(parameters):
     for size, passes in ((0, [12]), (1, [1] * 12), (5, [5, 5, 2]), (12, [12]), (99, [12])):
         bdpt = integrator(max_depth=4, spp_per_pass=size, **parameters)
         images.append(image(bdpt, scene, spp=12))
+        print("XX", size, images[-1][0, 0, 0], images[-1].mean(), bdpt.statistics)
         assert bdpt.statistics["passes"] == passes
     for other in images[1:]:
         np.testing.assert_allclose(other, images[0], rtol=1e-4)

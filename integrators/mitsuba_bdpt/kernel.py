@@ -2,8 +2,8 @@
 
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
 subpaths that it serves, in S distant pixels; all strategies of a pair are evaluated by that lane.
-Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples or
-image size.
+Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples
+or image size.
 """
 
 from __future__ import annotations
@@ -285,19 +285,21 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
     state = (dr.zeros(mi.Spectrum), counters)
     (radiance, counters), seen, traced = random_walk(kernel, side, walk, stream, visit, state)
     counters.camera += dr.select(active, traced, 0)
+    dropped = _deposit_camera(kernel, film, start.position, radiance, seen, shared, active)
+    counters.non_finite += dr.select(dropped, mi.UInt32(1), mi.UInt32(0))
+    return counters
+
+
+def _deposit_camera(kernel, film, position, radiance, seen, shared, active):
+    """Add a camera sample; returns the mask of samples that count as zero for want of a finite value."""
     rgb = kernel.to_rgb(radiance, shared.wavelengths)
     finite = dr.all(dr.isfinite(rgb))
-    counters.non_finite += dr.select(active & ~finite, mi.UInt32(1), mi.UInt32(0))
     opaque = seen
-    if not plan.hide_emitters and kernel.scene.environment() is not None:
+    if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
         opaque = mi.Bool(True)  # `path`: a visible environment covers the image
-    film.put_camera(
-        start.position,
-        dr.select(finite, rgb, 0),
-        dr.select(opaque, mi.Float(1), mi.Float(0)),
-        active if kernel.plan.served > 1 else mi.Bool(True),
-    )
-    return counters
+    alpha = dr.select(opaque, mi.Float(1), mi.Float(0))
+    film.put_camera(position, dr.select(finite, rgb, 0), alpha, active)
+    return active & ~finite
 
 
 def _deposit_splat(kernel, film, c, position, shared, counters):
