@@ -186,6 +186,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
     # From the sensor into the distance, for light from infinity.
     away = rays.spawn(join.anchor, -join.d, emission.si)
+    away.maxt = join.reach  # camera rays see the surroundings behind the far plane
     ray = dr.select(emission.infinite, away, ray)
     counters.shadow_t1 += _one(active)
     active &= ~rays.occluded(kernel.scene, ray, active)
@@ -325,6 +326,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     counters.evaluated += candidates
     counters.zero += candidates - nonzero
     value = chosen * total
+    counters.non_finite += _one(~dr.isfinite(total))
     active = total > 0
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
     active, survival = _roulette(kernel, value, u, active, counters)

@@ -237,6 +237,8 @@ class Emitters:
         A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon,
         but its pdf_direction only up to the radius: wrong for points of the sphere itself.
         """
+        # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
+        ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
         pdf = emitter.pdf_direction(it, ds, active)
         if not self._inward_spheres:
             return pdf
@@ -493,6 +495,14 @@ class _SmoothMeshes:
     def of(emitters):
         """Tables for those of ``emitters`` that need them, or None."""
         faces = [_curved_faces(e.get_shape()) for e in emitters]
+        for emitter, curved in zip(emitters, faces, strict=True):
+            # Such an emitter draws the point from its texture: its face is not known.
+            if curved is not None and mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+                raise NotImplementedError(
+                    f"emitter '{emitter.id()}' has a textured radiance on a mesh with vertex normals, "
+                    "which the bdpt integrator does not support yet; remove the normals (face_normals "
+                    "on the shape) or use integrator type 'path'"
+                )
         return _SmoothMeshes(faces) if any(f is not None for f in faces) else None
 
     def __init__(self, faces):

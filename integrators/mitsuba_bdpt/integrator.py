@@ -264,6 +264,7 @@ class Render:
         self.kernel = Kernel(
             scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
         )
+        self._samplers = {}
         self.passes, self.compiled, self.cached, self.compile_seconds = [], 0, 0, 0.0
 
     def run(self, spp: int, on_pass):
@@ -292,18 +293,23 @@ class Render:
             self.kernel.set_threshold(self.accumulator.mean(size))
 
     def _points(self, number, batch, spp):
-        sampler = None
-        if self.settings.points == "sampler":
+        if self.settings.points != "sampler":
+            return points.Points(self.settings.points, self.seed)
+        # One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do.
+        sampler = self._samplers.get(batch.first_pixel)
+        if sampler is None:
             sampler = self.sensor.sampler().clone()
             sampler.set_sample_count(spp)
             sampler.set_samples_per_wavefront(batch.samples)
-            sampler.seed(
-                mi.sample_tea_32(self.seed, mi.UInt32(batch.first_pixel))[0],
-                batch.pixels * batch.samples,
-            )
-            for _ in range(number):
-                sampler.advance()
-        return points.Points(self.settings.points, self.seed, sampler)
+            seed = mi.sample_tea_32(self.seed, mi.UInt32(batch.first_pixel))[0]
+            sampler.seed(seed, batch.pixels * batch.samples)
+            self._samplers[batch.first_pixel] = sampler
+        else:
+            sampler.advance()
+        drawn = points.Points("sampler", self.seed, sampler)
+        sampler.schedule_state()
+        dr.eval()
+        return drawn
 
     def _launch(self):
         """Evaluate what was recorded, and note how it was compiled."""

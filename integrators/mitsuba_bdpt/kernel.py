@@ -248,7 +248,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
         pi=pi,
         ray=ray,
         previous=start.p,
-        throughput=mi.Spectrum(start.weight),
+        throughput=mi.Spectrum(1),
         partial=mis.Partial(kernel.heuristic.start(dr.rcp(start.pdf_w)), mi.Float(0)),
         reference=mi.Float(1),
         eta=mi.Float(1),
@@ -292,7 +292,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
 
 def _deposit_camera(kernel, film, position, radiance, seen, shared, active):
     """Add a camera sample; returns the mask of samples that count as zero for want of a finite value."""
-    rgb = kernel.to_rgb(radiance, shared.wavelengths)
+    rgb = kernel.to_rgb(radiance * shared.weight, shared.wavelengths)
     finite = dr.all(dr.isfinite(rgb))
     opaque = seen
     if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
@@ -314,8 +314,8 @@ def _deposit_splat(kernel, film, c, position, shared, counters):
 
 
 def _deposit_strategy(kernel, film, c, position, shared):
-    weighted = kernel.to_rgb(c.weighted(), shared.wavelengths)
-    unweighted = kernel.to_rgb(c.value, shared.wavelengths)
+    weighted = kernel.to_rgb(c.weighted() * shared.weight, shared.wavelengths)
+    unweighted = kernel.to_rgb(c.value * shared.weight, shared.wavelengths)
     finite = dr.all(dr.isfinite(weighted))
     film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
 

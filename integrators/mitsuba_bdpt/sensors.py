@@ -26,12 +26,11 @@ _KINDS = ("PerspectiveCamera", "ThinLensCamera")
 
 @dataclass
 class CameraStart:
-    """Start of a camera subpath: ``ray`` (on the near plane), ``weight`` (wavelengths), ``p`` of z_0,
+    """Start of a camera subpath: ``ray`` (on the near plane), ``p`` of z_0,
     ``pdf_w`` density of the direction (solid angle), ``position`` on the film in pixels (a box
     filter counts it at the pixel's corner, as Mitsuba does)."""
 
     ray: object
-    weight: object
     p: object
     pdf_w: object
     position: object
@@ -44,7 +43,8 @@ class CameraJoin:
     ``anchor`` on the near plane, where visibility ends; ``d`` unit direction from the point to z_0;
     ``dist2`` squared distance to z_0; ``importance`` W_e over the density of z_0, equal to the
     solid-angle density p_w with which a camera subpath leaves towards the point; ``position`` on
-    the film in pixels; ``valid``: within the film region and the clip planes.
+    the film in pixels; ``reach`` length of camera rays along ``-d``; ``valid``: within the film region
+    and the clip planes.
     """
 
     anchor: rays.Anchor
@@ -52,6 +52,7 @@ class CameraJoin:
     dist2: object
     importance: object
     position: object
+    reach: object
     valid: object
 
 
@@ -123,7 +124,6 @@ class Camera:
         cos = self._axis_cos(ray.d)
         return CameraStart(
             ray=mi.Ray3f(ray),
-            weight=like.weight,
             p=self._lens_point(u_lens),
             pdf_w=self._density(cos),
             position=mi.Point2f(pixel) if self.box else position,
@@ -164,6 +164,7 @@ class Camera:
                 uv.x * float(self.crop_size[0]) + float(self.crop_offset[0]),
                 uv.y * float(self.crop_size[1]) + float(self.crop_offset[1]),
             ),
+            reach=(self._far - self._near) / cos,
             valid=inside & within,
         )
 
