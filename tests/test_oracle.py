@@ -544,11 +544,9 @@ class Sensor:
         ray = mi.Ray3f(w.point(w.k), w.towards(w.k, w.k - 1), mi.Float(0), mi.Color0f())
         return sensors.CameraStart(
             ray=ray,
-            weight=mi.Spectrum(1),
             p=w.point(w.k),
             pdf_w=self.density,
             position=mi.Point2f(0.5),
-            pixel=mi.Point2f(0.5),
         )
 
     def join(self, p, u_lens):
@@ -559,6 +557,7 @@ class Sensor:
             dist2=w.f(w.paths.dist2[:, -1]),
             importance=self.density,
             position=mi.Point2f(0.5),
+            reach=mi.Float(dr.inf),
             valid=mi.Bool(True),
         )
 
@@ -630,6 +629,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         full_pdf=False,
         round_trip=False,
         strategy_images=False,
+        store_size=64,
         max_depth=u32(k),
         rr_depth=u32(10**6),
         last_stored=u32(k - 2 if k > 2 else 0),

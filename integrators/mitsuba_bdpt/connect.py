@@ -338,9 +338,10 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
 
 
 def _candidates(kernel, z: Vertex, path: LightPath):
-    """Number of light vertices to try at ``z``."""
+    """Number of light vertices to try at ``z``: slot i holds y_{i+1} or a later one, and paths have at
+    most `Kernel.last_inner` edges."""
     possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)
-    return dr.select(possible, path.count, 0)
+    return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)
 
 
 def _roulette(kernel, value, u, active, counters):

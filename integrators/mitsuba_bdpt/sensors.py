@@ -105,21 +105,21 @@ class Camera:
         self._area = v[30]
         self._low, self._high = mi.Point2f(*v[31:33]), mi.Point2f(*v[33:35])
         self._near, self._far, self._radius, self._focus = v[35:39]
-        self._size = dr.opaque(mi.UInt32, int(self.region[0]))
+        self._width = dr.opaque(mi.UInt32, int(self.region[0]))
+        self._first = dr.opaque(mi.Point2i, (self.crop_offset - self.border).tolist())
+        self._size = dr.opaque(mi.Point2f, self.crop_size.astype(float).tolist())
+        self._offset = dr.opaque(mi.Point2f, self.crop_offset.astype(float).tolist())
 
     def pixel(self, index):
         """Film pixel of the ``index``-th pixel of the region (row by row), as ``mi.Point2i``."""
-        y = index // self._size
-        x = index - y * self._size
-        shift = self.crop_offset - self.border
-        return mi.Point2i(mi.Int32(x) + int(shift[0]), mi.Int32(y) + int(shift[1]))
+        y = index // self._width
+        x = index - y * self._width
+        return mi.Point2i(mi.Int32(x), mi.Int32(y)) + self._first
 
     def start(self, pixel, u_film, u_lens, like) -> CameraStart:
         """Start of a camera subpath through ``pixel``; ``like`` carries time and wavelengths."""
         position = mi.Point2f(pixel) + u_film
-        offset = mi.Point2f(self.crop_offset.tolist())
-        size = mi.Point2f(self.crop_size.tolist())
-        ray, _ = self.sensor.sample_ray(like.time, 0.5, (position - offset) / size, u_lens)
+        ray, _ = self.sensor.sample_ray(like.time, 0.5, (position - self._offset) / self._size, u_lens)
         ray.wavelengths = like.wavelengths
         cos = self._axis_cos(ray.d)
         return CameraStart(
@@ -160,10 +160,7 @@ class Camera:
             d=mi.Vector3f(d),
             dist2=dist2,
             importance=self._density(cos),
-            position=mi.Point2f(
-                uv.x * float(self.crop_size[0]) + float(self.crop_offset[0]),
-                uv.y * float(self.crop_size[1]) + float(self.crop_offset[1]),
-            ),
+            position=uv * self._size + self._offset,
             reach=(self._far - self._near) / cos,
             valid=inside & within,
         )
