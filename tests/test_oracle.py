@@ -630,6 +630,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         round_trip=False,
         strategy_images=False,
         store_size=64,
+        surfaces=True,
         max_depth=u32(k),
         rr_depth=u32(10**6),
         last_stored=u32(k - 2 if k > 2 else 0),

@@ -68,6 +68,7 @@ class Kernel:
         self.scene, self.camera, self.emitters, self.plan = scene, camera, emitters, plan
         self.heuristic = heuristic
         self.quadrics = emitters.quadrics
+        self.surfaces = bool(scene.shapes())
         self.full_pdf = bsdf.needs_full_pdf(scene_bsdfs(scene))
         self.round_trip = bsdf.needs_round_trip(scene_bsdfs(scene))
         depth = min(settings.max_depth, UNLIMITED)

@@ -6,7 +6,7 @@ Vertices are numbered as in the field: y_0 / z_0 is the endpoint, ``edges`` the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -139,6 +139,8 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
 
 def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     """Sample the next edge and trace it."""
+    if not kernel.surfaces:  # a virtual call needs somebody to call
+        return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
     points, h = kernel.points, kernel.heuristic
     si = vertex.si
     active = vertex.hit & (walk.edges < side.last_edge)
