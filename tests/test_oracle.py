@@ -547,6 +547,7 @@ class Sensor:
             p=w.point(w.k),
             pdf_w=self.density,
             position=mi.Point2f(0.5),
+            counted=mi.Point2f(0.5),
         )
 
     def join(self, p, u_lens):

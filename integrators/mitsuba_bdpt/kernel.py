@@ -260,7 +260,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
 
     def add(c, total):
         if kernel.strategy_images:
-            _deposit_strategy(kernel, film, c, start.position, shared)
+            _deposit_strategy(kernel, film, c, start.counted, shared)
         return total + c.weighted()
 
     def visit(z, stream, state):
@@ -286,7 +286,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
     state = (dr.zeros(mi.Spectrum), counters)
     (radiance, counters), seen, traced = random_walk(kernel, side, walk, stream, visit, state)
     counters.camera += dr.select(active, traced, 0)
-    dropped = _deposit_camera(kernel, film, start.position, radiance, seen, shared, active)
+    dropped = _deposit_camera(kernel, film, start.counted, radiance, seen, shared, active)
     counters.non_finite += dr.select(dropped, mi.UInt32(1), mi.UInt32(0))
     return counters
 

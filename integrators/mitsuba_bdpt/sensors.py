@@ -27,13 +27,14 @@ _KINDS = ("PerspectiveCamera", "ThinLensCamera")
 @dataclass
 class CameraStart:
     """Start of a camera subpath: ``ray`` (on the near plane), ``p`` of z_0,
-    ``pdf_w`` density of the direction (solid angle), ``position`` on the film in pixels (a box
-    filter counts it at the pixel's corner, as Mitsuba does)."""
+    ``pdf_w`` density of the direction (solid angle), ``position`` on the film in pixels,
+    ``counted`` where the filter counts it (a box filter: at the pixel's corner, as Mitsuba does)."""
 
     ray: object
     p: object
     pdf_w: object
     position: object
+    counted: object
 
 
 @dataclass
@@ -126,7 +127,8 @@ class Camera:
             ray=mi.Ray3f(ray),
             p=self._lens_point(u_lens),
             pdf_w=self._density(cos),
-            position=mi.Point2f(pixel) if self.box else position,
+            position=position,
+            counted=mi.Point2f(pixel) if self.box else position,
         )
 
     def join(self, p, u_lens) -> CameraJoin:
