@@ -622,7 +622,7 @@ def test_hide_emitters_and_alpha(hide, lamp):
         "lamp": EMITTERS[lamp](),
         "glass": {"type": "sphere", "center": [1, 1.5, 0.5], "radius": 0.4, "bsdf": {"type": "null"}},
     }
-    a, b = same_image(mi.load_dict(scene), 0.03, hide_emitters=hide, max_depth=3)
+    a, b = same_image(mi.load_dict(scene), 0.03, hide_emitters=hide, max_depth=3, spp=(128, 1024))
     assert a.shape[-1] == 4
     np.testing.assert_allclose(a[..., 3].mean(0), b[..., 3].mean(0), atol=0.05)
     if hide or lamp == "sphere":
@@ -671,7 +671,7 @@ SURFACES = {
 def test_every_surface_between_lamp_and_camera(name):
     """Rationale: null events, delta lobes, mixtures and one-sided surfaces change which strategies
     exist at a vertex. A ball and an upright card of the material, an area lamp. Expected: equals
-    `path`. Tolerance: the confidence interval, below 3 %. Statistic: Welch over tiles, 10 seeds.
+    `path`. Tolerance: the confidence interval, below 4 %. Statistic: Welch over tiles, 10 seeds.
     """
     scene = room()
     scene["ball"]["bsdf"] = SURFACES[name]()
@@ -683,7 +683,8 @@ def test_every_surface_between_lamp_and_camera(name):
             "to_world": T().translate([0.3, 0.7, 1]).rotate([0, 1, 0], 40).scale([0.5, 0.7, 1]),
         },
     }
-    same_image(mi.load_dict(scene), 0.04, max_depth=4)
+    # `path` finds the lamp through delta lobes by chance only: eight samples to our one.
+    same_image(mi.load_dict(scene), 0.04, max_depth=4, spp=(128, 1024))
 
 
 def test_instances(tmp_path):

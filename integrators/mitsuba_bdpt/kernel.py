@@ -282,7 +282,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
             radiance += connect.connect_one(kernel, z, path, stream, counters)
         return radiance, counters
 
-    side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat)
+    side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat, alpha=film.alpha)
     state = (dr.zeros(mi.Spectrum), counters)
     (radiance, counters), seen, traced = random_walk(kernel, side, walk, stream, visit, state)
     counters.camera += dr.select(active, traced, 0)

@@ -65,7 +65,8 @@ class Side:
     ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
     alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera
     side). ``complete``: called with the first vertex of a light subpath, returns the density of
-    next-event estimation that completes ``d_vcm`` there.
+    next-event estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event
+    other than null happened.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Side:
     last_edge: object
     coefficient: object
     complete: object = None
+    alpha: bool = False
 
 
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
@@ -144,10 +146,12 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     points, h = kernel.points, kernel.heuristic
     si = vertex.si
     active = vertex.hit & (walk.edges < side.last_edge)
+    # `path` samples at the last vertex too: alpha is 1 unless that event is null.
+    sampled = vertex.hit if side.alpha else active
     u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
     take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
-    step = take(vertex.bsdf, si, u1, u2, active, kernel.full_pdf, kernel.round_trip)
+    step = take(vertex.bsdf, si, u1, u2, sampled, kernel.full_pdf, kernel.round_trip)
     coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
@@ -162,6 +166,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     throughput = dr.select(playing, throughput / survive, throughput)
     active &= ~playing | (u < survive)
 
+    seen = walk.seen | (sampled & ~step.null)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), walk.ray)
     ray = dr.select(active, ray, mi.Ray3f(walk.ray))
     return Walk(
@@ -173,6 +178,6 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
         reference=walk.reference,
         eta=eta,
         edges=walk.edges + 1,
-        seen=walk.seen | (active & ~step.null),
+        seen=seen,
         active=active,
     )
