@@ -59,7 +59,7 @@ def allocate_light_path(size: int, lanes: int) -> LightPath:
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
         throughput=dr.alloc_local(mi.Spectrum, size),
         partial=dr.alloc_local(mi.Vector2f, size),
-        anchor=dr.alloc_local(mi.Float, size),
+        anchor=dr.alloc_local(mi.Vector2f, size),
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
@@ -73,7 +73,7 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
     path.si.write(vertex.si, slot, keep)
     path.throughput.write(mi.Spectrum(vertex.throughput / vertex.cos), slot, keep)
     path.partial.write(mi.Vector2f(vertex.partial.d_vcm, vertex.partial.d_vc), slot, keep)
-    path.anchor.write(vertex.anchor.offset, slot, keep)
+    path.anchor.write(mi.Vector2f(vertex.anchor.offset, vertex.anchor.curvature), slot, keep)
     path.s.write(vertex.edges + 1, slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
@@ -81,13 +81,13 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
 def read_light_vertex(kernel, path: LightPath, slot) -> Vertex:
     """The stored vertex ``slot``, the same in all lanes that use it."""
     si = path.si[slot]
-    partial = path.partial[slot]
+    partial, anchor = path.partial[slot], path.anchor[slot]
     s = path.s[slot]
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
         cos=mi.Float(1),
-        anchor=rays.Anchor(si.p, si.n, path.anchor[slot], kernel.quadrics.ends(si.shape)),
+        anchor=rays.Anchor(si.p, si.n, anchor.x, anchor.y if kernel.quadrics.any else mi.Float(0)),
         throughput=path.throughput[slot],
         partial=mis.Partial(partial.x, partial.y),
         edges=s - 1,
@@ -242,12 +242,13 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     between = y.si.p - z.si.p
     dist2 = dr.squared_norm(between)
     active &= dist2 > 0
-    d = between * dr.rsqrt(dist2)
+    inverse = dr.rcp(dist2)
+    d = between * dr.sqrt(inverse)
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
     cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
     f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
     f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, cos_y / y.cos)
-    value = (z.throughput * f_z.value) * (f_y.value * y.throughput) / dist2
+    value = (z.throughput * f_z.value) * (f_y.value * y.throughput) * inverse
     nonzero = active & (_size(value) > 0)
 
     light_side = mis.alternatives(
@@ -255,14 +256,14 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
         y.partial,
         newest_coefficient(kernel, NEXT_EVENT, y.edges),
         f_y.pdf_rev,
-        f_z.pdf_fwd * cos_y / dist2,
+        f_z.pdf_fwd * cos_y * inverse,
     )
     camera_side = mis.alternatives(
         h,
         z.partial,
         newest_coefficient(kernel, kernel.coefficient_splat, z.edges),
         f_z.pdf_rev,
-        f_y.pdf_fwd * cos_z / dist2,
+        f_y.pdf_fwd * cos_z * inverse,
     )
     weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, nonzero)
@@ -302,38 +303,38 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     number serves the whole draw: what is left of it after each decision is uniform again.
     """
 
-    def body(slot, chosen, total, target, u, nonzero):
-        c = inner(kernel, z, read_light_vertex(kernel, path, slot))
+    def body(slot, chosen, total, end, u, nonzero):
+        y = read_light_vertex(kernel, path, slot)
+        c = inner(kernel, z, y)
         value = c.weighted()
         size = _size(value)
-        total = total + size
-        share = dr.select(size > 0, size / total, 0)
-        take = u < share
-        u = dr.select(take, u / share, (u - share) / (1 - share))
-        chosen = dr.select(take, value / size, chosen)
-        return slot + 1, chosen, total, dr.select(take, slot, target), u, nonzero + _one(c.active)
+        before, total = total, total + size
+        # What is left of the number after the decision, u / share or (u - share) / (1 - share).
+        u_total = u * total
+        take = u_total < size
+        rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
+        u = dr.select(total > 0, rest, u)
+        chosen = dr.select(take, value, chosen)
+        # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
+        end = dr.select(take, rays.end_point(z.anchor, y.anchor), end)
+        return slot + 1, chosen, total, end, u, nonzero + _one(c.active)
 
     candidates = _candidates(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
-    lanes = dr.width(path.count)
-    _, chosen, total, target, _, nonzero = dr.while_loop(
-        # The target is as wide as the lanes, see the counter of `LightPath`.
-        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), dr.zeros(mi.UInt32, lanes), u, mi.UInt32(0)),
-        lambda slot, chosen, total, target, u, nonzero: slot < candidates,
+    _, chosen, total, end, u, nonzero = dr.while_loop(
+        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.Point3f(z.si.p), u, mi.UInt32(0)),
+        lambda slot, chosen, total, end, u, nonzero: slot < candidates,
         body,
         label="draw an inner connection",
     )
     counters.evaluated += candidates
     counters.zero += candidates - nonzero
-    value = chosen * total
+    value = chosen * (total / _size(chosen))
     counters.non_finite += _one(~dr.isfinite(total))
     active = total > 0
-    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
     active, survival = _roulette(kernel, value, u, active, counters)
     counters.shadow_inner += _one(active)
-    si = path.si.read(target, active)
-    anchor = rays.Anchor(si.p, si.n, path.anchor.read(target, active), kernel.quadrics.ends(si.shape, active))
-    active &= ~rays.occluded(kernel.scene, rays.segment(z.anchor, anchor, z.si), active)
+    active &= ~rays.occluded(kernel.scene, rays.segment_to(z.anchor, end, z.si), active)
     return dr.select(active, value / survival, 0)
 
 

@@ -88,15 +88,16 @@ class Accumulator:
         for b in blocks:
             b.clear()
 
-    def mean(self, spp: int) -> float:
-        """Mean of the image so far (largest channel), for the scale of roulette."""
+    def mean(self, spp: int):
+        """Mean of the image so far (largest channel), for the scale of roulette: a ``Float64`` of
+        width 1, for which nobody has waited yet."""
         camera, light = (
-            np.array(s).reshape(-1, b.channel_count())
-            for s, b in zip(self._sums[:2], (self.camera, self.light), strict=True)
+            [dr.sum(sums[channel :: block.channel_count()]) for channel in (0, 1, 2, self.channels - 1)]
+            for sums, block in zip(self._sums[:2], (self.camera, self.light), strict=True)
         )
-        weight = max(camera[:, self.channels - 1].sum(), 1e-30)
-        splat_weight = max(self._splat_weight(spp).sum(), 1e-30)
-        return float((camera[:, :3].sum(0) / weight + light[:, :3].sum(0) / splat_weight).max())
+        weights = dr.maximum(camera[3], 1e-30), max(float(self._splat_weight(spp).sum()), 1e-30)
+        channels = zip(camera[:3], light[:3], strict=True)
+        return dr.max(mi.Vector3d(*(c / weights[0] + y / weights[1] for c, y in channels)))
 
     def _splat_weight(self, spp: int):
         """W', shape (height, width)."""

@@ -264,29 +264,38 @@ class Render:
         self.kernel = Kernel(
             scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
         )
-        self._samplers = {}
+        self._samplers, self._running = {}, []
         self.passes, self.compiled, self.cached, self.compile_seconds = [], 0, 0, 0.0
 
     def run(self, spp: int, on_pass):
         """Trace ``spp`` samples per pixel, fewer under ``timeout`` or when interrupted."""
         pixels = int(self.camera.region[0]) * int(self.camera.region[1])
         sizes = pass_sizes(pixels, spp, self.settings)
+        watched = on_pass is not None or self.settings.timeout >= 0
         try:
             for number, size in enumerate(sizes):
                 self._pass(number, size, spp)
+                # The second pass is recorded while the first, a short one, runs.
+                if watched or number > 0 or len(sizes) == 1:
+                    self._wait()
                 if on_pass is not None:
                     on_pass(self.report(spp))
                 if 0 <= self.settings.timeout <= time.perf_counter() - self.started:
                     break
         finally:
+            self._wait()
             self.accumulator.finish(sum(self.passes))
 
     def _pass(self, number: int, size: int, spp: int):
         done = sum(self.passes)
-        for batch in batches(self.camera, done, size, self.settings):
+        for launch, batch in enumerate(batches(self.camera, done, size, self.settings)):
+            if launch:
+                self._wait()
             self.kernel.points = self._points(number, batch, spp)
             trace(self.kernel, self.accumulator, batch, spp)
-            self._launch()
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                self.accumulator.evaluate(self.kernel.batch_counts)
+            self._running.append(self.kernel.batch_counts)
         self.accumulator.close_pass()
         self.passes.append(size)
         if number == 0 and self.plan.roulette:
@@ -311,14 +320,12 @@ class Render:
         dr.eval()
         return drawn
 
-    def _launch(self):
-        """Evaluate what was recorded, and note how it was compiled."""
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            self.accumulator.evaluate(self.kernel.batch_counts)
-            dr.sync_thread()
-            history = dr.kernel_history()
-        self.kernel.counts += self.kernel.batch_counts.numpy()
-        for entry in history:
+    def _wait(self):
+        """Wait for what was launched, and note what it did and how it was compiled."""
+        dr.sync_thread()
+        while self._running:
+            self.kernel.counts += self._running.pop().numpy()
+        for entry in dr.kernel_history():
             if entry["type"] == dr.KernelType.JIT:
                 self.cached += bool(entry["cache_hit"])
                 self.compiled += not entry["cache_hit"]

@@ -9,7 +9,6 @@ or image size.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import log2
 
 import drjit as dr
 import mitsuba as mi
@@ -96,11 +95,12 @@ class Kernel:
         """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
         return k <= self._reach
 
-    def set_threshold(self, mean: float):
+    def set_threshold(self, mean):
         """Contributions below a tenth of the image's mean play roulette (a power of two, so that
-        the order of atomic sums rarely changes a decision)."""
-        rounded = 2.0 ** round(log2(0.1 * mean)) if mean > 0 else 0.0
-        self.inverse_threshold = dr.opaque(mi.Float, 1 / rounded if rounded > 0 else dr.inf)
+        the order of atomic sums rarely changes a decision). ``mean``: ``Float64`` of width 1."""
+        rounded = dr.exp2(dr.round(dr.log2(0.1 * mean)))
+        self.inverse_threshold = mi.Float(dr.select(mean > 0, dr.rcp(rounded), dr.inf))
+        dr.eval(self.inverse_threshold)
 
     def to_rgb(self, value, wavelengths):
         """Linear sRGB of a spectrum."""
@@ -217,7 +217,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         complete=lambda si, first: emitters.connection_density(e, si, first),
     )
 
-    def visit(vertex, stream, state):
+    def visit(vertex, state):
         path, counters = state
         if kernel.plan.splat:
             c, position = connect.splat(kernel, vertex, stream, counters)
@@ -263,7 +263,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
             _deposit_strategy(kernel, film, c, start.counted, shared)
         return total + c.weighted()
 
-    def visit(z, stream, state):
+    def visit(z, state):
         radiance, counters = state
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.

@@ -1,17 +1,17 @@
 """The one place where random numbers come from.
 
-Every draw names its purpose and the vertex it serves, so that the first dimensions can be taken
-from a better point set than independent numbers:
+Every draw names its purpose and the vertex it serves, so that the point set can be exchanged:
 
-* ``sobol``: Owen-scrambled Sobol' pairs, padded: one sequence over all samples of the image in
-  pixel order (all samples of a pixel are neighbours in it, so each pixel holds a net, and so does
-  each power-of-two group of pixels).
-* ``sampler``: the scene's own sampler.
-* ``independent``: PCG32 throughout.
+* ``sobol``: Owen-scrambled Sobol' pairs, padded, for the purposes in `STRATIFIED` at every vertex:
+  one sequence over all samples of the image in pixel order (all samples of a pixel are neighbours
+  in it, so each pixel holds a net, and so does each power-of-two group of pixels).
+* ``sampler``: the scene's own sampler for the first dimensions, see `_SAMPLER_TABLE`. Not for more:
+  Mitsuba's stratified samplers correlate pairs of dimensions (0.95 for ``stratified`` at 16
+  samples), which roulette and light choice would turn into visible structure.
+* ``independent``: hashed numbers throughout.
 
-The dimensions behind `STRATIFIED` always are independent: structure far down a path does not pay,
-and Mitsuba's stratified samplers correlate pairs of dimensions (0.95 for ``stratified`` at 16
-samples), which roulette and light choice would turn into visible structure.
+All else is hashed: a number is a function of seed, sample, vertex and purpose, so that no
+generator's state is carried along a path.
 """
 
 from __future__ import annotations
@@ -45,24 +45,20 @@ class Purpose(IntEnum):
 
 
 _PURPOSES = 16  # room per vertex in the numbering of dimensions
+_SPREAD = 0x9E3779B1  # odd, so that dimensions stay distinct; spreads them over all bits
+_SECOND = 0x85EBCA6B  # tells the second number of a pair from the first
 
-# Up to which vertex a purpose is stratified. Measured on a Cornell box: gains come from film,
-# emission, first light sample and the first bounces; beyond the third there are none.
+# Measured on a Cornell box: gains come from film, emission, first light sample and the first bounces;
+# beyond the third there are none, but telling these vertices apart would cost more.
 STRATIFIED = {
-    "camera": {
-        Purpose.FILM: 0,
-        Purpose.APERTURE: 0,
-        Purpose.EMITTER: 3,
-        Purpose.BSDF: 3,
-        Purpose.LOBE: 3,
-    },
+    "camera": {Purpose.FILM, Purpose.APERTURE, Purpose.EMITTER, Purpose.BSDF, Purpose.LOBE},
     "light": {
-        Purpose.TIME: 0,
-        Purpose.WAVELENGTH: 0,
-        Purpose.EMISSION_POINT: 0,
-        Purpose.EMISSION_DIRECTION: 0,
-        Purpose.BSDF: 1,
-        Purpose.LOBE: 1,
+        Purpose.TIME,
+        Purpose.WAVELENGTH,
+        Purpose.EMISSION_POINT,
+        Purpose.EMISSION_DIRECTION,
+        Purpose.BSDF,
+        Purpose.LOBE,
     },
 }
 
@@ -84,12 +80,13 @@ _SAMPLER_TABLE = (
 
 @dataclass
 class Stream:
-    """State of one subpath's numbers: ``rng`` for independent ones, ``index`` and ``seed`` into the
-    Sobol' sequence, ``first`` the scene sampler's numbers by (purpose, vertex)."""
+    """One subpath's numbers: ``digits`` its place in the Sobol' sequence (reversed index), ``seed``
+    the sequence's, ``key`` of the hashed numbers, ``first`` the scene sampler's numbers by (purpose,
+    vertex). ``UInt32``, unchanged along the subpath."""
 
-    rng: object
-    index: object
+    digits: object
     seed: object
+    key: object
     first: dict
 
 
@@ -118,15 +115,15 @@ class Points:
         """
         side_seed = sobol.hash_u32(self.seed, mi.UInt32(1 if side == "light" else 2))
         low, seed = sobol.split_index(index, side_seed)
-        state = mi.sample_tea_64(low, seed)
-        rng = mi.PCG32(1, state, mi.UInt64(low) << 32 | mi.UInt64(seed))
+        # A bijection of the index: no two of 2^32 samples share their numbers.
+        key = sobol.hash_u32(seed, low)
         first = {}
         if self._table is not None:
             for (owner, purpose, vertex, dims), values in zip(_SAMPLER_TABLE, self._table, strict=True):
                 if owner == side:
                     kind = mi.Float if dims == 1 else mi.Point2f
-                    first[f"{purpose.name}{vertex}"] = dr.gather(kind, values, slot)
-        return Stream(rng, low, seed, first)
+                    first[purpose, vertex] = dr.gather(kind, values, slot)
+        return Stream(dr.brev(low), sobol.mix(seed), key, first)
 
     def draw_1d(self, side: str, stream: Stream, purpose: Purpose, vertex=0):
         """One number in [0, 1) for ``purpose`` at ``vertex`` (a Python or Dr.Jit integer)."""
@@ -137,31 +134,31 @@ class Points:
         return self._draw(side, stream, purpose, vertex, 2)
 
     def _draw(self, side, stream, purpose, vertex, dims):
-        independent = _independent(stream.rng, dims)
-        limit = STRATIFIED[side].get(purpose)
-        if limit is None or self.kind == "independent":
-            return independent
-        if self.kind == "sampler":
-            for at in range(limit + 1):
-                if (value := stream.first.get(f"{purpose.name}{at}")) is not None:
-                    independent = _choose(vertex, at, at, value, independent)
-            return independent
-        dimension = sobol.hash_u32(stream.seed, mi.UInt32(int(purpose) + _PURPOSES * vertex))
-        if dims == 1:
-            value = sobol.scrambled_single(stream.index, dimension)
-        else:
-            value = mi.Point2f(*sobol.scrambled_pair(stream.index, dimension))
-        return _choose(vertex, 0, limit, value, independent)
+        dimension = (mi.UInt32(int(purpose)) + _PURPOSES * vertex) * _SPREAD
+        if self.kind == "sobol" and purpose in STRATIFIED[side]:
+            seed = sobol.mix(stream.seed ^ dimension)
+            if dims == 1:
+                return sobol.scrambled_single_at(stream.digits, seed)
+            return mi.Point2f(*sobol.scrambled_pair_at(stream.digits, seed))
+        value = _hashed(sobol.mix(stream.key ^ dimension), dims)
+        for name, drawn in stream.first.items():
+            if name[0] is purpose:
+                value = _replace(vertex, name[1], drawn, value)
+        return value
 
 
-def _independent(rng, dims):
+def _hashed(word, dims):
     if dims == 1:
-        return rng.next_float32()
-    return mi.Point2f(rng.next_float32(), rng.next_float32())
+        return _to_unit(word)
+    return mi.Point2f(_to_unit(word), _to_unit(sobol.mix(word ^ _SECOND)))
 
 
-def _choose(vertex, first, last, inside, outside):
-    """``inside`` where first <= vertex <= last."""
+def _to_unit(word):
+    return mi.Float(mi.Int32(word >> 8)) * (2.0**-24)
+
+
+def _replace(vertex, at, inside, outside):
+    """``inside`` at the vertex ``at``, elsewhere ``outside``."""
     if isinstance(vertex, int):
-        return inside if first <= vertex <= last else outside
-    return dr.select((vertex >= first) & (vertex <= last), inside, outside)
+        return inside if vertex == at else outside
+    return dr.select(vertex == at, inside, outside)

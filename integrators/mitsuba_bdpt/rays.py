@@ -56,7 +56,8 @@ class Quadrics:
         shapes = scene.shapes()
         rows = [_curvatures(s) for s in shapes]
         self._size = 0
-        if any(any(row) for row in rows):
+        self.any = any(any(row) for row in rows)
+        if self.any:
             ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
             self._size = max(ids) + 1
             table = [(0.0, 0.0)] * self._size
@@ -74,7 +75,7 @@ class Quadrics:
         return self._look_up("_starts", shape, active)
 
     def _look_up(self, column, shape, active):
-        if self._size == 0:
+        if not self.any:
             return mi.Float(0)
         number = dr.reinterpret_array(mi.UInt32, shape)
         known = mi.Bool(active) & (number < self._size)  # shapes inside instances are not
@@ -117,14 +118,24 @@ def spawn(anchor: Anchor, d, like) -> mi.Ray3f:
     return mi.Ray3f(anchor.towards(d), d, like.time, like.wavelengths)
 
 
+def end_point(a: Anchor, b: Anchor):
+    """Where a visibility ray from ``a`` to ``b`` ends: just before ``b``'s surface."""
+    end = b.towards(a.p - b.p)
+    early = dr.minimum((QUADRIC_ULPS * 2.0**-24) * dr.norm(end - a.p) * b.curvature, 0.01)
+    return end + (a.p - end) * early
+
+
+def segment_to(a: Anchor, end, like) -> mi.Ray3f:
+    """Ray from ``a`` to the point ``end``; time and wavelengths as in ``like``."""
+    o = a.towards(end - a.p)
+    between = end - o
+    dist = dr.norm(between)
+    return mi.Ray3f(o, between / dist, dist, like.time, like.wavelengths)
+
+
 def segment(a: Anchor, b: Anchor, like) -> mi.Ray3f:
     """Ray from ``a`` that ends just before ``b``; time and wavelengths as in ``like``."""
-    between = b.p - a.p
-    o = a.towards(between)
-    to_target = b.towards(-between) - o
-    dist = dr.norm(to_target)
-    early = dr.minimum((QUADRIC_ULPS * 2.0**-24) * dist * b.curvature, 0.01)
-    return mi.Ray3f(o, to_target / dist, dist * (1 - early), like.time, like.wavelengths)
+    return segment_to(a, end_point(a, b), like)
 
 
 def occluded(scene, ray, active):

@@ -45,7 +45,15 @@ import mitsuba as mi
 if TYPE_CHECKING:
     UInt32Like = mi.UInt32 | int
 
-__all__ = ["hash_u32", "scrambled_pair", "scrambled_single", "split_index"]
+__all__ = [
+    "hash_u32",
+    "mix",
+    "scrambled_pair",
+    "scrambled_pair_at",
+    "scrambled_single",
+    "scrambled_single_at",
+    "split_index",
+]
 
 
 def hash_u32(x: UInt32Like, y: UInt32Like) -> mi.UInt32:
@@ -55,7 +63,7 @@ def hash_u32(x: UInt32Like, y: UInt32Like) -> mi.UInt32:
     the broadcast width and covers all of [0, 2^32). For a fixed ``x`` it is a bijection of ``y``
     (different dimensions never share a seed) and for a fixed ``y`` one of ``x``. Not symmetric.
     """
-    return _mix(_mix(mi.UInt32(x) + 0x9E3779B9) ^ (mi.UInt32(y) * 0x9E3779B1))
+    return mix(mix(mi.UInt32(x) + 0x9E3779B9) ^ (mi.UInt32(y) * 0x9E3779B1))
 
 
 def scrambled_pair(index: UInt32Like, seed: UInt32Like) -> tuple[mi.Float, mi.Float]:
@@ -75,8 +83,13 @@ def scrambled_pair(index: UInt32Like, seed: UInt32Like) -> tuple[mi.Float, mi.Fl
     coordinate of each, at most 2 for any functions of one coordinate of each, and 4 for the
     product of the first digits of all four. Functions of one seed converge an order faster.
     """
+    return scrambled_pair_at(dr.brev(mi.UInt32(index)), seed)
+
+
+def scrambled_pair_at(reversed_index: mi.UInt32, seed: UInt32Like) -> tuple[mi.Float, mi.Float]:
+    """:func:`scrambled_pair` of an index whose bits are in reverse order already."""
     shuffle_seed, seed_x, seed_y = _seeds(seed)
-    digits = _shuffle(index, shuffle_seed)
+    digits = dr.brev(_scramble(reversed_index, shuffle_seed))
     return _unit(_scramble(digits, seed_x)), _unit(_scramble(_second(digits), seed_y))
 
 
@@ -86,8 +99,13 @@ def scrambled_single(index: UInt32Like, seed: UInt32Like) -> mi.Float:
     Arguments, range and width as there. Every aligned block of 2^m indices, m <= 24, has exactly
     one value in each interval of length 2^-m.
     """
+    return scrambled_single_at(dr.brev(mi.UInt32(index)), seed)
+
+
+def scrambled_single_at(reversed_index: mi.UInt32, seed: UInt32Like) -> mi.Float:
+    """:func:`scrambled_single` of an index whose bits are in reverse order already."""
     shuffle_seed, seed_x, _ = _seeds(seed)
-    return _unit(_scramble(_shuffle(index, shuffle_seed), seed_x))
+    return _unit(_scramble(dr.brev(_scramble(reversed_index, shuffle_seed)), seed_x))
 
 
 def split_index(index64: mi.UInt64 | int, seed: UInt32Like) -> tuple[mi.UInt32, mi.UInt32]:
@@ -99,11 +117,11 @@ def split_index(index64: mi.UInt64 | int, seed: UInt32Like) -> tuple[mi.UInt32, 
     """
     index64 = mi.UInt64(index64)
     high = mi.UInt32(index64 >> 32)
-    # _mix(0) == 0, and _mix is a bijection: no two high words share a seed.
-    return mi.UInt32(index64), mi.UInt32(seed) ^ _mix(high)
+    # mix(0) == 0, and mix is a bijection: no two high words share a seed.
+    return mi.UInt32(index64), mi.UInt32(seed) ^ mix(high)
 
 
-def _mix(x: mi.UInt32) -> mi.UInt32:
+def mix(x: mi.UInt32) -> mi.UInt32:
     """Bijective 32-bit mix with 0 -> 0 (hash-prospector, two multiplications, bias 0.107)."""
     x = (x ^ (x >> 16)) * 0x21F0AAAD
     x = (x ^ (x >> 15)) * 0xD35A2D97
@@ -117,12 +135,14 @@ def _seeds(seed: UInt32Like) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
     The low bits decide the leading digits: with shifts of 11 and 22 the low ten bits of the
     three are exactly independent and uniform over a uniform ``seed``.
     """
-    first = _mix(mi.UInt32(seed) + 0x9E3779B9)
+    first = mix(mi.UInt32(seed) + 0x9E3779B9)
     return first, (first ^ (first >> 11)) * 0x2C1B3C6D, (first ^ (first >> 22)) * 0x297A2D39
 
 
 def _scramble(digits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Owen-scramble a digit word: bit k changes as a hash of bits 0 to k - 1 and ``seed`` says.
+
+    On a reversed index it is a nested uniform shuffle: aligned power-of-two blocks go to such blocks.
 
     Vegdahl's form of the Laine-Karras hash. Sums, products and ``x ^= x * even`` all carry from
     lower bits to higher ones only, and each is a bijection.
@@ -131,11 +151,6 @@ def _scramble(digits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     digits = (digits + seed) * ((seed >> 16) | 1)
     digits = digits ^ (digits * 0x05526C56)
     return digits ^ (digits * 0x53A22864)
-
-
-def _shuffle(index: UInt32Like, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform shuffle of the index: aligned power-of-two blocks go to such blocks."""
-    return dr.brev(_scramble(dr.brev(mi.UInt32(index)), seed))
 
 
 def _second(digits: mi.UInt32) -> mi.UInt32:

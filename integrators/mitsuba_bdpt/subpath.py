@@ -80,19 +80,18 @@ class Side:
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     """Follow ``walk`` to its end; returns ``(state, seen, rays)``.
 
-    ``visit(vertex, stream, state)`` returns the new state; ``rays`` counts closest-hit rays per
+    ``visit(vertex, state)`` returns the new state; ``rays`` counts closest-hit rays per
     lane; ``seen`` says whether an event other than null happened.
     """
 
-    def body(walk, stream, state):
+    def body(walk, state):
         vertex = _arrive(kernel, side, walk)
-        state = visit(vertex, stream, state)
-        walk = _leave(kernel, side, walk, vertex, stream)
-        return walk, stream, state
+        state = visit(vertex, state)
+        return _leave(kernel, side, walk, vertex, stream), state
 
-    walk, stream, state = dr.while_loop(
-        (walk, stream, state),
-        lambda walk, stream, state: walk.active,
+    walk, state = dr.while_loop(
+        (walk, state),
+        lambda walk, state: walk.active,
         body,
         # Dr.Jit's kernel cache does not tell sizes of local memory apart; the label does.
         label=f"{side.name} subpath, {kernel.store_size} stored",
