@@ -286,10 +286,10 @@ def test_step_is_evaluation_over_density(name, direct_calls):
             mi.Float(dr.select(use, 1, 0)),
             step.weight,
             ev.value,
-            step.pdf_fwd,
-            step.pdf_rev,
-            ev.pdf_fwd,
-            ev.pdf_rev,
+            step.pdf_fwd_w,
+            step.pdf_rev_w,
+            ev.pdf_fwd_w,
+            ev.pdf_rev_w,
             step.cos_out,
         )
         use = use > 0

@@ -352,11 +352,11 @@ def test_direct_sample_agrees_with_hits(name):
     si.n, si.t = mi.Normal3f(0, 1, 0), mi.Float(1)
     direct = emitters.sample_direct(si, mi.Point2f(u[3], u[4]), mi.Bool(True))
     if np.all(np.array(direct.delta)):
-        assert np.all(np.array(direct.pdf) == 1)
+        assert np.all(np.array(direct.pdf_w) == 1)
         return
     at = scene.ray_intersect(mi.Ray3f(mi.Point3f(si.p), direct.d))
     emitter = at.emitter(scene)
-    seen = np.array(emitter != dr.zeros(mi.EmitterPtr)) & (np.array(direct.pdf) > 0)
+    seen = np.array(emitter != dr.zeros(mi.EmitterPtr)) & (np.array(direct.pdf_w) > 0)
     seen &= np.array(direct.d.y) > 0.05
     # Samples on a lamp's far side carry nothing; the ray finds the near side.
     seen &= np.array(direct.infinite | (dr.norm(at.p - direct.anchor.p) < 1e-3))
@@ -372,10 +372,10 @@ def test_direct_sample_agrees_with_hits(name):
     lit = mi.Bool(np.array(dr.max(radiance)) > 0)
     seen &= np.array(lit)
     assert seen.sum() > 500
-    assert off((direct.weight * direct.pdf).x, radiance.x) < 0.01
+    assert off((direct.weight * direct.pdf_w).x, radiance.x) < 0.01
     # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rays.Quadrics).
     few = 0.05 if name == "cylinder" else 0.01
-    assert off(direct.pdf, connect * to_angle) < few
+    assert off(direct.pdf_w, connect * to_angle) < few
     edge = dr.select(at.is_valid(), dr.rcp(dr.square(at.t)), 1)
     assert off(direct.emission_ratio, first * second / connect * edge) < few
 
@@ -529,6 +529,27 @@ def test_splats_land_where_rays_started(name):
     for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
         assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
     np.testing.assert_allclose(join.importance, start.pdf_w, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_camera_rays_are_those_of_mitsuba(name):
+    """Rationale: camera rays are made here, with run-time values where Mitsuba's are literals in the
+    kernel. Expected: origin, direction and length of `sensor.sample_ray` for the same film position and
+    lens sample, within 1e-5 of the scene's scale (float32, some ten operations).
+    """
+    sensor = mi.load_dict(CAMERAS[name]())
+    camera, like = camera_of(sensor)
+    u = np.random.default_rng(8).random((4, 5000), dtype=np.float32)
+    width, height = (int(x) for x in camera.region)
+    index = mi.UInt32((u[3] * width * height).astype(np.uint32))
+    lens = mi.Point2f(u[1], u[2])
+    start = camera.start(camera.pixel(index), mi.Point2f(u[0], u[3]), lens, like)
+    film = sensor.film()
+    uv = (start.position - mi.Point2f(film.crop_offset())) / mi.Point2f(film.crop_size())
+    ray, _ = sensor.sample_ray(0, 0.5, uv, lens)
+    np.testing.assert_allclose(start.ray.o, ray.o, atol=1e-5)
+    np.testing.assert_allclose(start.ray.d, ray.d, atol=1e-5)
+    np.testing.assert_allclose(start.ray.maxt, ray.maxt, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -113,11 +113,11 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     area, position = mi.Bool(paths.kind == AREA), mi.Bool(paths.kind == POSITION)
     infinite, unhittable = mi.Bool(paths.infinite), mi.Bool(paths.delta_emitter)
 
-    def fold(partial, coefficient, pdf_fwd, pdf_rev, cos_out, is_delta):
+    def fold(partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, is_delta):
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
-            pdf_fwd=dr.select(is_delta, 0, pdf_fwd),
-            pdf_rev=dr.select(is_delta, 0, pdf_rev),
+            pdf_fwd_w=dr.select(is_delta, 0, pdf_fwd_w),
+            pdf_rev_w=dr.select(is_delta, 0, pdf_rev_w),
             cos_out=cos_out,
             delta=is_delta,
         )
@@ -282,7 +282,7 @@ def test_partial_sums_survive_zero_and_infinity(name):
     a, rev, density, fwd = grid
     start = mis.Partial(h.start(dr.rcp(fwd * fwd)), h.start(a))
     for partial in (start, mis.arrive(h, start, dr.rcp(fwd), mi.Float(1e-6))):
-        step = SimpleNamespace(pdf_fwd=fwd, pdf_rev=rev, cos_out=a, delta=mi.Bool(False))
+        step = SimpleNamespace(pdf_fwd_w=fwd, pdf_rev_w=rev, cos_out=a, delta=mi.Bool(False))
         folded = mis.scatter(h, partial, 0.3, step)
         for x in (partial, folded):
             side = mis.alternatives(h, x, 0.3, rev, density)
@@ -834,7 +834,7 @@ def test_densities_of_emission_are_those_of_hits(name):
     connect_, first, second = lights.hit_densities(z0, y1.p, there)
     dist2 = dr.squared_norm(z0.p - y1.p)
     to_area = dr.select(direct.infinite, 1, dr.abs(dr.dot(z0.n, direct.d)) / dist2)
-    assert_equal(direct.pdf * to_area, connect_, there)
+    assert_equal(direct.pdf_w * to_area, connect_, there)
     ratio = first * second / (connect_ * dr.select(direct.infinite, 1, dist2))
     assert_equal(direct.emission_ratio, ratio, there & (ratio > 0))
 

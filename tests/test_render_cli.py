@@ -198,12 +198,30 @@ def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
         (["-P", "nonsense=1"], "nonsense"),
         (["-Dnonsense=1"], "nonsense"),
         (["--integrator", "no_such_plugin"], "no_such_plugin"),
+        (["--integrator", "bdpt", "-P", "max_depth=0.5"], "TypeError: bdpt: max_depth=0.5 must be"),
     ],
 )
 def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message):
     assert main(["render", str(scene), *arguments]) == 1
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ") and message in captured.err and not captured.out
+    assert "Traceback" not in captured.err
+
+
+def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
+    def no_gpu(variant):
+        raise ImportError("the CUDA backend hasn't been initialized")
+
+    monkeypatch.setattr(render.mi, "set_variant", no_gpu)
+    assert main(["render", str(scene), "--variant", "cuda_ad_rgb"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: variant='cuda_ad_rgb' cannot be used on this machine")
+    assert "llvm_ad_rgb" in error
+
+
+def test_no_time_at_all_is_one_pass(scene, capsys):
+    assert main(["render", str(scene), "--integrator", "bdpt", "--time", "0", "-o", "a.exr"]) == 0
+    assert " 1 spp " in capsys.readouterr().out
 
 
 def test_missing_scene_is_reported(scene, capsys):

@@ -27,12 +27,12 @@ _SAMPLED_PDF_IS_PDF = frozenset(
 class Evaluation:
     """``value`` f |cos| (light subpaths: adjoint factor included), densities in solid angle.
 
-    ``pdf_fwd`` of leaving into the new direction, ``pdf_rev`` of the reverse.
+    ``pdf_fwd_w`` of leaving into the new direction, ``pdf_rev_w`` of the reverse.
     """
 
     value: object
-    pdf_fwd: object
-    pdf_rev: object
+    pdf_fwd_w: object
+    pdf_rev_w: object
 
 
 @dataclass
@@ -41,8 +41,8 @@ class Step:
 
     wo: object
     weight: object
-    pdf_fwd: object
-    pdf_rev: object
+    pdf_fwd_w: object
+    pdf_rev_w: object
     cos_out: object
     delta: object
     null: object
@@ -73,8 +73,8 @@ def evaluate(bsdf, si, wo, active) -> Evaluation:
 
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
-        value, pdf_fwd = self.eval_pdf(ctx, si, wo, active)
-        return value, pdf_fwd, self.pdf(ctx, with_wi(si, wo), si.wi, active)
+        value, pdf_fwd_w = self.eval_pdf(ctx, si, wo, active)
+        return value, pdf_fwd_w, self.pdf(ctx, with_wi(si, wo), si.wi, active)
 
     return Evaluation(*_ask(bsdf, ask, si, wo, active))
 
@@ -88,13 +88,13 @@ def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
 
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
-        value, pdf_rev = self.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
-        return value, self.pdf(ctx, si, wo, active), pdf_rev
+        value, pdf_rev_w = self.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
+        return value, self.pdf(ctx, si, wo, active), pdf_rev_w
 
-    value, pdf_fwd, pdf_rev = _ask(bsdf, ask, si, wo, active)
+    value, pdf_fwd_w, pdf_rev_w = _ask(bsdf, ask, si, wo, active)
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
-    return Evaluation(value * cos_ratio, pdf_fwd, pdf_rev)
+    return Evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
 
 
 def geometric_cos(si, w):
@@ -114,16 +114,16 @@ def sample(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -
         bs, weight = self.sample(ctx, si, u1, u2, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         smooth = active & ~delta
-        pdf_fwd = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
-        pdf_rev = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
+        pdf_fwd_w = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
+        pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
         reversible = mi.Bool(True)
         if round_trip:
             back, _ = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Importance)
             reversible = ~delta | back
-        return bs, weight, pdf_fwd, pdf_rev, reversible
+        return bs, weight, pdf_fwd_w, pdf_rev_w, reversible
 
-    bs, weight, pdf_fwd, pdf_rev, reversible = _ask(bsdf, ask, si, u1, u2, active)
-    step = _step(si, bs, weight, pdf_fwd, pdf_rev)
+    bs, weight, pdf_fwd_w, pdf_rev_w, reversible = _ask(bsdf, ask, si, u1, u2, active)
+    step = _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
     if round_trip:  # no alternative that would have to make this event from the other side
         step.cos_out = dr.select(reversible, step.cos_out, 0)
     return step
@@ -137,22 +137,25 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         smooth = active & ~delta
         ctx = mi.BSDFContext()
-        value, pdf_rev = self.eval_pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
-        pdf_fwd = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
+        value, pdf_rev_w = self.eval_pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
+        pdf_fwd_w = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
         delta_weight = mitsuba_weight
         if round_trip:  # the radiance that a camera subpath carries, without its factor eta^-2
             back, weight = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Radiance)
             delta_weight = dr.select(back, weight / dr.square(bs.eta), 0)
-        # A direction that Mitsuba rejects has weight 0, whatever its pdf says.
-        valid = (bs.pdf > 0) & (delta | (pdf_fwd > 0))
-        valid &= dr.max(dr.abs(mi.unpolarized_spectrum(mitsuba_weight))) > 0
-        weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd)
-        return bs, dr.select(valid, weight, 0), pdf_fwd, pdf_rev
+        # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
+        rejected = (bs.pdf == 0) | (~delta & (pdf_fwd_w == 0)) | _is_zero(mitsuba_weight)
+        weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd_w)
+        return bs, dr.select(rejected, 0, weight), pdf_fwd_w, pdf_rev_w
 
-    bs, weight, pdf_fwd, pdf_rev = _ask(bsdf, ask, si, u1, u2, active)
+    bs, weight, pdf_fwd_w, pdf_rev_w = _ask(bsdf, ask, si, u1, u2, active)
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
-    weight = dr.select(dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0, weight * cos_ratio, 0)
-    return _step(si, bs, weight, pdf_fwd, pdf_rev)
+    weight = dr.select(_is_zero(weight), 0, weight * cos_ratio)
+    return _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
+
+
+def _is_zero(value):
+    return dr.max(dr.abs(mi.unpolarized_spectrum(value))) == 0
 
 
 def _back(bsdf, si, bs, u1, u2, active, mode):
@@ -173,12 +176,12 @@ def _event_cos_ratio(si, bs):
     return dr.select(refracted, ratio, 1)
 
 
-def _step(si, bs, weight, pdf_fwd, pdf_rev) -> Step:
+def _step(si, bs, weight, pdf_fwd_w, pdf_rev_w) -> Step:
     return Step(
         wo=bs.wo,
         weight=weight,
-        pdf_fwd=pdf_fwd,
-        pdf_rev=pdf_rev,
+        pdf_fwd_w=pdf_fwd_w,
+        pdf_rev_w=pdf_rev_w,
         cos_out=geometric_cos(si, bs.wo),
         delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
         null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),

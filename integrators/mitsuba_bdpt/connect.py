@@ -134,13 +134,13 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
     active = z.hit & (k <= kernel.max_depth) & bsdf.connectible(z.bsdf)
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
     e = kernel.emitters.sample_direct(z.si, u, active)
-    active &= e.pdf > 0
+    active &= e.pdf_w > 0
     wo = z.si.to_local(e.d)
     f = bsdf.evaluate(z.bsdf, z.si, wo, active)
     value = z.throughput * f.value * e.weight
     active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
 
-    light_side = h.start(dr.select(e.delta, 0, f.pdf_fwd / e.pdf))
+    light_side = h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w))
     older = dr.select(kernel.within_store(k), z.partial.d_vc, 0)
     newest = newest_coefficient(kernel, kernel.coefficient_splat, z.edges)
     newest = dr.select(kernel.within_store(k), newest, 0)
@@ -148,7 +148,7 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
         h,
         mis.Partial(z.partial.d_vcm, older),
         newest,
-        f.pdf_rev,
+        f.pdf_rev_w,
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
     weight = h.weight(NEXT_EVENT, light_side, camera_side)
@@ -214,7 +214,7 @@ def splat(kernel, y: Vertex, stream, counters):
     active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
 
     newest = newest_coefficient(kernel, NEXT_EVENT, y.edges)
-    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev, join.importance * to_area)
+    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.importance * to_area)
     weight = h.weight(kernel.coefficient_splat, light_side, mi.Float(0))
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
@@ -255,15 +255,15 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
         h,
         y.partial,
         newest_coefficient(kernel, NEXT_EVENT, y.edges),
-        f_y.pdf_rev,
-        f_z.pdf_fwd * cos_y * inverse,
+        f_y.pdf_rev_w,
+        f_z.pdf_fwd_w * cos_y * inverse,
     )
     camera_side = mis.alternatives(
         h,
         z.partial,
         newest_coefficient(kernel, kernel.coefficient_splat, z.edges),
-        f_z.pdf_rev,
-        f_y.pdf_fwd * cos_z * inverse,
+        f_z.pdf_rev_w,
+        f_y.pdf_fwd_w * cos_z * inverse,
     )
     weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, nonzero)

@@ -65,7 +65,7 @@ class Emission:
 class Direct:
     """A sample of next-event estimation: y_0 for a given camera vertex.
 
-    ``weight`` radiance / ``pdf``; ``pdf`` solid angle at the camera vertex with the selection, or
+    ``weight`` radiance / ``pdf_w``; ``pdf_w`` solid angle at the camera vertex with the selection, or
     the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
     the visibility ray (unused where ``infinite``); ``emission_ratio`` is
     pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
@@ -73,7 +73,7 @@ class Direct:
     """
 
     weight: object
-    pdf: object
+    pdf_w: object
     d: object
     anchor: rays.Anchor
     infinite: object
@@ -109,15 +109,14 @@ class Emitters:
                 for e, k in zip(emitters, kinds, strict=True)
             ]
         )
-        frames = [_frame(e, k) for e, k in zip(emitters, kinds, strict=True)]
-        columns = list(zip(*frames, strict=True))
+        placements = [_placement(e, k) for e, k in zip(emitters, kinds, strict=True)]
         bounds = _bounds(scene)
         sphere = bounds.bounding_sphere() if bounds.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
         # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
         radius = max(float(sphere.radius) * (1 + 1e-4), 1e-30)
         self._pmf = pmf
         self._inv_area = dr.rcp(area)
-        self._table = [mi.Float([float(x) for x in column]) for column in columns]
+        self._placements = _Placement.table(placements)
         textured = [
             k == AREA and mi.has_flag(e.flags(), mi.EmitterFlags.SpatiallyVarying)
             for e, k in zip(emitters, kinds, strict=True)
@@ -126,11 +125,11 @@ class Emitters:
         self._textured = mi.Bool(textured)
         self._inverse = _inverse_table(self._pointers)
         self._smooth_meshes = _SmoothMeshes.of(emitters)
-        self._inward_spheres = any(frame[14] > 0 for frame in frames)
+        self._inward_spheres = any(p.radius > 0 for p in placements)
         self.center = mi.Point3f(sphere.center)
         self.radius = mi.Float(radius)
         dr.make_opaque(
-            self._kind, self._pmf, self._inv_area, self._table, self._inverse, self.center, self.radius
+            self._kind, self._pmf, self._inv_area, self._placements, self._inverse, self.center, self.radius
         )
 
     # -- tables -----------------------------------------------------------------------------
@@ -165,7 +164,7 @@ class Emitters:
 
     def _direction_density(self, index, active):
         """Solid-angle density of the emission from point and spot lights."""
-        return dr.gather(mi.Float, self._table[12], index, active)
+        return dr.gather(mi.Float, self._placements.density_w, index, active)
 
     # -- emission ---------------------------------------------------------------------------
 
@@ -242,25 +241,19 @@ class Emitters:
         pdf = emitter.pdf_direction(it, ds, active)
         if not self._inward_spheres:
             return pdf
-        column = [dr.gather(mi.Float, c, index, active) for c in self._table]
-        to_centre = dr.squared_norm(it.p - mi.Point3f(*column[9:12]))
-        inside = active & (to_centre <= dr.square(column[14]))
+        sphere = self._placements.at(index, active)
+        inside = active & (dr.squared_norm(it.p - sphere.position) <= dr.square(sphere.radius))
         inv_area = dr.gather(mi.Float, self._inv_area, index, active)
         cos = dr.abs(dr.dot(ds.d, ds.n))
         return dr.select(inside, inv_area * dr.square(ds.dist) / cos, pdf)
 
     def _emit_position(self, emitter, index, u_point, u_direction, like, active) -> Emission:
-        column = [dr.gather(mi.Float, c, index, active) for c in self._table]
-        p = mi.Point3f(*column[9:12])
-        cos_cutoff = column[13]
-        local = mi.warp.square_to_uniform_cone(u_direction, cos_cutoff)
-        d = (
-            mi.Vector3f(*column[0:3]) * local.x
-            + mi.Vector3f(*column[3:6]) * local.y
-            + mi.Vector3f(*column[6:9]) * local.z
-        )
+        placed = self._placements.at(index, active)
+        p = placed.position
+        local = mi.warp.square_to_uniform_cone(u_direction, placed.cos_cutoff)
+        d = placed.x * local.x + placed.y * local.y + placed.z * local.z
         intensity = self._intensity(emitter, p, d, like, active)
-        pdf_second = column[12]
+        pdf_second = placed.density_w
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.t, si.p, si.time, si.wavelengths = mi.Float(0), p, like.time, like.wavelengths
         return Emission(
@@ -456,33 +449,68 @@ def _kind(emitter) -> int:
     return _KINDS[name]
 
 
-def _frame(emitter, kind):
-    """A row of the table: axes (9), position (3), density of emission per solid angle, cosine of the
-    cutoff, radius. Point and spot lights use all but the radius; spheres that emit inwards position
-    and radius (as far as they sample from inside), 0 for all others."""
-    axes, p, density, cos_cutoff, radius = (1, 0, 0, 0, 1, 0, 0, 0, 1), (0, 0, 0), 1.0, -1.0, 0.0
+@dataclass
+class _Placement:
+    """Where an emitter is: axes ``x``, ``y``, ``z`` and ``position`` of point and spot lights, their
+    constant density of emission ``density_w`` (solid angle) within ``cos_cutoff``. Of a sphere that
+    emits inwards, ``position`` and the ``radius`` up to which it samples as from inside; 0 for all
+    others. Scalars for one emitter, Dr.Jit arrays for a table of them."""
+
+    x: object = (1, 0, 0)
+    y: object = (0, 1, 0)
+    z: object = (0, 0, 1)
+    position: object = (0, 0, 0)
+    density_w: object = 1.0
+    cos_cutoff: object = -1.0
+    radius: object = 0.0
+
+    @staticmethod
+    def table(rows):
+        """The rows as columns that `at` can look up."""
+
+        def column(name):
+            # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
+            values = np.array([getattr(row, name) for row in rows], dtype=np.float64).T.tolist()
+            if not isinstance(values[0], list):
+                return mi.Float(values)
+            return (mi.Point3f if name == "position" else mi.Vector3f)(*(mi.Float(v) for v in values))
+
+        return _Placement(**{name: column(name) for name in vars(_Placement())})
+
+    def at(self, index, active):
+        """The row ``index``."""
+        return _Placement(**{k: dr.gather(type(v), v, index, active) for k, v in vars(self).items()})
+
+
+def _placement(emitter, kind) -> _Placement:
     if kind == POINT:
-        p, density = dr.slice(mi.Point3f(mi.traverse(emitter)["position"])), 1 / (4 * dr.pi)
-    elif kind == SPOT:
+        position = dr.slice(mi.Point3f(mi.traverse(emitter)["position"]))
+        return _Placement(position=position, density_w=1 / (4 * dr.pi))
+    if kind == SPOT:
         params = mi.traverse(emitter)
         to_world = params["to_world"]
-        axes = [
-            x
+        x, y, z = (
+            dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
             for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-            for x in dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
-        ]
-        p = dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
+        )
         cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
-        density = 1 / (2 * dr.pi * (1 - cos_cutoff))
-    elif kind == AREA and emitter.get_shape().shape_type() == mi.ShapeType.Sphere.value:
+        return _Placement(
+            x=x,
+            y=y,
+            z=z,
+            position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))),
+            density_w=1 / (2 * dr.pi * (1 - cos_cutoff)),
+            cos_cutoff=cos_cutoff,
+        )
+    if kind == AREA and emitter.get_shape().shape_type() == mi.ShapeType.Sphere.value:
         to_world = mi.traverse(emitter.get_shape())["to_world"]
         p = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
         ps = emitter.get_shape().sample_position(0, mi.Point2f(0.5))
-        if dr.slice(dr.dot(ps.n, ps.p - p)) < 0:
-            # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
-            radius = dr.slice(dr.norm(ps.p - p)) * (1 + 1500 * 2.0**-24)
-        p = dr.slice(p)
-    return (*axes, *p, density, cos_cutoff, radius)
+        inwards = dr.slice(dr.dot(ps.n, ps.p - p)) < 0
+        # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
+        radius = dr.slice(dr.norm(ps.p - p)) * (1 + 1500 * 2.0**-24) if inwards else 0.0
+        return _Placement(position=dr.slice(p), radius=radius)
+    return _Placement()
 
 
 class _SmoothMeshes:
@@ -514,8 +542,8 @@ class _SmoothMeshes:
                 length = np.linalg.norm(cross, axis=1)
                 normals.append(cross / np.maximum(length, 1e-300)[:, None])
                 cumulative.append(np.cumsum(length) / length.sum())
-        self._normals = mi.Normal3f(np.concatenate(normals).T.astype(np.float32))
-        self._cumulative = mi.Float(np.concatenate(cumulative).astype(np.float32))
+        self._normals = mi.Normal3f(*(mi.Float(v) for v in np.concatenate(normals).T.tolist()))
+        self._cumulative = mi.Float(np.concatenate(cumulative).tolist())
         self._first, self._count = mi.UInt32(first), mi.UInt32(count)
         self._steps = max(count).bit_length()
         dr.make_opaque(self._normals, self._cumulative, self._first, self._count)

@@ -9,11 +9,61 @@ right thing for every filter, crop window and border. Putting both kinds into on
 
 from __future__ import annotations
 
+from math import ceil
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .strategies import strategies, strategy_count, strategy_index, strategy_names
+
+
+class Block:
+    """Sums of samples weighted by the film's filter, as in ``mi.ImageBlock``, but of a size that is a
+    run-time value: Mitsuba's, and Dr.Jit's copies of small targets for each thread, are literals in the
+    kernel, which would be compiled anew for every resolution.
+
+    ``size`` (width, height); ``channels`` an even number, so that Dr.Jit adds a pixel's as a packet;
+    ``mode`` how neighbouring lanes are added: ``Local`` where they mostly meet in a pixel, else ``Direct``
+    (measured for 2^20 samples of 4 channels on two cores: 3 and 9 ms if 64 lanes meet, 41 and 26 ms if
+    they do not).
+    """
+
+    def __init__(self, size, offset, channels: int, rfilter, mode):
+        self.channels, self._rfilter, self._mode = channels, rfilter, mode
+        self._length = size[0] * size[1] * channels
+        self._size = dr.opaque(mi.Point2i, size)
+        self._offset = dr.opaque(mi.Point2i, offset)
+        self.clear()
+
+    def clear(self):
+        """Set all sums to zero."""
+        self.data = dr.zeros(mi.Float, self._length)
+        dr.make_opaque(self.data)
+
+    def put(self, position, values, active):
+        """Add ``values`` (one per channel) at a continuous film position."""
+        if self._rfilter.is_box_filter():
+            self._add(mi.Point2i(dr.floor(position)) - self._offset, values, active)
+            return
+        radius = self._rfilter.radius()
+        taps = ceil(2 * radius)
+        at = position - mi.Point2f(self._offset) - 0.5  # in pixel centres
+        first = mi.Point2i(dr.ceil(at - radius))
+
+        def body(tap):
+            pixel = first + mi.Point2i(tap % taps, tap // taps)
+            distance = mi.Point2f(pixel) - at
+            weight = self._rfilter.eval(distance.x) * self._rfilter.eval(distance.y)
+            self._add(pixel, [weight * v for v in values], active)
+            return (tap + 1,)
+
+        dr.while_loop((mi.Int32(0),), lambda tap: tap < taps * taps, body, label="reconstruction filter")
+
+    def _add(self, pixel, values, active):
+        inside = active & dr.all((pixel >= 0) & (pixel < self._size))
+        index = mi.UInt32(pixel.y * self._size.x + pixel.x)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.data, mi.ArrayXf(values), index, inside, mode=self._mode)
 
 
 class Accumulator:
@@ -32,26 +82,17 @@ class Accumulator:
         self.offset = [int(x) for x in film.crop_offset()]
         self.rfilter = film.rfilter()
         film.prepare(strategy_names(depth))
-        # Even numbers of channels, padded with zeros: Dr.Jit then adds a pixel's channels as a packet
-        # (three by three, splats alone cost a tenth of a render).
         self.channels = 5 if self.alpha else 4
-        self.camera = self._block(self.channels + self.channels % 2)
-        self.light = self._block(4)
+        self.camera = self._block(self.channels + self.channels % 2, dr.ReduceMode.Local)
+        self.light = self._block(4, dr.ReduceMode.Direct)
         # One strip of rows per strategy, far enough apart for the filter.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
-        self.strategies = self._block(6, strategy_count(depth) * self._stride) if depth else None
-        self._sums = None
+        rows = strategy_count(depth) * self._stride
+        self.strategies = self._block(6, dr.ReduceMode.Direct, rows) if depth else None
+        self._done = (None, ())
 
-    def _block(self, channels: int, height: int | None = None):
-        return mi.ImageBlock(
-            [self.size[0], height or self.size[1]],
-            self.offset,
-            channels,
-            rfilter=self.rfilter,
-            border=False,
-            normalize=False,
-            coalesce=False,
-        )
+    def _block(self, channels: int, mode, height: int | None = None):
+        return Block([self.size[0], height or self.size[1]], self.offset, channels, self.rfilter, mode)
 
     def put_camera(self, position, rgb, alpha, active):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
@@ -72,30 +113,37 @@ class Accumulator:
 
     def evaluate(self, *others):
         """Run what was recorded since the last call as one kernel, ``others`` with it."""
-        dr.eval([b.tensor() for b in self._blocks()], *others)
+        dr.eval([b.data for b in self._blocks()], *others)
 
     def _blocks(self):
         return [b for b in (self.camera, self.light, self.strategies) if b is not None]
 
-    def close_pass(self):
-        """Move the pass's sums into double precision."""
+    @property
+    def passes(self) -> tuple:
+        """Samples per pixel of each pass that is in the sums."""
+        return self._done[1]
+
+    def close_pass(self, spp: int):
+        """Move the sums of a pass with ``spp`` samples per pixel into double precision."""
         blocks = self._blocks()
-        sums = [mi.Float64(b.tensor().array) for b in blocks]
-        if self._sums is not None:
-            sums = [a + b for a, b in zip(self._sums, sums, strict=True)]
+        sums = [mi.Float64(b.data) for b in blocks]
+        before, passes = self._done
+        if before is not None:
+            sums = [a + b for a, b in zip(before, sums, strict=True)]
         dr.eval(sums)
-        self._sums = sums
+        self._done = (sums, (*passes, spp))  # at once: Ctrl-C may come between any two steps
         for b in blocks:
             b.clear()
 
-    def mean(self, spp: int):
+    def mean(self):
         """Mean of the image so far (largest channel), for the scale of roulette: a ``Float64`` of
         width 1, for which nobody has waited yet."""
         camera, light = (
-            [dr.sum(sums[channel :: block.channel_count()]) for channel in (0, 1, 2, self.channels - 1)]
-            for sums, block in zip(self._sums[:2], (self.camera, self.light), strict=True)
+            [dr.sum(sums[channel :: block.channels]) for channel in (0, 1, 2, self.channels - 1)]
+            for sums, block in zip(self._done[0][:2], (self.camera, self.light), strict=True)
         )
-        weights = dr.maximum(camera[3], 1e-30), max(float(self._splat_weight(spp).sum()), 1e-30)
+        splat_weight = float(self._splat_weight(sum(self.passes)).sum())
+        weights = dr.maximum(camera[3], 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
         channels = zip(camera[:3], light[:3], strict=True)
         return dr.max(mi.Vector3d(*(c / weights[0] + y / weights[1] for c, y in channels)))
 
@@ -117,18 +165,19 @@ class Accumulator:
         high = np.interp(n + self.border - centre, edges, cumulative)
         return high - np.interp(-self.border - centre, edges, cumulative)
 
-    def finish(self, spp: int):
-        """Store the result of ``spp`` samples per pixel in the film."""
+    def finish(self):
+        """Store the result of the passes so far in the film."""
         w, h = self.size
-        if spp == 0:
+        sums, passes = self._done
+        if not passes:
             return
-        camera, light = (np.array(s).reshape(h, w, -1) for s in self._sums[:2])
+        camera, light = (np.array(s).reshape(h, w, -1) for s in sums[:2])
         camera = camera[..., : self.channels]
-        to_film = camera[..., -1:] / self._splat_weight(spp)[..., None]
+        to_film = camera[..., -1:] / self._splat_weight(sum(passes))[..., None]
         camera[..., :3] += light[..., :3] * to_film
         layers = [camera]
         if self.depth:
-            tall = np.array(self._sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
+            tall = np.array(sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
             for index, (_, _, t) in enumerate(strategies(self.depth)):
                 layers.append(tall[index] * (to_film if t == 1 else 1))
         values = np.concatenate(layers, axis=-1).astype(np.float32)

@@ -13,8 +13,7 @@ import mitsuba as mi
 from . import mis, points
 from .emitters import Emitters
 from .film import Accumulator
-from .kernel import CONNECTIONS as CONNECTION_COUNTS
-from .kernel import RAYS, Batch, Kernel, trace
+from .kernel import Batch, Counters, Kernel, trace
 from .plan import CONNECTIONS, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings, plan, scene_bsdfs
 from .sensors import Camera
 from .strategies import strategy_count, strategy_names
@@ -25,6 +24,9 @@ PASS_SAMPLES = 1 << 21
 
 # With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
 PASS_SAMPLES_SAMPLER = 1 << 20
+
+# Kinds of rays in the statistics, of what the kernel counts.
+RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 
 # What strategy images may take, in bytes, before the render is refused.
 STRATEGY_MEMORY = 2 << 30
@@ -265,7 +267,8 @@ class Render:
             scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
         )
         self._samplers, self._running = {}, []
-        self.passes, self.compiled, self.cached, self.compile_seconds = [], 0, 0, 0.0
+        self._counts = dict.fromkeys(Counters.names(), 0)
+        self.compiled, self.cached, self.compile_seconds = 0, 0, 0.0
 
     def run(self, spp: int, on_pass):
         """Trace ``spp`` samples per pixel, fewer under ``timeout`` or when interrupted."""
@@ -284,22 +287,21 @@ class Render:
                     break
         finally:
             self._wait()
-            self.accumulator.finish(sum(self.passes))
+            self.accumulator.finish()
 
     def _pass(self, number: int, size: int, spp: int):
-        done = sum(self.passes)
+        done = sum(self.accumulator.passes)
         for launch, batch in enumerate(batches(self.camera, done, size, self.settings)):
             if launch:
                 self._wait()
             self.kernel.points = self._points(number, batch, spp)
-            trace(self.kernel, self.accumulator, batch, spp)
+            counts = trace(self.kernel, self.accumulator, batch, spp)
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-                self.accumulator.evaluate(self.kernel.batch_counts)
-            self._running.append(self.kernel.batch_counts)
-        self.accumulator.close_pass()
-        self.passes.append(size)
+                self.accumulator.evaluate(counts)
+            self._running.append(counts)
+        self.accumulator.close_pass(size)
         if number == 0 and self.plan.roulette:
-            self.kernel.set_threshold(self.accumulator.mean(size))
+            self.kernel.set_threshold(self.accumulator.mean())
 
     def _points(self, number, batch, spp):
         if self.settings.points != "sampler":
@@ -324,7 +326,8 @@ class Render:
         """Wait for what was launched, and note what it did and how it was compiled."""
         dr.sync_thread()
         while self._running:
-            self.kernel.counts += self._running.pop().numpy()
+            batch = self._running.pop().numpy().tolist()
+            self._counts = {name: self._counts[name] + n for name, n in zip(self._counts, batch, strict=True)}
         for entry in dr.kernel_history():
             if entry["type"] == dr.KernelType.JIT:
                 self.cached += bool(entry["cache_hit"])
@@ -333,17 +336,16 @@ class Render:
 
     def report(self, spp: int) -> PassReport:
         """Progress so far, for ``on_pass``."""
-        counts = self.kernel.counts
-        return PassReport(
-            sum(self.passes), spp, time.perf_counter() - self.started, int(counts[: len(RAYS)].sum())
-        )
+        seconds = time.perf_counter() - self.started
+        return PassReport(sum(self.accumulator.passes), spp, seconds, sum(self._rays().values()))
+
+    def _rays(self):
+        return {name: self._counts[name] for name in RAYS}
 
     def statistics(self) -> dict:
         """The render in numbers; plain values only."""
-        counts = [int(x) for x in self.kernel.counts]
-        rays = dict(zip(RAYS, counts, strict=False))
-        connections = dict(zip(CONNECTION_COUNTS, counts[len(RAYS) :], strict=False))
-        connections["traced"] = rays["shadow_inner"]
+        connections = {name: self._counts[name] for name in ("evaluated", "zero", "rouletted")}
+        connections["traced"] = self._counts["shadow_inner"]
         total = time.perf_counter() - self.started
         return {
             "seconds": {
@@ -352,12 +354,12 @@ class Render:
                 "render": total - self.compile_seconds,
                 "total": total,
             },
-            "rays": rays,
+            "rays": self._rays(),
             "connections": connections,
             "skipped": list(self.plan.skipped),
             "decisions": [],
-            "passes": list(self.passes),
-            "non_finite": counts[-1],
+            "passes": list(self.accumulator.passes),
+            "non_finite": self._counts["non_finite"],
             "kernels": {"compiled": self.compiled, "cached": self.cached},
             "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
         }

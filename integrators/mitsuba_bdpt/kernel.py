@@ -8,26 +8,24 @@ or image size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from . import bsdf, connect, mis, rays
 from .plan import MAX_STORED, UNLIMITED, scene_bsdfs
 from .points import Purpose
 from .subpath import Side, Walk, random_walk
 
-RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 # Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
 STORE_SIZES = (64, MAX_STORED)
-CONNECTIONS = ("evaluated", "zero", "rouletted")
 
 
 @dataclass
 class Counters:
-    """What a lane has done; ``UInt32`` each."""
+    """What a lane has done; ``UInt32`` each. First rays by kind, then inner connections by what became
+    of them (``rouletted``: splats too), then samples that count as zero for want of a finite value."""
 
     camera: object
     light: object
@@ -38,6 +36,10 @@ class Counters:
     zero: object
     rouletted: object
     non_finite: object
+
+    @classmethod
+    def names(cls) -> list[str]:
+        return [field.name for field in fields(cls)]
 
 
 @dataclass
@@ -87,8 +89,6 @@ class Kernel:
         self.coefficient_endpoints = f32(count if plan.endpoints else 0)
         self.coefficient_inner = f32(inner)
         self.inverse_threshold = f32(dr.inf)
-        self.counts = np.zeros(len(RAYS) + len(CONNECTIONS) + 1, dtype=np.int64)
-        self.batch_counts = None
         self.points = None
 
     def within_store(self, k):
@@ -114,14 +114,15 @@ class Kernel:
 
 def trace(kernel: Kernel, film, batch: Batch, spp: int):
     """Trace one batch and add it to ``film`` (an `Accumulator`); ``spp`` is the render's total,
-    which places the batch in the image's point sequence. Side effects only, evaluated later."""
+    which places the batch in the image's point sequence. Returns what `Counters` counted (``UInt32``,
+    one after the other); nothing is evaluated yet."""
     total = batch.pixels * batch.samples
     lanes = -(-total // kernel.plan.served)
     # The count of light subpaths is exact also where S does not divide the batch.
     kernel.count_light = dr.opaque(mi.Float, lanes / total)
     lane = dr.arange(mi.UInt32, lanes)
-    place = _Places(kernel, batch, spp, lanes, total)
-    counters = Counters(*(mi.UInt32(0) for _ in range(len(RAYS) + len(CONNECTIONS) + 1)))
+    place = _Places(kernel, batch, spp)
+    counters = Counters(*(mi.UInt32(0) for _ in Counters.names()))
 
     stream = kernel.points.stream("light", place.index(lane), lane)
     shared = _shared(kernel, stream)
@@ -129,10 +130,12 @@ def trace(kernel: Kernel, film, batch: Batch, spp: int):
     if kernel.plan.light:
         path, counters = _light_subpath(kernel, film, stream, shared, path, counters)
 
+    common = _Lane(place, shared, path)
+
     def body(served, counters):
         slot = lane + served * dr.opaque(mi.UInt32, lanes)
         active = slot < dr.opaque(mi.UInt32, total)
-        counters = _camera_subpath(kernel, film, place, slot, shared, path, counters, active)
+        counters = _camera_subpath(kernel, film, common, slot, counters, active)
         return served + 1, counters
 
     if kernel.plan.served == 1:
@@ -144,13 +147,22 @@ def trace(kernel: Kernel, film, batch: Batch, spp: int):
             body,
             label="camera subpaths of one light subpath",
         )
-    _record(kernel, counters)
+    return _sum(counters)
+
+
+@dataclass
+class _Lane:
+    """What a lane's camera subpaths share: the map of samples, time and wavelengths, light vertices."""
+
+    place: _Places
+    shared: Shared
+    path: connect.LightPath
 
 
 class _Places:
     """Where a camera sample of the batch lies: pixel, and index in the image's sequence."""
 
-    def __init__(self, kernel, batch: Batch, spp: int, lanes: int, total: int):
+    def __init__(self, kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
         self._samples = dr.opaque(mi.UInt32, batch.samples)
@@ -207,6 +219,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         eta=mi.Float(1),
         edges=mi.UInt32(1),
         seen=mi.Bool(False),
+        broken=mi.Bool(False),
         active=active,
     )
     side = Side(
@@ -226,13 +239,15 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
             connect.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    (path, counters), _, traced = random_walk(kernel, side, walk, stream, visit, (path, counters))
-    counters.light += dr.select(active, traced, 0)
+    (path, counters), walk = random_walk(kernel, side, walk, stream, visit, (path, counters))
+    counters.light += dr.select(active, walk.traced(), 0)
+    counters.non_finite += dr.select(walk.broken, mi.UInt32(1), mi.UInt32(0))
     return path, counters
 
 
-def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
+def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
     points, plan = kernel.points, kernel.plan
+    place, shared, path = lane.place, lane.shared, lane.path
     stream = points.stream("camera", place.index(slot), slot)
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
     u_lens = mi.Point2f(0.5)
@@ -255,6 +270,7 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
         eta=mi.Float(1),
         edges=mi.UInt32(1),
         seen=mi.Bool(False),
+        broken=mi.Bool(False),
         active=active,
     )
 
@@ -284,10 +300,10 @@ def _camera_subpath(kernel, film, place, slot, shared, path, counters, active):
 
     side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat, alpha=film.alpha)
     state = (dr.zeros(mi.Spectrum), counters)
-    (radiance, counters), seen, traced = random_walk(kernel, side, walk, stream, visit, state)
-    counters.camera += dr.select(active, traced, 0)
-    dropped = _deposit_camera(kernel, film, start.counted, radiance, seen, shared, active)
-    counters.non_finite += dr.select(dropped, mi.UInt32(1), mi.UInt32(0))
+    (radiance, counters), walk = random_walk(kernel, side, walk, stream, visit, state)
+    counters.camera += dr.select(active, walk.traced(), 0)
+    dropped = _deposit_camera(kernel, film, start.counted, radiance, walk.seen, shared, active)
+    counters.non_finite += dr.select(dropped | walk.broken, mi.UInt32(1), mi.UInt32(0))
     return counters
 
 
@@ -321,14 +337,12 @@ def _deposit_strategy(kernel, film, c, position, shared):
     film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
 
 
-def _record(kernel, counters: Counters):
-    """Reduce the lanes' counters to the batch's."""
-    values = list(vars(counters).values())
-    kernel.batch_counts = dr.zeros(mi.UInt32, len(values))
-    for i, value in enumerate(values):
-        dr.scatter_reduce(
-            dr.ReduceOp.Add, kernel.batch_counts, value, mi.UInt32(i), mode=dr.ReduceMode.Expand
-        )
+def _sum(counters: Counters):
+    """The lanes' counters added up, ``UInt32`` in the order of `Counters.names`."""
+    total = dr.zeros(mi.UInt32, len(Counters.names()))
+    for i, value in enumerate(vars(counters).values()):
+        dr.scatter_reduce(dr.ReduceOp.Add, total, value, mi.UInt32(i), mode=dr.ReduceMode.Expand)
+    return total
 
 
 def _opaque(kind):

@@ -110,34 +110,34 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
     """Fold the newest alternative and take a sampled direction (eqs. 34, 35; delta events 53, 54).
 
     ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
-    ``pdf_fwd`` and ``pdf_rev`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``.
+    ``pdf_fwd_w`` and ``pdf_rev_w`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``.
     """
     older = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),
-        heuristic.scale(partial.d_vc, step.pdf_rev),
+        heuristic.scale(partial.d_vc, step.pdf_rev_w),
     )
     # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its forward and
     # reverse probabilities cancel.
     kept = dr.select(
         step.delta,
         heuristic.scale(partial.d_vc, step.cos_out),
-        heuristic.scale(older, step.cos_out / step.pdf_fwd),
+        heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
     )
     return Partial(
-        d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd))),
+        d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
         d_vc=kept,
     )
 
 
-def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev, density):
+def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev_w, density):
     """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40, 41, 44-47).
 
-    ``coefficient`` of the newest alternative's class; ``pdf_rev`` solid-angle density of sampling
+    ``coefficient`` of the newest alternative's class; ``pdf_rev_w`` solid-angle density of sampling
     the vertex before the last from the last; ``density`` of making the last vertex from the other
     side, in the measure in which ``d_vcm`` is stored (area, or solid angle at infinity).
     """
     total = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),
-        heuristic.scale(partial.d_vc, pdf_rev),
+        heuristic.scale(partial.d_vc, pdf_rev_w),
     )
     return heuristic.scale(total, density)

@@ -49,7 +49,7 @@ def run(options: Namespace) -> int:
         prepare_output(output)
         scene, integrator = load(options)
         sensor = choose_sensor(scene, options.sensor)
-        spp = options.spp or (UNLIMITED_SPP if options.time else sensor.sampler().sample_count())
+        spp = options.spp or (UNLIMITED_SPP if options.time is not None else sensor.sampler().sample_count())
         outcome = render(scene, integrator, options, spp)
         if outcome.interrupted and not outcome.spp:
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
@@ -60,10 +60,16 @@ def run(options: Namespace) -> int:
         print("interrupted; no image written", file=sys.stderr)
         return INTERRUPTED
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {message(error)}", file=sys.stderr)
         return 1
     print(summary(output, outcome, sensor.film().crop_size()))
     return INTERRUPTED if outcome.interrupted else 0
+
+
+def message(error: Exception) -> str:
+    """The text of `error`; of a Python traceback that Mitsuba has put into it, the last line only."""
+    before, traceback, rest = str(error).partition("Traceback (most recent call last):")
+    return before + rest.strip().splitlines()[-1] if traceback else before
 
 
 def prepare_output(output: Path) -> None:
@@ -91,10 +97,16 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
         raise ValueError(f"variant={options.variant!r} is not one of Mitsuba's: {known}.")
     if not options.scene.is_file():
         raise ValueError(f"scene={str(options.scene)!r} is not a file.")
-    mi.set_variant(options.variant)
+    try:
+        mi.set_variant(options.variant)
+    except ImportError as error:
+        raise ValueError(
+            f"variant={options.variant!r} cannot be used on this machine ({error}); "
+            "use an LLVM variant, for example llvm_ad_rgb."
+        ) from error
     mi.file_resolver().prepend(str(options.scene.resolve().parent))
     overrides = dict(options.properties)
-    if options.time:
+    if options.time is not None:
         overrides["timeout"] = options.time
 
     config = mi.parser.ParserConfig(options.variant)

@@ -89,6 +89,7 @@ class Camera:
             *np.linalg.inv(world)[:3].ravel(),
             *world[:3].ravel(),
             *to_film.ravel(),
+            *np.linalg.inv(to_film).ravel(),
             *origin,
             area,
             *-margin,
@@ -102,10 +103,10 @@ class Camera:
         v = [dr.opaque(mi.Float, _number(x)) for x in values]
         self._to_camera = [mi.Vector4f(*v[i : i + 4]) for i in (0, 4, 8)]
         self._to_world = [mi.Vector4f(*v[i : i + 4]) for i in (12, 16, 20)]
-        self._to_film, self._origin = v[24:28], mi.Point2f(*v[28:30])
-        self._area = v[30]
-        self._low, self._high = mi.Point2f(*v[31:33]), mi.Point2f(*v[33:35])
-        self._near, self._far, self._radius, self._focus = v[35:39]
+        self._to_film, self._from_film, self._origin = v[24:28], v[28:32], mi.Point2f(*v[32:34])
+        self._area = v[34]
+        self._low, self._high = mi.Point2f(*v[35:37]), mi.Point2f(*v[37:39])
+        self._near, self._far, self._radius, self._focus = v[39:43]
         self._width = dr.opaque(mi.UInt32, int(self.region[0]))
         self._first = dr.opaque(mi.Point2i, (self.crop_offset - self.border).tolist())
         self._size = dr.opaque(mi.Point2f, self.crop_size.astype(float).tolist())
@@ -120,12 +121,17 @@ class Camera:
     def start(self, pixel, u_film, u_lens, like) -> CameraStart:
         """Start of a camera subpath through ``pixel``; ``like`` carries time and wavelengths."""
         position = mi.Point2f(pixel) + u_film
-        ray, _ = self.sensor.sample_ray(like.time, 0.5, (position - self._offset) / self._size, u_lens)
-        ray.wavelengths = like.wavelengths
-        cos = self._axis_cos(ray.d)
+        uv = (position - self._offset) / self._size - self._origin
+        a, lens = self._from_film, self._lens_local(u_lens)
+        # Through the point of the plane in focus that the lens centre sees at this film position.
+        in_focus = mi.Point3f(a[0] * uv.x + a[1] * uv.y, a[2] * uv.x + a[3] * uv.y, 1) * self._focus
+        local = dr.normalize(in_focus - lens)
+        cos = local.z
+        d, z0 = _transform(self._to_world, local, 0), _transform(self._to_world, lens, 1)
+        near, far = self._near / cos, self._far / cos
         return CameraStart(
-            ray=mi.Ray3f(ray),
-            p=self._lens_point(u_lens),
+            ray=mi.Ray3f(z0 + d * near, mi.Vector3f(d), far - near, like.time, like.wavelengths),
+            p=z0,
             pdf_w=self._density(cos),
             position=position,
             counted=mi.Point2f(pixel) if self.box else position,
@@ -168,11 +174,13 @@ class Camera:
         )
 
     def _lens_point(self, u_lens):
-        local = mi.Point3f(0)
-        if self.lens:
-            disk = mi.warp.square_to_uniform_disk_concentric(u_lens) * self._radius
-            local = mi.Point3f(disk.x, disk.y, 0)
-        return _transform(self._to_world, local, 1)
+        return _transform(self._to_world, self._lens_local(u_lens), 1)
+
+    def _lens_local(self, u_lens):
+        if not self.lens:
+            return mi.Point3f(0)
+        disk = mi.warp.square_to_uniform_disk_concentric(u_lens) * self._radius
+        return mi.Point3f(disk.x, disk.y, 0)
 
     def _axis_cos(self, d):
         return dr.dot(mi.Vector3f(*(row.z for row in self._to_world)), d)

@@ -24,7 +24,7 @@ class Walk:
     ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
     measure before that edge; ``reference`` the throughput that roulette compares with; ``eta``
     product of relative indices of refraction; ``edges`` number of edges up to the next vertex;
-    ``seen``: an event other than null happened.
+    ``seen``: an event other than null happened; ``broken``: it ended for want of a finite throughput.
     """
 
     pi: object
@@ -36,7 +36,12 @@ class Walk:
     eta: object
     edges: object
     seen: object
+    broken: object
     active: object
+
+    def traced(self):
+        """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
+        return dr.maximum(self.edges, 2) - 1
 
 
 @dataclass
@@ -78,10 +83,9 @@ class Side:
 
 
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
-    """Follow ``walk`` to its end; returns ``(state, seen, rays)``.
+    """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
 
-    ``visit(vertex, state)`` returns the new state; ``rays`` counts closest-hit rays per
-    lane; ``seen`` says whether an event other than null happened.
+    ``visit(vertex, state)`` returns the new state.
     """
 
     def body(walk, state):
@@ -96,8 +100,7 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
         # Dr.Jit's kernel cache does not tell sizes of local memory apart; the label does.
         label=f"{side.name} subpath, {kernel.store_size} stored",
     )
-    # The last step counts an edge but traces no ray.
-    return state, walk.seen, dr.maximum(walk.edges, 2) - 1
+    return state, walk
 
 
 def newest_coefficient(kernel, first, edges):
@@ -157,7 +160,8 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     throughput = walk.throughput * step.weight
     eta = walk.eta * step.eta
     brightest = dr.max(mi.unpolarized_spectrum(throughput))
-    active &= brightest > 0
+    broken = walk.broken | (active & ~dr.isfinite(brightest))
+    active &= (brightest > 0) & ~broken
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / walk.reference * (1 if side.adjoint else dr.square(eta)), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.edges)
@@ -178,5 +182,6 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
         eta=eta,
         edges=walk.edges + 1,
         seen=seen,
+        broken=broken,
         active=active,
     )
