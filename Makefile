@@ -28,6 +28,9 @@ benchmark: $(INSTALLED)
 	$(VENV)/bin/python scripts/benchmark.py efficiency cornell_box --json docs/benchmark.json
 	$(VENV)/bin/python scripts/benchmark.py efficiency uplight_room --json docs/benchmark.json
 	$(VENV)/bin/python scripts/benchmark.py coldstart --json docs/benchmark.json
+	$(VENV)/bin/python scripts/benchmark.py points cornell_box --json docs/benchmark.json
+	$(VENV)/bin/python scripts/benchmark.py points uplight_room --json docs/benchmark.json
+	$(VENV)/bin/python scripts/benchmark.py memory --json docs/benchmark.json
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .

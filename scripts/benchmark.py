@@ -3,6 +3,8 @@
     python scripts/benchmark.py cost                    # Cornell box, depth 6, 256x256, 64 spp
     python scripts/benchmark.py efficiency cornell_box  # also uplight_room, glass_caustics, ...
     python scripts/benchmark.py coldstart               # empty kernel cache to the first image
+    python scripts/benchmark.py points cornell_box      # point sets against independent numbers
+    python scripts/benchmark.py memory                  # peak of a process, 1920x1080, depth 8
 
 All figures are ratios; the two sides alternate in one run. Rules: warm kernels, medians over seeds;
 relMSE = mean of (x - r)^2 / (r^2 + 0.01 mean(r)^2) over pixels and channels, *trimmed* without the
@@ -28,7 +30,7 @@ import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
 ROOT = Path(__file__).parent.parent
-DEPTH = {"cornell_box": 6, "uplight_room": 8, "ajar_door": 8, "many_lights": 6, "glass_caustics": 8}
+CORNELL_DEPTH = 6  # where the others have a depth of their own in the file
 
 
 def timed(scene, integrator, spp, seed):
@@ -49,8 +51,11 @@ def rel_mse(image, reference, trim=0.0):
 
 def load(name, resolution, max_depth):
     """A scene of scenes/ and its depth."""
-    depth = max_depth or DEPTH.get(name, 8)
     path = str(ROOT / "scenes" / f"{name}.xml")
+    default = CORNELL_DEPTH
+    if name != "cornell_box":
+        default = mi.load_file(path, resolution=1, parallel=False).integrator().max_depth
+    depth = max_depth or default
     return mi.load_file(path, resolution=resolution, max_depth=depth, parallel=False), depth
 
 
@@ -154,6 +159,52 @@ def efficiency(args):
     return result
 
 
+def points(args):
+    """Error of each point set against independent numbers, at equal samples."""
+    resolution = args.resolution or 128
+    scene, depth = load(args.scene, resolution, args.max_depth)
+    path = str(ROOT / "scenes" / f"{args.scene}.xml")
+    jittered = mi.load_file(
+        path, resolution=resolution, max_depth=depth, sampler="multijitter", parallel=False
+    )
+    ref, _ = reference(scene, args.scene, resolution, depth, 1.0)
+    errors = {}
+    for name in ("independent", "sobol", "sampler"):
+        integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "points": name})
+        used = jittered if name == "sampler" else scene
+        images = [timed(used, integrator, args.spp, seed)[0] for seed in range(args.seeds)]
+        errors[name] = float(np.median([rel_mse(image, ref, 0.001) for image in images]))
+    gains = {name: errors["independent"] / error for name, error in errors.items()}
+    print(
+        f"relMSE of bdpt, {args.scene}, {resolution}x{resolution}, depth {depth}, {args.spp} spp, trimmed: "
+        + ", ".join(f"{n} {errors[n]:.5f} ({g:.2f}x)" for n, g in gains.items())
+        + " (sampler: multijitter)"
+    )
+    return gains
+
+
+MEMORY = """
+import resource
+import mitsuba_bdpt, mitsuba as mi
+mi.set_variant('llvm_ad_rgb')
+d = mi.cornell_box()
+d['sensor']['film']['width'], d['sensor']['film']['height'] = 1920, 1080
+mi.render(mi.load_dict(d), integrator=mi.load_dict({'type': 'bdpt', 'max_depth': 8}), spp=%d)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
+
+
+def memory(args):
+    """Peak of a process in GiB at 1920x1080, for few and for more samples."""
+    result = {}
+    for spp in (2, 8):
+        code = [sys.executable, "-c", MEMORY % spp]
+        out = subprocess.run(code, check=True, capture_output=True, text=True).stdout
+        result[f"{spp} spp"] = float(out.split()[-1])
+    print("peak memory at 1920x1080: " + ", ".join(f"{n} {x:.2f} GiB" for n, x in result.items()))
+    return result
+
+
 COLD = """
 import time; start = time.perf_counter()
 import mitsuba_bdpt, mitsuba as mi, drjit as dr
@@ -194,7 +245,7 @@ def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("cost", "efficiency", "coldstart"))
+    parser.add_argument("what", choices=("cost", "efficiency", "coldstart", "points", "memory"))
     parser.add_argument("scene", nargs="?", default="cornell_box", help="name in scenes/")
     parser.add_argument("--spp", type=int, default=64)
     parser.add_argument("--seeds", type=int, default=5)
@@ -206,7 +257,7 @@ def main():
     result = globals()[args.what](args)
     if args.json:
         kept = json.loads(args.json.read_text()) if args.json.exists() else {}
-        key = args.what if args.what != "efficiency" else f"efficiency {args.scene}"
+        key = f"{args.what} {args.scene}" if args.what in ("efficiency", "points") else args.what
         kept[key] = result
         args.json.write_text(json.dumps(kept, indent=2) + "\n")
 

@@ -36,6 +36,28 @@ def test_sizes_of_local_memory_are_kernels_of_their_own():
     assert b > a
 
 
+@pytest.mark.slow
+def test_memory_does_not_grow_with_samples():
+    """Rationale: passes bound what a launch holds. Expected: a process that renders 1920x1080 at
+    depth 8 stays below 1.5 GiB (the budget stated in the README; measured 0.75), and with three times
+    the samples it needs no more. Tolerance: 5 %, what the allocator rounds.
+    """
+    code = """
+import resource, sys
+import mitsuba_bdpt, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+d = mi.cornell_box()
+d["sensor"]["film"]["width"], d["sensor"]["film"]["height"] = 1920, 1080
+mi.render(mi.load_dict(d), integrator=mi.load_dict({"type": "bdpt", "max_depth": 8}), spp=int(sys.argv[1]))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    few, more = (
+        int(subprocess.run([sys.executable, "-c", code, spp], capture_output=True, text=True).stdout)
+        for spp in ("3", "9")
+    )
+    assert few < 1.5 * 2**20 and more < 1.05 * few
+
+
 def test_lanes_that_skip_vertices_keep_their_own():
     """Rationale: an index of width 1 into local memory is taken for the same in all lanes; lanes that
     skip a delta vertex then write to other lanes' slots (it crashed, or was wrong). Expected: a glass and
