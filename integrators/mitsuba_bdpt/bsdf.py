@@ -144,17 +144,18 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
             back, weight = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Radiance)
             delta_weight = dr.select(back, weight / dr.square(bs.eta), 0)
         # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
-        rejected = (bs.pdf == 0) | (~delta & (pdf_fwd_w == 0)) | _is_zero(mitsuba_weight)
+        rejected = (bs.pdf == 0) | (~delta & (pdf_fwd_w == 0)) | is_zero(mitsuba_weight)
         weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd_w)
         return bs, dr.select(rejected, 0, weight), pdf_fwd_w, pdf_rev_w
 
     bs, weight, pdf_fwd_w, pdf_rev_w = _ask(bsdf, ask, si, u1, u2, active)
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
-    weight = dr.select(_is_zero(weight), 0, weight * cos_ratio)
+    weight = dr.select(is_zero(weight), 0, weight * cos_ratio)
     return _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
 
 
-def _is_zero(value):
+def is_zero(value):
+    """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
     return dr.max(dr.abs(mi.unpolarized_spectrum(value))) == 0
 
 

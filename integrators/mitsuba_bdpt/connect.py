@@ -4,6 +4,9 @@ All return a `Contribution`: the full *unweighted* estimate f / p of the strateg
 class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone.
 Densities and cosines are geometric, throughputs contain everything up to and including the edge to
 the vertex. Equation numbers: Georgiev 2012, see `mis`.
+
+What a lane accumulates (``counters``, ``path``) is changed in place: these records are state of the
+loops around, and each statement binds a new array to a field.
 """
 
 from __future__ import annotations
@@ -16,6 +19,9 @@ import mitsuba as mi
 from . import bsdf, mis, rays
 from .points import Purpose
 from .subpath import Vertex, newest_coefficient
+
+# Least probability of surviving roulette: random numbers are multiples of 2^-24.
+LEAST_SURVIVAL = 2.0**-20
 
 # kappa of s = 0 and s = 1: a sample each per camera vertex.
 NEXT_EVENT = HIT = 1.0
@@ -112,7 +118,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     t = z.edges + 1
     active = sees_emitter(kernel, z)
     radiance = emitters.emitted(z.si, active)
-    active &= dr.max(mi.unpolarized_spectrum(radiance)) != 0
+    active &= ~bsdf.is_zero(radiance)
     connect, first, second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
     newest = dr.select(directly, kernel.coefficient_endpoints, NEXT_EVENT) * dr.select(
@@ -138,7 +144,7 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
     wo = z.si.to_local(e.d)
     f = bsdf.evaluate(z.bsdf, z.si, wo, active)
     value = z.throughput * f.value * e.weight
-    active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
+    active &= ~bsdf.is_zero(value)
 
     light_side = h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w))
     older = dr.select(kernel.within_store(k), z.partial.d_vc, 0)
@@ -152,6 +158,7 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
     weight = h.weight(NEXT_EVENT, light_side, camera_side)
+    active &= _counts(kernel, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point = rays.segment(z.anchor, e.anchor, z.si)
@@ -177,11 +184,12 @@ def join_endpoints(kernel, emission, stream, counters, active):
     cos = dr.select(emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d)))
     geometry = cos / join.dist2
     value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
-    active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
+    active &= ~bsdf.is_zero(value)
     # s = 0: the camera hits the same point.
     ratio = join.importance * geometry / emission.pdf_first
     light_side = h.start(dr.select(emission.delta, 0, ratio))
     weight = h.weight(kernel.coefficient_endpoints, light_side, mi.Float(0))
+    active &= _counts(kernel, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
     # From the sensor into the distance, for light from infinity.
@@ -211,11 +219,12 @@ def splat(kernel, y: Vertex, stream, counters):
     to_area = cos / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
-    active &= dr.max(dr.abs(mi.unpolarized_spectrum(value))) > 0
+    active &= ~bsdf.is_zero(value)
 
     newest = newest_coefficient(kernel, NEXT_EVENT, y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.importance * to_area)
     weight = h.weight(kernel.coefficient_splat, light_side, mi.Float(0))
+    active &= _counts(kernel, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active)
@@ -249,7 +258,7 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
     f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, cos_y / y.cos)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput) * inverse
-    nonzero = active & (_size(value) > 0)
+    active &= ~bsdf.is_zero(value)
 
     light_side = mis.alternatives(
         h,
@@ -266,7 +275,8 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
         f_y.pdf_fwd_w * cos_z * inverse,
     )
     weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
-    return Contribution(value, weight, y.edges + 1, z.edges + 1, nonzero)
+    active &= _counts(kernel, weight)
+    return Contribution(value, weight, y.edges + 1, z.edges + 1, active)
 
 
 def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
@@ -303,11 +313,13 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     number serves the whole draw: what is left of it after each decision is uniform again.
     """
 
-    def body(slot, chosen, total, end, u, nonzero):
+    def body(slot, chosen, total, end, u, nonzero, broken):
         y = read_light_vertex(kernel, path, slot)
         c = inner(kernel, z, y)
         value = c.weighted()
         size = _size(value)
+        broken |= ~dr.isfinite(size)
+        size = dr.select(dr.isfinite(size), size, 0)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
         u_total = u * total
@@ -317,20 +329,21 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         chosen = dr.select(take, value, chosen)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
         end = dr.select(take, rays.end_point(z.anchor, y.anchor), end)
-        return slot + 1, chosen, total, end, u, nonzero + _one(c.active)
+        return slot + 1, chosen, total, end, u, nonzero + _one(c.active), broken
 
     candidates = _candidates(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
-    _, chosen, total, end, u, nonzero = dr.while_loop(
-        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.Point3f(z.si.p), u, mi.UInt32(0)),
-        lambda slot, chosen, total, end, u, nonzero: slot < candidates,
+    none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.Point3f(z.si.p)
+    _, chosen, total, end, u, nonzero, broken = dr.while_loop(
+        (*none, u, mi.UInt32(0), mi.Bool(False)),
+        lambda slot, *_: slot < candidates,
         body,
         label="draw an inner connection",
     )
     counters.evaluated += candidates
     counters.zero += candidates - nonzero
+    counters.non_finite += _one(broken)
     value = chosen * (total / _size(chosen))
-    counters.non_finite += _one(~dr.isfinite(total))
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)
     counters.shadow_inner += _one(active)
@@ -349,10 +362,18 @@ def _roulette(kernel, value, u, active, counters):
     """Unbiased roulette on a weighted contribution before its visibility is tested."""
     if not kernel.plan.roulette:
         return active, mi.Float(1)
-    survival = dr.minimum(_size(value) * kernel.inverse_threshold, 1)
+    size = _size(value)
+    # Not below the spacing of the random numbers, which are 0 more often than that; NaN goes on.
+    survival = dr.clip(size * kernel.inverse_threshold, LEAST_SURVIVAL, 1)
+    survival = dr.select(dr.isfinite(size), survival, 1)
     survived = u < survival
     counters.rouletted += _one(active & ~survived)
     return active & survived, survival
+
+
+def _counts(kernel, weight):
+    """Mask: a strategy of this weight is worth a ray. Technique images show unweighted ones too."""
+    return mi.Bool(True) if kernel.strategy_images else ~(weight == 0)
 
 
 def _size(value):

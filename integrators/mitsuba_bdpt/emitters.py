@@ -28,6 +28,11 @@ from . import rays
 
 AREA, POINT, SPOT, INFINITE, DIRECTIONAL = range(5)
 
+# Shapes whose textured radiance Mitsuba samples rightly. On a cylinder the points have other densities than
+# stated (0.4 to 1.6 times), on a mesh all faces with the same texture coordinates share one density but
+# only one face is sampled (a cube: a sixth).
+_TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
+
 _KINDS = {
     "AreaLight": AREA,
     "PointLight": POINT,
@@ -121,8 +126,16 @@ class Emitters:
             k == AREA and mi.has_flag(e.flags(), mi.EmitterFlags.SpatiallyVarying)
             for e, k in zip(emitters, kinds, strict=True)
         ]
-        self._any_textured = any(textured)
-        self._textured = mi.Bool(textured)
+        # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
+        by_texture = [
+            t and e.get_shape().shape_type() in _TEXTURE_SAMPLED
+            for e, t in zip(emitters, textured, strict=True)
+        ]
+        by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
+        self._any_by_texture, self._by_texture = any(by_texture), mi.Bool(by_texture)
+        self._any_by_shape, self._by_shape = any(by_shape), mi.Bool(by_shape)
+        if self._any_by_shape:
+            _refuse_curves(scene, emitters[by_shape.index(True)])
         self._inverse = _inverse_table(self._pointers)
         self._smooth_meshes = _SmoothMeshes.of(emitters)
         self._inward_spheres = any(p.radius > 0 for p in placements)
@@ -196,6 +209,9 @@ class Emitters:
         shape = emitter.get_shape()
         # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
         ps, _ = emitter.sample_position(like.time, u_point, active)
+        if self._any_by_shape:
+            mask = self._is_by_shape(index, active)
+            ps = dr.select(mask, shape.sample_position(like.time, u_point, mask), ps)
         local = mi.warp.square_to_cosine_hemisphere(u_direction)
         si = mi.SurfaceInteraction3f(ps, like.wavelengths)
         si.t = mi.Float(0)
@@ -231,7 +247,7 @@ class Emitters:
 
     def _pdf_direction(self, emitter, index, it, ds, active):
         """Density with which next-event estimation at ``it`` samples ``ds`` (solid angle, without
-        the selection).
+        the selection). Turns ``ds.n``, which callers build for this call alone.
 
         A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon,
         but its pdf_direction only up to the radius: wrong for points of the sphere itself.
@@ -239,13 +255,18 @@ class Emitters:
         # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
         ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
         pdf = emitter.pdf_direction(it, ds, active)
-        if not self._inward_spheres:
-            return pdf
-        sphere = self._placements.at(index, active)
-        inside = active & (dr.squared_norm(it.p - sphere.position) <= dr.square(sphere.radius))
+        by_area = mi.Bool(False)
+        if self._inward_spheres:
+            sphere = self._placements.at(index, active)
+            by_area |= active & (dr.squared_norm(it.p - sphere.position) <= dr.square(sphere.radius))
+        if self._any_by_shape:
+            by_area |= self._is_by_shape(index, active)
         inv_area = dr.gather(mi.Float, self._inv_area, index, active)
         cos = dr.abs(dr.dot(ds.d, ds.n))
-        return dr.select(inside, inv_area * dr.square(ds.dist) / cos, pdf)
+        return dr.select(by_area, inv_area * dr.square(ds.dist) / cos, pdf)
+
+    def _is_by_shape(self, index, active):
+        return active & dr.gather(mi.Bool, self._by_shape, index, active)
 
     def _emit_position(self, emitter, index, u_point, u_direction, like, active) -> Emission:
         placed = self._placements.at(index, active)
@@ -359,6 +380,10 @@ class Emitters:
         u = mi.Point2f(u_x, u.y)
         emitter = self._pointer(index, active)
         ds, weight = emitter.sample_direction(si, u, active)
+        if self._any_by_shape:
+            mask = self._is_by_shape(index, active)
+            by_shape, its_weight = _sample_shape(emitter, si, u, mask)
+            ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
         area = self._is(index, active, AREA)
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
         delta = self._is(index, active, POINT, SPOT, DIRECTIONAL)
@@ -422,11 +447,11 @@ class Emitters:
     def _area_density(self, emitter, index, at, n, active):
         """Density of emission's y_0 on a surface, without the selection. ``at`` has ``p``, ``uv``."""
         density = dr.gather(mi.Float, self._inv_area, index, active)
-        if not self._any_textured:
+        if not self._any_by_texture:
             return density
         # A textured emitter samples its texture. It tells the area density only to a reference point
         # at unit distance straight above.
-        textured = active & dr.gather(mi.Bool, self._textured, index, active)
+        textured = active & dr.gather(mi.Bool, self._by_texture, index, active)
         it = dr.zeros(mi.Interaction3f)
         it.p = at.p + n
         ds = dr.zeros(mi.DirectionSample3f)
@@ -437,6 +462,36 @@ class Emitters:
         if self.count == 1:
             return mi.Float(1)
         return dr.gather(mi.Float, self._pmf, index, active)
+
+
+def _sample_shape(emitter, si, u, active):
+    """Next-event estimation by a uniform point of the emitter's shape, in Mitsuba's conventions: the
+    density is over the cosine with the shading normal, the weight is radiance over density."""
+    ps = emitter.get_shape().sample_position(si.time, u, active)
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.n, ds.uv, ds.time, ds.emitter = ps.p, ps.n, ps.uv, si.time, emitter
+    between = ps.p - si.p
+    ds.dist = dr.norm(between)
+    ds.d = between / ds.dist
+    cos = dr.abs(dr.dot(ds.n, ds.d))
+    ds.pdf = dr.select(active & (cos > 0), ps.pdf * dr.square(ds.dist) / cos, 0)
+    there = mi.SurfaceInteraction3f(ps, si.wavelengths)
+    there.wi = there.to_local(-ds.d)
+    radiance = emitter.eval(there, active)
+    return ds, dr.select(ds.pdf > 0, radiance / ds.pdf, 0)
+
+
+def _refuse_curves(scene, emitter):
+    """Raise ``NotImplementedError`` if a call on shapes would meet curves, which have no
+    ``sample_position``."""
+    for shape in scene.shapes():
+        if shape.shape_type() in (mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value):
+            raise NotImplementedError(
+                f"bdpt: emitter '{emitter.id()}' has a textured radiance on a "
+                f"{emitter.get_shape().class_name()}, which is not supported beside curves "
+                f"('{shape.id()}'); make the radiance uniform, put it on a rectangle, disk or sphere, "
+                "or use integrator type 'path'"
+            )
 
 
 def _kind(emitter) -> int:
@@ -523,14 +578,6 @@ class _SmoothMeshes:
     def of(emitters):
         """Tables for those of ``emitters`` that need them, or None."""
         faces = [_curved_faces(e.get_shape()) for e in emitters]
-        for emitter, curved in zip(emitters, faces, strict=True):
-            # Such an emitter draws the point from its texture: its face is not known.
-            if curved is not None and mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
-                raise NotImplementedError(
-                    f"emitter '{emitter.id()}' has a textured radiance on a mesh with vertex normals, "
-                    "which the bdpt integrator does not support yet; remove the normals (face_normals "
-                    "on the shape) or use integrator type 'path'"
-                )
         return _SmoothMeshes(faces) if any(f is not None for f in faces) else None
 
     def __init__(self, faces):

@@ -41,10 +41,11 @@ class Block:
         self.data = dr.zeros(mi.Float, self._length)
         dr.make_opaque(self.data)
 
-    def put(self, position, values, active):
-        """Add ``values`` (one per channel) at a continuous film position."""
+    def put(self, position, values, active, row=0):
+        """Add ``values`` (one per channel) at a continuous film position, ``row`` rows below."""
+        down = mi.Point2i(0, mi.Int32(row))
         if self._rfilter.is_box_filter():
-            self._add(mi.Point2i(dr.floor(position)) - self._offset, values, active)
+            self._add(mi.Point2i(dr.floor(position)) - self._offset + down, values, active)
             return
         radius = self._rfilter.radius()
         taps = ceil(2 * radius)
@@ -55,7 +56,7 @@ class Block:
             pixel = first + mi.Point2i(tap % taps, tap // taps)
             distance = mi.Point2f(pixel) - at
             weight = self._rfilter.eval(distance.x) * self._rfilter.eval(distance.y)
-            self._add(pixel, [weight * v for v in values], active)
+            self._add(pixel + down, [weight * v for v in values], active)
             return (tap + 1,)
 
         dr.while_loop((mi.Int32(0),), lambda tap: tap < taps * taps, body, label="reconstruction filter")
@@ -90,6 +91,7 @@ class Accumulator:
         rows = strategy_count(depth) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, rows) if depth else None
         self._done = (None, ())
+        self._share = [self._covered(n) for n in self.size]
 
     def _block(self, channels: int, mode, height: int | None = None):
         return Block([self.size[0], height or self.size[1]], self.offset, channels, self.rfilter, mode)
@@ -106,10 +108,8 @@ class Accumulator:
 
     def put_strategy(self, position, weighted, unweighted, s, t, active):
         """Add to the technique images of the strategy (s, t)."""
-        row = mi.Float(strategy_index(s, t) * self._stride)
-        below = mi.Point2f(position.x, position.y + row)
         values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
-        self.strategies.put(below, values, active)
+        self.strategies.put(position, values, active, strategy_index(s, t) * self._stride)
 
     def evaluate(self, *others):
         """Run what was recorded since the last call as one kernel, ``others`` with it."""
@@ -138,18 +138,17 @@ class Accumulator:
     def mean(self):
         """Mean of the image so far (largest channel), for the scale of roulette: a ``Float64`` of
         width 1, for which nobody has waited yet."""
-        camera, light = (
-            [dr.sum(sums[channel :: block.channels]) for channel in (0, 1, 2, self.channels - 1)]
-            for sums, block in zip(self._done[0][:2], (self.camera, self.light), strict=True)
-        )
+        blocks = zip(self._done[0][:2], (self.camera, self.light), strict=True)
+        camera, light = ([dr.sum(sums[i :: block.channels]) for i in range(3)] for sums, block in blocks)
+        weight = dr.sum(self._done[0][0][self.channels - 1 :: self.camera.channels])
         splat_weight = float(self._splat_weight(sum(self.passes)).sum())
-        weights = dr.maximum(camera[3], 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
-        channels = zip(camera[:3], light[:3], strict=True)
-        return dr.max(mi.Vector3d(*(c / weights[0] + y / weights[1] for c, y in channels)))
+        weight, splat_weight = dr.maximum(weight, 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
+        channels = zip(camera, light, strict=True)
+        return dr.max(mi.Vector3d(*(c / weight + y / splat_weight for c, y in channels)))
 
     def _splat_weight(self, spp: int):
         """W', shape (height, width)."""
-        x, y = (self._covered(n) for n in self.size)
+        x, y = self._share
         return spp * y[:, None] * x[None, :]
 
     def _covered(self, n: int):

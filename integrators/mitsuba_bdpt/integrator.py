@@ -14,13 +14,27 @@ from . import mis, points
 from .emitters import Emitters
 from .film import Accumulator
 from .kernel import Batch, Counters, Kernel, trace
-from .plan import CONNECTIONS, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings, plan, scene_bsdfs
+from .plan import (
+    CONNECTIONS,
+    DEFAULT_STORED,
+    LIGHT_PATHS,
+    MAX_STORED,
+    SKIP,
+    UNLIMITED,
+    Settings,
+    plan,
+    scene_bsdfs,
+)
 from .sensors import Camera
 from .strategies import strategy_count, strategy_names
 
 # Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
 # a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
 PASS_SAMPLES = 1 << 21
+
+# Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
+# every pass and does not average out (constant radiance, 2^12: 4e-6; 2^16: 5e-5; 2^20: 1e-3).
+MOST_SPP = 1 << 12
 
 # With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
 PASS_SAMPLES_SAMPLER = 1 << 20
@@ -165,7 +179,9 @@ def read_settings(props) -> Settings:
         light_paths=_light_paths(props),
         connections=_choice(props, "connections", CONNECTIONS),
         points=_choice(props, "points", points.POINTS),
-        stored_vertices=_integer(props.get("stored_vertices", 64), "stored_vertices", 1, MAX_STORED),
+        stored_vertices=_integer(
+            props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED
+        ),
         strategy_images=_boolean(props, "strategy_images"),
         spp_per_pass=_integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
         timeout=float(timeout),
@@ -208,14 +224,21 @@ def check_scene(scene, sensor):
             )
 
 
-def pass_sizes(pixels: int, spp: int, settings: Settings) -> list[int]:
+def _most_samples(settings: Settings) -> int:
+    """Samples in one launch."""
+    return PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
+
+
+def pass_sizes(camera: Camera, spp: int, settings: Settings) -> list[int]:
     """Samples per pixel of each pass, in order; their sum is ``spp``.
 
     A first pass of one sample gives roulette the scale of the image.
     """
-    limit = PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
-    # At most what one row of pixels can have in one launch, see `batches`.
-    size = min(settings.spp_per_pass or max(limit // max(pixels, 1), 1), limit)
+    limit = _most_samples(settings)
+    width, height = (int(x) for x in camera.region)
+    # One row of pixels fits into four launches' worth, see `batches`.
+    most = min(MOST_SPP, max(4 * limit // width, 1))
+    size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
     sizes = []
     if settings.points == "sampler":
         # Stratified samplers number the samples of a pixel; passes must cut them evenly.
@@ -227,7 +250,7 @@ def pass_sizes(pixels: int, spp: int, settings: Settings) -> list[int]:
 
 def batches(camera: Camera, first_sample: int, samples: int, settings: Settings):
     """Cut a pass into bands of rows that one kernel launch can take."""
-    limit = PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
+    limit = _most_samples(settings)
     width, height = (int(x) for x in camera.region)
     rows = (
         height
@@ -270,10 +293,10 @@ class Render:
         self._counts = dict.fromkeys(Counters.names(), 0)
         self.compiled, self.cached, self.compile_seconds = 0, 0, 0.0
 
-    def run(self, spp: int, on_pass):
-        """Trace ``spp`` samples per pixel, fewer under ``timeout`` or when interrupted."""
-        pixels = int(self.camera.region[0]) * int(self.camera.region[1])
-        sizes = pass_sizes(pixels, spp, self.settings)
+    def run(self, spp: int, on_pass, cancelled=lambda: False):
+        """Trace ``spp`` samples per pixel, fewer under ``timeout``, when ``cancelled()`` after a pass or
+        when interrupted."""
+        sizes = pass_sizes(self.camera, spp, self.settings)
         watched = on_pass is not None or self.settings.timeout >= 0
         try:
             for number, size in enumerate(sizes):
@@ -283,19 +306,22 @@ class Render:
                     self._wait()
                 if on_pass is not None:
                     on_pass(self.report(spp))
-                if 0 <= self.settings.timeout <= time.perf_counter() - self.started:
+                late = 0 <= self.settings.timeout <= time.perf_counter() - self.started
+                if late or cancelled():
                     break
         finally:
-            self._wait()
-            self.accumulator.finish()
+            try:
+                self._wait()
+            finally:
+                self.accumulator.finish()
 
     def _pass(self, number: int, size: int, spp: int):
         done = sum(self.accumulator.passes)
         for launch, batch in enumerate(batches(self.camera, done, size, self.settings)):
             if launch:
                 self._wait()
-            self.kernel.points = self._points(number, batch, spp)
-            counts = trace(self.kernel, self.accumulator, batch, spp)
+            drawn = self._points(number, batch, spp)
+            counts = trace(self.kernel, self.accumulator, batch, drawn, spp)
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 self.accumulator.evaluate(counts)
             self._running.append(counts)
@@ -388,6 +414,11 @@ def _make_class():
             self.settings = settings
             self.statistics = {}
             self.on_pass = None
+            self._cancelled = False
+
+        def cancel(self):
+            """End the render that is running after its next pass, from ``on_pass`` or another thread."""
+            self._cancelled = True
 
         @property
         def max_depth(self):
@@ -409,7 +440,8 @@ def _make_class():
             spp = _samples(sensor, spp, self.settings)
             render = Render(scene, sensor, self.settings, seed)
             try:
-                render.run(spp, self.on_pass)
+                self._cancelled = False
+                render.run(spp, self.on_pass, lambda: self._cancelled)
             finally:
                 self.statistics = render.statistics()
             _log(self.statistics)

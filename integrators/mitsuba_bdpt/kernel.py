@@ -8,6 +8,7 @@ or image size.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, fields
 
 import drjit as dr
@@ -15,7 +16,7 @@ import mitsuba as mi
 
 from . import bsdf, connect, mis, rays
 from .plan import MAX_STORED, UNLIMITED, scene_bsdfs
-from .points import Purpose
+from .points import Points, Purpose
 from .subpath import Side, Walk, random_walk
 
 # Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
@@ -39,6 +40,7 @@ class Counters:
 
     @classmethod
     def names(cls) -> list[str]:
+        """In the order in which `trace` returns the sums."""
         return [field.name for field in fields(cls)]
 
 
@@ -76,7 +78,7 @@ class Kernel:
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
         self.strategy_images = settings.strategy_images
-        count = 1 / plan.served if plan.light else 0.0
+        count = 1 / plan.served if plan.light else 0.0  # nominal, see `bound`
         inner = 1.0 if plan.connections != "none" else 0.0
         u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
@@ -84,12 +86,17 @@ class Kernel:
         self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)
         self.last_light = u32(max(reach - 1 if plan.splat else reach - 2, 0))
         self.served = u32(plan.served)
-        self.count_light = f32(count)
         self.coefficient_splat = f32(count * plan.splat_coefficient if plan.splat else 0)
         self.coefficient_endpoints = f32(count if plan.endpoints else 0)
         self.coefficient_inner = f32(inner)
         self.inverse_threshold = f32(dr.inf)
-        self.points = None
+
+    def bound(self, points, count_light: float) -> Kernel:
+        """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
+        camera subpath, which the estimates of t = 1 are divided by (weights keep the nominal one)."""
+        other = copy(self)
+        other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
+        return other
 
     def within_store(self, k):
         """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
@@ -112,14 +119,13 @@ class Kernel:
         return mi.Color3f(value)
 
 
-def trace(kernel: Kernel, film, batch: Batch, spp: int):
+def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
     """Trace one batch and add it to ``film`` (an `Accumulator`); ``spp`` is the render's total,
-    which places the batch in the image's point sequence. Returns what `Counters` counted (``UInt32``,
+    which places the batch in the image's point sequence. Returns what `Counters` counted (``UInt64``,
     one after the other); nothing is evaluated yet."""
     total = batch.pixels * batch.samples
     lanes = -(-total // kernel.plan.served)
-    # The count of light subpaths is exact also where S does not divide the batch.
-    kernel.count_light = dr.opaque(mi.Float, lanes / total)
+    kernel = kernel.bound(points, lanes / total)  # exact also where S does not divide the batch
     lane = dr.arange(mi.UInt32, lanes)
     place = _Places(kernel, batch, spp)
     counters = Counters(*(mi.UInt32(0) for _ in Counters.names()))
@@ -338,10 +344,10 @@ def _deposit_strategy(kernel, film, c, position, shared):
 
 
 def _sum(counters: Counters):
-    """The lanes' counters added up, ``UInt32`` in the order of `Counters.names`."""
-    total = dr.zeros(mi.UInt32, len(Counters.names()))
+    """The lanes' counters added up, ``UInt64`` in the order of `Counters.names`."""
+    total = dr.zeros(mi.UInt64, len(Counters.names()))
     for i, value in enumerate(vars(counters).values()):
-        dr.scatter_reduce(dr.ReduceOp.Add, total, value, mi.UInt32(i), mode=dr.ReduceMode.Expand)
+        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt64(value), mi.UInt32(i), mode=dr.ReduceMode.Expand)
     return total
 
 

@@ -11,6 +11,8 @@ UNLIMITED = 2**32 - 1
 # Most light vertices per lane (a lane's local memory lies on a thread's stack).
 MAX_STORED = 1024
 
+DEFAULT_STORED = 64
+
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
 CONNECTIONS = ("auto", "all", "one", "none")
 SKIP = ("auto", "impossible", "none")
@@ -96,10 +98,10 @@ def plan(scene, emitters, camera, settings: Settings) -> Plan:
         skip("t=1, (1,1), inner", "by hand", "light_paths=0")
     if inner and connections == "none":
         inner = skip("inner", "by hand", "connections=none")
-    if light_paths and settings.stored_vertices < depth:
+    if light_paths and settings.stored_vertices < min(depth, DEFAULT_STORED):
         skip(
             f"t=1 and inner for paths longer than {settings.stored_vertices} edges",
-            "worthless now",
+            "by hand",
             f"stored_vertices={settings.stored_vertices}: such paths use s=0 and s=1",
         )
     return Plan(

@@ -47,6 +47,7 @@ class Purpose(IntEnum):
 _PURPOSES = 16  # room per vertex in the numbering of dimensions
 _SPREAD = 0x9E3779B1  # odd, so that dimensions stay distinct; spreads them over all bits
 _SECOND = 0x85EBCA6B  # tells the second number of a pair from the first
+_KEY = 0x27D4EB2F  # keeps the key of sample 0 from being 0
 
 # Measured on a Cornell box: gains come from film, emission, first light sample and the first bounces;
 # beyond the third there are none, but telling these vertices apart would cost more.
@@ -115,15 +116,14 @@ class Points:
         """
         side_seed = sobol.hash_u32(self.seed, mi.UInt32(1 if side == "light" else 2))
         low, seed = sobol.split_index(index, side_seed)
-        # A bijection of the index: no two of 2^32 samples share their numbers.
-        key = sobol.hash_u32(seed, low)
         first = {}
         if self._table is not None:
             for (owner, purpose, vertex, dims), values in zip(_SAMPLER_TABLE, self._table, strict=True):
                 if owner == side:
                     kind = mi.Float if dims == 1 else mi.Point2f
                     first[purpose, vertex] = dr.gather(kind, values, slot)
-        return Stream(dr.brev(low), sobol.mix(seed), key, first)
+        # A bijection of the index: no two of 2^32 samples of a sequence share their numbers.
+        return Stream(dr.brev(low), sobol.mix(seed), sobol.mix(low ^ _KEY), first)
 
     def draw_1d(self, side: str, stream: Stream, purpose: Purpose, vertex=0):
         """One number in [0, 1) for ``purpose`` at ``vertex`` (a Python or Dr.Jit integer)."""
@@ -134,13 +134,15 @@ class Points:
         return self._draw(side, stream, purpose, vertex, 2)
 
     def _draw(self, side, stream, purpose, vertex, dims):
+        # The seed is in the dimension's word, not in the key: else the hashed numbers of two dimensions
+        # would be the same pairs for every seed, in another order.
         dimension = (mi.UInt32(int(purpose)) + _PURPOSES * vertex) * _SPREAD
+        seed = sobol.mix(stream.seed ^ dimension)
         if self.kind == "sobol" and purpose in STRATIFIED[side]:
-            seed = sobol.mix(stream.seed ^ dimension)
             if dims == 1:
                 return sobol.scrambled_single_at(stream.digits, seed)
             return mi.Point2f(*sobol.scrambled_pair_at(stream.digits, seed))
-        value = _hashed(sobol.mix(stream.key ^ dimension), dims)
+        value = _hashed(sobol.mix(stream.key ^ seed), dims)
         for name, drawn in stream.first.items():
             if name[0] is purpose:
                 value = _replace(vertex, name[1], drawn, value)

@@ -27,6 +27,9 @@ KEPT = ("max_depth", "rr_depth", "hide_emitters")
 UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""
 
+PASS_SPP = 16
+"""Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
+
 MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
 INTERRUPTED = 130
 """The exit status of a process that SIGINT has ended."""
@@ -155,10 +158,12 @@ def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
 def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
     """Render into the sensor's film, drawing progress on a terminal."""
     started, interrupted = time.perf_counter(), False
+    own_passes = hasattr(integrator, "on_pass")
+    if options.time is not None and not own_passes:
+        return render_repeatedly(scene, integrator, options, spp)
     with progress_bar() as bar:
-        draw = show_pass(bar, options.time)
-        if hasattr(integrator, "on_pass"):
-            integrator.on_pass = draw
+        if own_passes:
+            integrator.on_pass = show_pass(bar, options.time)
         try:
             integrator.render(scene, options.sensor, options.seed, spp, develop=False, evaluate=True)
             dr.sync_thread()
@@ -171,6 +176,29 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
         # Mitsuba's own integrators leave nothing behind.
         spp = 0
     return Outcome(time.perf_counter() - started, spp, interrupted, statistics)
+
+
+def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
+    """Render with one seed after the other until the time is over, and leave the mean in the film.
+
+    Mitsuba's integrators render all samples at once in vectorised variants, whatever their timeout.
+    """
+    started, done, total, interrupted = time.perf_counter(), 0, 0.0, False
+    film = choose_sensor(scene, options.sensor).film()
+    try:
+        while done < spp and (done == 0 or time.perf_counter() - started < options.time):
+            size, seed = min(PASS_SPP, spp - done), options.seed + done // PASS_SPP
+            integrator.render(scene, options.sensor, seed, size, develop=False, evaluate=True)
+            # Raw sums with their weights: passes of any size and filter add up.
+            total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
+            done += size
+    except KeyboardInterrupt:
+        interrupted = True
+    if done:
+        film.prepare(integrator.aov_names())
+        mean = mi.TensorXf((total / done).astype(np.float32))
+        film.put_block(mi.ImageBlock(mean, film.crop_offset(), border=False))
+    return Outcome(time.perf_counter() - started, done, interrupted)
 
 
 def progress_bar() -> Progress:

@@ -143,13 +143,13 @@ class Camera:
         to_z0 = z0 - p
         dist2 = dr.squared_norm(to_z0)
         d = to_z0 * dr.rsqrt(dist2)
-        return self._join(p - z0, d, dist2, z0, self._far)
+        return self._join(p - z0, d, dist2, z0, (self._near, self._far))
 
     def join_direction(self, d, u_lens) -> CameraJoin:
         """As `join`, with light that travels along ``d`` from infinity; ``dist2`` is 1."""
-        return self._join(-d, mi.Vector3f(d), mi.Float(1), self._lens_point(u_lens), dr.inf)
+        return self._join(-d, mi.Vector3f(d), mi.Float(1), self._lens_point(u_lens), (0, dr.inf))
 
-    def _join(self, outward, d, dist2, z0, far) -> CameraJoin:
+    def _join(self, outward, d, dist2, z0, clip) -> CameraJoin:
         local = _transform(self._to_camera, outward, 0)  # from z_0, camera coordinates
         depth = local.z
         # The film position is where the line crosses the plane in focus, seen from the lens centre.
@@ -159,8 +159,7 @@ class Camera:
         a = self._to_film
         uv = mi.Point2f(a[0] * x + a[1] * y, a[2] * x + a[3] * y) + self._origin
         inside = dr.all((uv >= self._low) & (uv < self._high))
-        near = self._near if far is self._far else 0
-        within = (depth > 0) & (depth >= near) & (depth <= far)
+        within = (depth > 0) & (depth >= clip[0]) & (depth <= clip[1])
         cos = self._axis_cos(-d)
         on_near_plane = z0 - d * (self._near / cos)
         return CameraJoin(

@@ -3,7 +3,7 @@
 Everything here is a pure function of 32-bit unsigned arrays: no tables, no memory access, no
 state. A high-dimensional sample is made by *padding*: one :func:`scrambled_pair` (or
 :func:`scrambled_single`) per one or two dimensions, all with the same ``index`` and each with its
-own ``seed``, for which :func:`hash_u32` is the tool.
+own ``seed`` (see `points`).
 
 Why not what Mitsuba ships: ``mi.radical_inverse_2`` and ``mi.sobol_2`` do run in a kernel, but
 their ``scramble`` argument is only xor-ed onto the digits (a random digital shift). That keeps
