@@ -9,13 +9,13 @@ right thing for every filter, crop window and border. Putting both kinds into on
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, inf
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .strategies import strategies, strategy_count, strategy_index, strategy_names
+from .strategies import layer_names, strategies, strategy_count, strategy_index
 
 
 class Block:
@@ -67,14 +67,46 @@ class Block:
         dr.scatter_reduce(dr.ReduceOp.Add, self.data, mi.ArrayXf(values), index, inside, mode=self._mode)
 
 
+class Replicates:
+    """Mean and squared deviations of independent images of the scene, weighted by their samples.
+
+    With n_b samples per pixel in image x_b, N in all, and B images, the variance of the weighted mean
+    is estimated by sum_b n_b (x_b - mean)^2 / (N (B - 1)).
+    """
+
+    def __init__(self):
+        self.count, self.mean, self._squares = 0, None, None
+        self._spp, self._sums = 0, None
+
+    def add(self, sums, spp: int, develop):
+        """Add an image: ``sums`` and ``spp`` are those of all images so far, ``develop(camera, light,
+        spp)`` makes an image of the difference."""
+        n = spp - self._spp
+        new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
+        x = develop(*new, n)
+        before = np.zeros_like(x) if self.mean is None else self.mean
+        self._squares = np.zeros_like(x) if self._squares is None else self._squares
+        mean = before + (x - before) * (n / spp)
+        self._squares = self._squares + n * (x - before) * (x - mean)
+        self.count, self.mean, self._spp, self._sums = self.count + 1, mean, spp, sums
+
+    def variance(self, spp: int, shape=()):
+        """Variance of the mean of ``spp`` samples per pixel (those of a replicate that was not
+        finished included); infinite, in the given shape, with fewer than two replicates."""
+        if self.count < 2:
+            return np.full(shape, np.inf)
+        return self._squares / (spp * (self.count - 1))
+
+
 class Accumulator:
     """Collects the samples of one render.
 
     ``film`` Mitsuba's film; ``border`` how many pixels camera samples reach beyond the crop window;
-    ``depth`` the largest path length of the strategy images, 0 for none.
+    ``depth`` the largest path length of the strategy images, 0 for none; ``variance`` whether the
+    layers of the variance are wanted, see `close_replicate`.
     """
 
-    def __init__(self, film, border: int, depth: int):
+    def __init__(self, film, border: int, depth: int, variance: bool = False):
         self.film = film
         self.border = border
         self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
@@ -82,7 +114,8 @@ class Accumulator:
         self.size = [int(x) for x in film.crop_size()]
         self.offset = [int(x) for x in film.crop_offset()]
         self.rfilter = film.rfilter()
-        film.prepare(strategy_names(depth))
+        self.replicates = Replicates() if variance else None
+        film.prepare(layer_names(depth, variance))
         self.channels = 5 if self.alpha else 4
         self.camera = self._block(self.channels + self.channels % 2, dr.ReduceMode.Local)
         self.light = self._block(4, dr.ReduceMode.Direct)
@@ -135,6 +168,27 @@ class Accumulator:
         for b in blocks:
             b.clear()
 
+    def close_replicate(self):
+        """Count what was added since the last call as one independent replicate of the image."""
+        sums, passes = self._done
+        self.replicates.add([np.array(s) for s in sums[:2]], sum(passes), self._image)
+
+    def error(self) -> float:
+        """Estimated relMSE of the image, variance / (mean^2 + 0.01 mean(image)^2) averaged over pixels
+        and channels; infinite with fewer than two replicates."""
+        mean = self.replicates.mean
+        if mean is None:
+            return inf
+        variance = self.replicates.variance(sum(self.passes))
+        return float((variance / (mean**2 + 0.01 * mean.mean() ** 2 + 1e-300)).mean())
+
+    def _image(self, camera, light, spp: int):
+        """Image (height, width, 3) of sums over ``spp`` samples per pixel."""
+        w, h = self.size
+        camera, light = camera.reshape(h, w, -1), light.reshape(h, w, -1)
+        weight = camera[..., self.channels - 1, None]
+        return camera[..., :3] / weight + light[..., :3] / self._splat_weight(spp)[..., None]
+
     def mean(self):
         """Mean of the image so far (largest channel), for the scale of roulette: a ``Float64`` of
         width 1, for which nobody has waited yet."""
@@ -175,6 +229,8 @@ class Accumulator:
         to_film = camera[..., -1:] / self._splat_weight(sum(passes))[..., None]
         camera[..., :3] += light[..., :3] * to_film
         layers = [camera]
+        if self.replicates is not None:
+            layers.append(self.replicates.variance(sum(passes), camera[..., :3].shape) * camera[..., -1:])
         if self.depth:
             tall = np.array(sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
             for index, (_, _, t) in enumerate(strategies(self.depth)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +26,7 @@ from .plan import (
     scene_bsdfs,
 )
 from .sensors import Camera
-from .strategies import strategy_count, strategy_names
+from .strategies import layer_names, strategy_count
 
 # Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
 # a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
@@ -41,6 +41,10 @@ PASS_SAMPLES_SAMPLER = 1 << 20
 
 # Kinds of rays in the statistics, of what the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
+
+# Independent images whose spread gives the variance: as few as the contract allows, since each has a
+# point sequence of its own and short sequences are worse.
+REPLICATES = 8
 
 # What strategy images may take, in bytes, before the render is refused.
 STRATEGY_MEMORY = 2 << 30
@@ -99,6 +103,11 @@ All of them are combined by multiple importance sampling.
    - |bool|
    - Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` for each strategy; needs a
      finite ``max_depth``. (Default: false)
+ * - variance
+   - |bool|
+   - Adds the layers ``variance.R``, ``.G``, ``.B``: the variance of each pixel, splats included,
+     estimated from 8 independent parts of the render; ``statistics["error"]`` is the relMSE that
+     follows. Needs at least 8 samples per pixel. (Default: false)
  * - spp_per_pass
    - |int|
    - Samples per pixel in one pass; 0 (default) chooses.
@@ -183,6 +192,7 @@ def read_settings(props) -> Settings:
             props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED
         ),
         strategy_images=_boolean(props, "strategy_images"),
+        variance=_boolean(props, "variance"),
         spp_per_pass=_integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
         timeout=float(timeout),
     )
@@ -229,10 +239,10 @@ def _most_samples(settings: Settings) -> int:
     return PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
 
 
-def pass_sizes(camera: Camera, spp: int, settings: Settings) -> list[int]:
+def pass_sizes(camera: Camera, spp: int, settings: Settings, first: bool = True) -> list[int]:
     """Samples per pixel of each pass, in order; their sum is ``spp``.
 
-    A first pass of one sample gives roulette the scale of the image.
+    The ``first`` pass of a render has one sample and gives roulette the scale of the image.
     """
     limit = _most_samples(settings)
     width, height = (int(x) for x in camera.region)
@@ -243,9 +253,35 @@ def pass_sizes(camera: Camera, spp: int, settings: Settings) -> list[int]:
     if settings.points == "sampler":
         # Stratified samplers number the samples of a pixel; passes must cut them evenly.
         size = next(n for n in range(min(size, spp), 0, -1) if spp % n == 0)
-    elif settings.skip != "none" and spp > 1:
+    elif first and settings.skip != "none" and spp > 1:
         sizes, spp = [1], spp - 1
     return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
+
+
+@dataclass(frozen=True)
+class Step:
+    """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate, whose last it
+    may be; ``replicate`` counts the independent images that `variance` needs, else 0."""
+
+    replicate: int
+    done: int
+    size: int
+    of: int
+    last: bool
+
+
+def schedule(camera: Camera, spp: int, settings: Settings) -> list[Step]:
+    """All passes of a render of ``spp`` samples per pixel."""
+    parts = [spp]
+    if settings.variance:
+        parts = [spp // REPLICATES + (i < spp % REPLICATES) for i in range(REPLICATES)]
+    steps = []
+    for replicate, part in enumerate(parts):
+        done = 0
+        for size in pass_sizes(camera, part, settings, replicate == 0):
+            steps.append(Step(replicate, done, size, part, done + size == part))
+            done += size
+    return steps
 
 
 def batches(camera: Camera, first_sample: int, samples: int, settings: Settings):
@@ -285,7 +321,7 @@ class Render:
         dr.make_opaque(self.seed)
         depth = settings.max_depth if settings.strategy_images else 0
         _check_strategy_memory(depth, self.film)
-        self.accumulator = Accumulator(self.film, self.camera.border, depth)
+        self.accumulator = Accumulator(self.film, self.camera.border, depth, settings.variance)
         self.kernel = Kernel(
             scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
         )
@@ -296,18 +332,19 @@ class Render:
     def run(self, spp: int, on_pass, cancelled=lambda: False):
         """Trace ``spp`` samples per pixel, fewer under ``timeout``, when ``cancelled()`` after a pass or
         when interrupted."""
-        sizes = pass_sizes(self.camera, spp, self.settings)
-        watched = on_pass is not None or self.settings.timeout >= 0
+        timeout = self.settings.timeout
+        watched = on_pass is not None or timeout >= 0
         try:
-            for number, size in enumerate(sizes):
-                self._pass(number, size, spp)
+            for number, step in enumerate(self._steps(spp)):
+                self._pass(step)
                 # The second pass is recorded while the first, a short one, runs.
-                if watched or number > 0 or len(sizes) == 1:
+                if watched or number > 0:
                     self._wait()
+                if step.last and self.settings.variance:
+                    self.accumulator.close_replicate()
                 if on_pass is not None:
                     on_pass(self.report(spp))
-                late = 0 <= self.settings.timeout <= time.perf_counter() - self.started
-                if late or cancelled():
+                if 0 <= timeout <= time.perf_counter() - self.started or cancelled():
                     break
         finally:
             try:
@@ -315,35 +352,55 @@ class Render:
             finally:
                 self.accumulator.finish()
 
-    def _pass(self, number: int, size: int, spp: int):
-        done = sum(self.accumulator.passes)
-        for launch, batch in enumerate(batches(self.camera, done, size, self.settings)):
+    def _steps(self, spp: int):
+        """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
+        for step in schedule(self.camera, spp, self.settings):
+            done, end = step.done, step.done + step.size
+            while done < end:
+                size = min(end - done, self._affordable(step.size))
+                yield replace(step, done=done, size=size, last=step.last and done + size == end)
+                done += size
+
+    def _affordable(self, size: int) -> int:
+        if self.settings.timeout < 0 or self.settings.points == "sampler":
+            return size
+        busy = time.perf_counter() - self.started - self.compile_seconds
+        rate = sum(self.accumulator.passes) / max(busy, 1e-3)
+        return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
+
+    def _pass(self, step: Step):
+        first = not self.accumulator.passes
+        for launch, batch in enumerate(batches(self.camera, step.done, step.size, self.settings)):
             if launch:
                 self._wait()
-            drawn = self._points(number, batch, spp)
-            counts = trace(self.kernel, self.accumulator, batch, drawn, spp)
+            drawn = self._points(step, batch)
+            counts = trace(self.kernel, self.accumulator, batch, drawn, step.of)
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 self.accumulator.evaluate(counts)
             self._running.append(counts)
-        self.accumulator.close_pass(size)
-        if number == 0 and self.plan.roulette:
+        self.accumulator.close_pass(step.size)
+        if first and self.plan.roulette:
             self.kernel.set_threshold(self.accumulator.mean())
 
-    def _points(self, number, batch, spp):
+    def _points(self, step, batch):
+        seed = self.seed
+        if step.replicate:  # a sequence of its own
+            seed = mi.sample_tea_32(self.seed, mi.UInt32(step.replicate))[1]
+            dr.make_opaque(seed)
         if self.settings.points != "sampler":
-            return points.Points(self.settings.points, self.seed)
+            return points.Points(self.settings.points, seed)
         # One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do.
         sampler = self._samplers.get(batch.first_pixel)
-        if sampler is None:
+        if sampler is None or step.done == 0:
             sampler = self.sensor.sampler().clone()
-            sampler.set_sample_count(spp)
+            sampler.set_sample_count(step.of)
             sampler.set_samples_per_wavefront(batch.samples)
-            seed = mi.sample_tea_32(self.seed, mi.UInt32(batch.first_pixel))[0]
-            sampler.seed(seed, batch.pixels * batch.samples)
+            band = mi.sample_tea_32(seed, mi.UInt32(batch.first_pixel))[0]
+            sampler.seed(band, batch.pixels * batch.samples)
             self._samplers[batch.first_pixel] = sampler
         else:
             sampler.advance()
-        drawn = points.Points("sampler", self.seed, sampler)
+        drawn = points.Points("sampler", seed, sampler)
         sampler.schedule_state()
         dr.eval()
         return drawn
@@ -387,6 +444,7 @@ class Render:
             "passes": list(self.accumulator.passes),
             "non_finite": self._counts["non_finite"],
             "kernels": {"compiled": self.compiled, "cached": self.cached},
+            **({"error": self.accumulator.error()} if self.settings.variance else {}),
             "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
         }
 
@@ -430,9 +488,8 @@ def _make_class():
             return self.settings.rr_depth
 
         def aov_names(self):
-            if not self.settings.strategy_images:
-                return []
-            return strategy_names(self.settings.max_depth)
+            depth = self.settings.max_depth if self.settings.strategy_images else 0
+            return layer_names(depth, self.settings.variance)
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             """Render ``scene``; see ``mi.Integrator.render`` for the arguments."""
@@ -557,12 +614,18 @@ def _resolve(scene, sensor):
 
 def _samples(sensor, spp, settings) -> int:
     spp = _integer(spp, "spp", 0)  # 0: the sampler's sample_count
-    if settings.points != "sampler":
-        return int(spp or sensor.sampler().sample_count())
-    sampler = sensor.sampler().clone()
-    if spp:
+    sampler = sensor.sampler()
+    if spp and settings.points == "sampler":
+        sampler = sampler.clone()
         sampler.set_sample_count(spp)  # stratified samplers round it
-    return int(sampler.sample_count())
+        spp = 0
+    spp = int(spp or sampler.sample_count())
+    if settings.variance and spp < REPLICATES:
+        raise ValueError(
+            f"bdpt: variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
+            "samples per pixel, one for each independent part of the render"
+        )
+    return spp
 
 
 def _log(statistics: dict):

@@ -32,6 +32,7 @@ class Settings:
     points: str
     stored_vertices: int
     strategy_images: bool
+    variance: bool
     spp_per_pass: int
     timeout: float
 

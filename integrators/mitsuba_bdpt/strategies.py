@@ -1,4 +1,4 @@
-"""The numbering of strategies: which (s, t) exist, their order and their names as film layers."""
+"""The numbering of strategies: which (s, t) exist, and the film's layers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,11 @@ def strategy_index(s, t):
     return (k - 1) * (k + 2) // 2 + s
 
 
-def strategy_names(depth: int) -> list[str]:
-    """Names of the film's layers, in the order in which `Accumulator` keeps them."""
-    return [
+def layer_names(depth: int, variance: bool) -> list[str]:
+    """Names of the film's layers, in the order in which `Accumulator` keeps them: the variance of the
+    pixels, and technique images of paths of up to ``depth`` edges."""
+    names = [f"variance.{channel}" for channel in "RGB"] if variance else []
+    return names + [
         f"{kind}.s{s}t{t}.{channel}"
         for _, s, t in strategies(depth)
         for kind in ("weighted", "unweighted")

@@ -1,0 +1,130 @@
+"""Error bars: the layers `variance.R` … and `statistics["error"]`."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import integrator as module
+from mitsuba_bdpt.film import Replicates
+from mitsuba_bdpt.sensors import Camera
+
+
+def scene(rfilter="box", width=12, sampler="independent"):
+    box = mi.cornell_box()
+    film = {"type": "hdrfilm", "width": width, "height": 12, "rfilter": {"type": rfilter}}
+    box["sensor"]["film"] = film | {"pixel_format": "rgb", "component_format": "float32"}
+    box["sensor"]["sampler"] = {"type": sampler, "sample_count": 16}
+    return mi.load_dict(box)
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 4, "variance": True} | parameters)
+
+
+def renders(integrator, target, seeds, spp):
+    images = [np.array(integrator.render(target, seed=s, spp=spp), dtype=np.float64) for s in seeds]
+    return np.stack(images)
+
+
+def test_weighted_variance_of_a_mean():
+    """Rationale: replicates may differ in size. Expected: images 1, 2, 4 of 1, 1, 2 samples have the
+    weighted mean 11/4 and sum n (x - mean)^2 = 49/16 + 9/16 + 2 * 25/16 = 27/4, hence the variance
+    27/4 / (4 * 2) of four samples, and 27/4 / (5 * 2) if a fifth belongs to no replicate.
+    """
+    replicates, total, spp = Replicates(), 0.0, 0
+    for x, n in ((1.0, 1), (2.0, 1), (4.0, 2)):
+        total, spp = total + x * n, spp + n
+        replicates.add([np.array([total])], spp, lambda sums, n: sums / n)
+    assert replicates.mean[0] == pytest.approx(11 / 4)
+    assert replicates.variance(4)[0] == pytest.approx(27 / 32)
+    assert replicates.variance(5)[0] == pytest.approx(27 / 40)
+    assert np.isinf(Replicates().variance(4, (2, 3))).all()
+
+
+@pytest.mark.parametrize(
+    ("rfilter", "parameters"),
+    [
+        ("box", {}),
+        ("gaussian", {"skip": "none"}),
+        ("box", {"points": "independent", "light_paths": 0}),
+        ("box", {"points": "sampler"}),
+    ],
+)
+def test_variance_is_the_spread_over_seeds(rfilter, parameters):
+    """Rationale: error bars are worth what they predict. Expected: the estimate, averaged over 64
+    seeds and the pixels, is the variance of the pixels over these seeds, splats included; both
+    relative to the pixels' squared mean, so that the few at the lamp's rim do not decide alone.
+    Tolerance: 10 %: 64 seeds give each pixel's variance to 18 %, 144 pixels of three partly correlated
+    channels give the mean to 2 %. Statistic: ratio of means.
+    """
+    target = scene(rfilter, sampler="multijitter" if "points" in parameters else "independent")
+    integrator = bdpt(**parameters)
+    assert integrator.aov_names() == ["variance.R", "variance.G", "variance.B"]
+    result = renders(integrator, target, range(64), 16)
+    images, estimates = result[..., :3], result[..., 3:]
+    scale = images.mean(0) ** 2 + 0.01 * images.mean() ** 2
+    expected = (images.var(0, ddof=1) / scale).mean()
+    assert (estimates.mean(0) / scale).mean() == pytest.approx(expected, rel=0.1)
+
+
+def test_error_is_the_relative_error_of_the_image():
+    """Expected: statistics["error"], averaged over 32 seeds, is the relMSE against a long render.
+    Tolerance: 15 %: the estimate divides by the noisy mean (some 5 % at this error), the rest as above.
+    """
+    target, integrator = scene(), bdpt()
+    errors, images = [], []
+    for seed in range(32):
+        images.append(np.array(integrator.render(target, seed=seed, spp=64), dtype=np.float64)[..., :3])
+        errors.append(integrator.statistics["error"])
+    reference = np.array(integrator.render(target, seed=99, spp=8192), dtype=np.float64)[..., :3]
+    expected = [((x - reference) ** 2 / (reference**2 + 0.01 * reference.mean() ** 2)).mean() for x in images]
+    assert np.mean(errors) == pytest.approx(np.mean(expected), rel=0.15)
+
+
+def test_the_image_is_as_good_with_it():
+    """Rationale: eight short point sequences instead of one. Expected: the mean is that of a render
+    without `variance` (2 %, four standard errors), and all samples count.
+    """
+    target = scene()
+    integrator = bdpt()
+    a = renders(integrator, target, range(8), 100)[..., :3]
+    assert sum(integrator.statistics["passes"]) == 100
+    b = renders(bdpt(variance=False), target, range(20, 28), 100)
+    assert b.shape[-1] == 3 and "error" not in bdpt(variance=False).statistics
+    assert a.mean() == pytest.approx(b.mean(), rel=0.02)
+
+
+def test_schedule_of_replicates():
+    """Expected: eight parts that differ by one sample at most, each counted from 0, the first pass
+    of all with one sample for the scale of roulette; without `variance` one part.
+    """
+    settings, camera = bdpt().settings, Camera(scene().sensors()[0])
+    steps = module.schedule(camera, 19, settings)
+    assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
+    assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)
+    assert all(s.done == 0 and s.size == s.of for s in steps[2:])
+    assert [s.replicate for s in module.schedule(camera, 19, bdpt(variance=False).settings)] == [0, 0]
+
+
+def test_interrupted_before_there_is_a_spread():
+    """Expected: with fewer than two replicates the variance is infinite, not a small number."""
+    target, integrator = scene(), bdpt(timeout=0.0)
+    result = np.array(integrator.render(target, spp=16))
+    assert np.isinf(result[..., 3:]).all() and np.isfinite(result[..., :3]).all()
+    assert integrator.statistics["error"] == np.inf
+
+
+def test_too_few_samples_are_refused():
+    with pytest.raises(ValueError, match=r"variance=True with spp=7 .* at least 8 samples per pixel"):
+        bdpt().render(scene(), spp=7)
+
+
+def test_beside_strategy_images():
+    """Expected: layers of both, the variance first; technique images still add up to the image."""
+    target, integrator = scene(), bdpt(strategy_images=True)
+    names = integrator.aov_names()
+    result = np.array(integrator.render(target, spp=32))
+    layers = dict(zip(names, np.moveaxis(result[..., 3:], -1, 0), strict=True))
+    assert names[:3] == ["variance.R", "variance.G", "variance.B"]
+    total = sum(layer for name, layer in layers.items() if name.startswith("weighted") and name.endswith("R"))
+    np.testing.assert_allclose(total, result[..., 0], rtol=1e-3, atol=1e-5)
+    assert layers["variance.R"].mean() > 0
