@@ -9,24 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from metrics import Sample, sidak, tile_means  # noqa: F401  (tile_means for the tests)
+from metrics import welch as difference
 from scipy import stats
 
 # Level of a whole family of comparisons, after Sidak's correction. Seeds are fixed, so a test
 # passes or fails for good; a change of the random numbers draws anew, with this chance per family
 # of a false alarm.
 LEVEL = 1e-3
-
-# What float32 arithmetic alone may do to a tile's mean, relative: differences below are no finding.
-ROUNDING = 2e-5
-
-
-def tile_means(image, tiles: int) -> np.ndarray:
-    """Means over ``tiles`` x ``tiles`` tiles of an image (height, width, channels), flattened to
-    (tiles * tiles, channels). The size must be divisible by ``tiles``."""
-    image = np.asarray(image, dtype=np.float64)
-    h, w, c = image.shape
-    parts = image.reshape(tiles, h // tiles, tiles, w // tiles, c)
-    return parts.mean(axis=(1, 3)).reshape(tiles * tiles, c)
 
 
 @dataclass
@@ -52,49 +42,25 @@ class Comparisons:
 
 
 def welch(a, b, label="", labels=None) -> Comparisons:
-    """Welch's unequal-variances t-test of each column of ``a`` (renders, m) against ``b``'s.
-
-    Two-sided. Differences within `ROUNDING` of the larger mean count as none. A column in which
-    both sides are nonzero in less than 9 of 10 renders is left to the image's mean: a few lumps
-    are not normal.
-    """
-    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
-    mean_a, mean_b = a.mean(0), b.mean(0)
-    var_a, var_b = a.var(0, ddof=1) / len(a), b.var(0, ddof=1) / len(b)
-    floor = ROUNDING * np.maximum(np.abs(mean_a), np.abs(mean_b))
-    error = np.sqrt(var_a + var_b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.maximum(np.abs(mean_a - mean_b) - floor, 0) / error
-        dof = (var_a + var_b) ** 2 / (var_a**2 / (len(a) - 1) + var_b**2 / (len(b) - 1))
-        t, dof = (
-            np.where(error > 0, t, np.where(floor < np.abs(mean_a - mean_b), np.inf, 0)),
-            (np.where(np.isfinite(dof), dof, 1)),
-        )
-    return _comparisons(a, b, t, dof, error > 10 * floor, label, labels, mean_a, mean_b, error)
+    """Welch's unequal-variances t-test of each column of ``a`` (renders, m) against ``b``'s, by
+    `metrics.welch`: a column in which both sides are often zero is left to the image's mean."""
+    return _comparisons(Sample.of(a), Sample.of(b), label, labels)
 
 
 def one_sample(a, expected, label="", labels=None) -> Comparisons:
     """Student's t-test of each column of ``a`` (renders, m) against the known value ``expected``."""
-    a = np.asarray(a, dtype=np.float64)
-    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64), a.shape[1:])
-    mean, error = a.mean(0), a.std(0, ddof=1) / np.sqrt(len(a))
-    floor = ROUNDING * np.abs(expected)
-    gap = np.abs(mean - expected)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(error > 0, np.maximum(gap - floor, 0) / error, np.where(gap > floor, np.inf, 0))
-    always = np.ones_like(a)
-    return _comparisons(a, always, t, len(a) - 1.0, error > 10 * floor, label, labels, mean, expected, error)
+    a = Sample.of(a)
+    return _comparisons(a, Sample.known(np.broadcast_to(expected, a.mean.shape)), label, labels)
 
 
-def _comparisons(a, b, t, dof, noisy, label, labels, mean_a, mean_b, error):
-    p = 2 * stats.t.sf(t, dof)
-    common = np.maximum((a != 0).mean(0), (b != 0).mean(0)) >= 0.9
-    names = labels or [f"tile {i}" for i in range(a.shape[1])]
+def _comparisons(a: Sample, b: Sample, label, labels):
+    found = difference(a, b)
+    names = labels or [f"tile {i}" for i in range(len(a.mean))]
     text = [
         f"{label} {name}: {x:.6g} vs {y:.6g} +- {e:.2g}"
-        for name, x, y, e in zip(names, mean_a, mean_b, error, strict=True)
+        for name, x, y, e in zip(names, a.mean, b.mean, found.error, strict=True)
     ]
-    return Comparisons(np.where(common, p, 1.0), text, noisy & common)
+    return Comparisons(found.p, text, found.continuous)
 
 
 def compare_images(a, b, label="") -> Comparisons:
@@ -115,12 +81,6 @@ def compare_known(a, expected, label="") -> Comparisons:
     whole = one_sample(np.mean(a, 1, keepdims=True), np.mean(expected), label, ["image"])
     whole.continuous[:] = False
     return Comparisons.join([tiles, whole])
-
-
-def sidak(p) -> float:
-    """Chance that the smallest of so many independent p-values is as small as it is."""
-    p = np.asarray(p, dtype=np.float64)
-    return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 1 - 1e-16))))
 
 
 def uniformity(p) -> float:

@@ -1,0 +1,606 @@
+"""The measures of scripts/metrics.py against values worked out by hand.
+
+Each docstring or comment has the arithmetic. Where a bound is statistical it is named; seeds are fixed.
+"""
+
+import os
+import subprocess
+import sys
+
+import metrics
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from metrics import Estimate, Measurement, Sample
+from scipy import stats
+
+quick = settings(deadline=None, max_examples=40, derandomize=True)
+images = arrays(np.float64, (2, 3, 3), elements=st.floats(2**-6, 64, width=32))
+factors = st.floats(1e-3, 1e3)
+
+
+def row(*values):
+    """An image of one row of gray pixels."""
+    return np.repeat(np.array(values, dtype=np.float64)[None, :, None], 3, axis=2)
+
+
+def pixel(r, g, b):
+    return np.array([[[r, g, b]]], dtype=np.float64)
+
+
+# Mean 2, so eps of relMSE is 0.01 * 4 = 0.04 and eps1 of the MAPE 0.01 * 2 = 0.02.
+REFERENCE, IMAGE = row(0, 2, 4), row(0.2, 3, 2)
+
+
+def test_mse():
+    """((0.2)^2 + 1^2 + 2^2) / 3 = 5.04 / 3 = 1.68."""
+    assert metrics.mse(IMAGE, REFERENCE) == pytest.approx(1.68, rel=1e-12)
+
+
+def test_rel_mse():
+    """0.04 / (0 + 0.04) = 1, 1 / (4 + 0.04), 4 / (16 + 0.04): the mean of the three."""
+    assert metrics.rel_mse_epsilon(REFERENCE) == pytest.approx(0.04, rel=1e-12)
+    expected = (1 + 1 / 4.04 + 4 / 16.04) / 3
+    assert metrics.rel_mse(IMAGE, REFERENCE) == pytest.approx(expected, rel=1e-12)
+
+
+def test_rel_mse_epsilon_is_of_pixels_and_channels():
+    """Mean of (0, 3, 6) is 3; 0.01 * 9. Per channel it would be (0, 0.09, 0.36)."""
+    assert metrics.rel_mse_epsilon(pixel(0, 3, 6)) == pytest.approx(0.09, rel=1e-12)
+
+
+def test_trim_leaves_out_values():
+    """Of 1000 pixels with 3000 values three are wrong, two of them in one pixel; reference 1, eps 0.01.
+
+    Squares / 1.01: 100, 81, 64, and 2997 of 0.01. trim = 0.001 leaves out 3 values: 0.01 / 1.01 remains.
+    trim = 2/3000 leaves out two: (64 + 2997 * 0.01) / 2998 / 1.01. Two *pixels* out would leave 0.01 too.
+    """
+    reference = np.ones((20, 50, 3))
+    image = reference + 0.1
+    image[3, 4, 0], image[3, 4, 2], image[7, 7, 1] = 11, 10, 9
+    trimmed = metrics.rel_mse(image, reference, 0.001)
+    assert trimmed == pytest.approx(0.01 / 1.01, rel=1e-9)
+    two = metrics.rel_mse(image, reference, 2 / 3000)
+    assert two == pytest.approx((64 + 2997 * 0.01) / 2998 / 1.01, rel=1e-9)
+    assert metrics.rel_mse(image, reference) == pytest.approx((245 + 29.97) / 3000 / 1.01, rel=1e-9)
+
+
+def test_mape():
+    """0.2 / 0.02 = 10, 1 / 2.02, 2 / 4.02: the mean of the three."""
+    expected = (10 + 1 / 2.02 + 2 / 4.02) / 3
+    assert metrics.mape(IMAGE, REFERENCE) == pytest.approx(expected, rel=1e-12)
+    assert metrics.mape(row(0, 1), row(0, 1)) == 0
+
+
+@quick
+@given(images, images, factors)
+def test_relative_errors_do_not_change_with_brightness(image, reference, factor):
+    """Scaling both images leaves relMSE and MAPE as they are and multiplies the MSE by the square."""
+    for measure in (metrics.rel_mse, metrics.mape, lambda x, r: metrics.rel_mse(x, r, 0.2)):
+        expected = measure(image, reference)
+        assert measure(factor * image, factor * reference) == pytest.approx(expected, rel=1e-9)
+    expected = factor**2 * metrics.mse(image, reference)
+    assert metrics.mse(factor * image, factor * reference) == pytest.approx(expected, rel=1e-9)
+
+
+@quick
+@given(images, images, st.floats(0, 0.9))
+def test_trimming_only_lowers(image, reference, trim):
+    """The mean without the worst values is at most the mean; an image is no different from itself."""
+    raw = metrics.rel_mse(image, reference)
+    assert 0 <= metrics.rel_mse(image, reference, trim) <= raw * (1 + 1e-12)
+    assert metrics.rel_mse(reference, reference, trim) == 0
+
+
+def test_energy_in_black():
+    """Pixel 0 is black, pixel 1 in one channel only: 3 * 0.5 of 3 * (0.5 + 2 + 3.5) is 1/12."""
+    reference = row(0, 2, 4)
+    reference[0, 1, 0] = 0
+    assert metrics.energy_in_black(row(0.5, 2, 3.5), reference) == pytest.approx(1 / 12, rel=1e-12)
+    assert metrics.energy_in_black(row(0, 0, 0), reference) == 0
+    assert metrics.energy_in_black(row(1, 0, 0), reference) == 1
+    with pytest.raises(ValueError, match="image holds negative values down to -1"):
+        metrics.energy_in_black(row(-1, 0, 0), reference)
+
+
+def test_tone_map():
+    """x = 0.25 at one stop is 0.5: 1.055 * 0.5^(1/2.4) - 0.055 = 1.055 * 0.749154 - 0.055 = 0.735357.
+
+    0.0005 becomes 0.001 and 12.92 * 0.001; what is outside [0, 1] after the exposure is clipped, so 0.6
+    is white at one stop.
+    """
+    shown = metrics.tone_map(row(0.25, 0.0005, 0.6, -1), 1)
+    assert shown == pytest.approx(row(0.735357, 0.01292, 1, 0), abs=1e-6)
+    assert metrics.tone_map(row(0.5), 0) == pytest.approx(row(0.735357), abs=1e-6)
+    assert metrics.tone_map(row(0.25), -1)[0, 0, 0] == pytest.approx(1.055 * 0.125 ** (1 / 2.4) - 0.055)
+
+
+def test_delta_e_2000():
+    """Grays have only lightness: dE = dL / S_L, L* = 116 Y^(1/3) - 16, S_L = 1 + 0.015 d^2 / sqrt(20 + d^2)
+    with d = mean L* - 50.
+
+    Black and white: dL = 100, d = 0, so 100. Y = 0.5^3 and 0.7^3: L* = 42 and 65.2, d = 3.6,
+    S_L = 1 + 0.015 * 12.96 / sqrt(32.96) = 1.033861, dE = 23.2 / 1.033861 = 22.4402. Red and green: 86.608
+    by the formula of Sharma et al. with the unrounded matrix of sRGB. The mean over pixels: (100 + 0) / 2.
+    """
+    black, white = pixel(0, 0, 0), pixel(1, 1, 1)
+    assert metrics.delta_e_2000(black, white) == pytest.approx(100, abs=1e-3)
+    assert metrics.delta_e_2000(row(0.125), row(0.343)) == pytest.approx(22.4402, abs=1e-3)
+    assert metrics.delta_e_2000(pixel(1, 0, 0), pixel(0, 1, 0)) == pytest.approx(86.608, abs=0.02)
+    assert metrics.delta_e_2000(row(0, 0.5), row(1, 0.5)) == pytest.approx(50, abs=1e-3)
+    exposed = metrics.delta_e_2000(row(0.25), row(0.686), -1)
+    assert exposed == pytest.approx(22.4402, abs=1e-3)
+
+
+def pq(luminance):
+    """Inverse EOTF of SMPTE ST 2084 for cd/m^2: ((c1 + c2 y^m1) / (1 + c3 y^m1))^m2, y = L / 10000."""
+    y = (np.asarray(luminance) / 1e4) ** (2610 / 16384)
+    return ((3424 / 4096 + 2413 / 128 * y) / (1 + 2392 / 128 * y)) ** (2523 / 32)
+
+
+def test_delta_e_itp():
+    """For grays L = M = S, so C_T = C_P = 0 and dE = 720 |PQ(Y) - PQ(Y')|.
+
+    PQ(100) = 0.508078, PQ(0) = 7e-7: black and white are 365.816 apart. Red against green by the matrices
+    of BT.2087 (sRGB to BT.2020), BT.2100 (to LMS, and L'M'S' to I, C_T / 2, C_P).
+    """
+    assert pq(100.0) == pytest.approx(0.508078, abs=1e-6)
+    assert metrics.delta_e_itp(pixel(0, 0, 0), pixel(1, 1, 1)) == pytest.approx(365.816, abs=0.01)
+    expected = 720 * (pq(50.0) - pq(25.0))
+    assert metrics.delta_e_itp(row(0.25), row(0.5)) == pytest.approx(expected, rel=1e-3)
+    assert metrics.delta_e_itp(row(0.5), row(1), -1) == pytest.approx(expected, rel=1e-3)
+    assert metrics.delta_e_itp(row(0.25), row(0.5), white=200) == pytest.approx(720 * (pq(100.0) - pq(50.0)))
+
+    to_2020 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
+    to_lms = np.array([[1688, 2146, 262], [683, 2951, 462], [99, 309, 3688]]) / 4096
+    to_itp = np.array([[2048, 2048, 0], [3305, -6806.5, 3501.5], [17933, -17390, -543]]) / 4096
+    red, green = (to_itp @ pq(100 * to_lms @ to_2020 @ np.array(rgb)) for rgb in ([1, 0, 0], [0, 1, 0]))
+    itp = 720 * np.linalg.norm(red - green)
+    assert metrics.delta_e_itp(pixel(1, 0, 0), pixel(0, 1, 0)) == pytest.approx(itp, rel=1e-3)
+
+
+@pytest.mark.parametrize("measure", [metrics.delta_e_2000, metrics.delta_e_itp])
+def test_colour_differences_are_of_what_is_shown(measure):
+    """Above white all looks the same, and an image is no different from itself."""
+    assert measure(row(2, 3, 0.5), row(7, 1, 0.5)) == pytest.approx(0, abs=1e-9)
+    assert measure(row(0.5, 0.25), row(0.25, 0.5)) > 1
+
+
+def test_hdr_flip():
+    """HDR-FLIP is 0 for equal images, grows with the difference, and is local.
+
+    A change in a corner of 96 x 64 pixels is not felt at the opposite one: the filters of 67 pixels per
+    degree reach 10 or so. Scaling both images moves the exposures and changes nothing. The value of a
+    fixed pair is that of the package's own command `flip` 1.7.
+    """
+    reference = np.random.default_rng(1).random((64, 96, 3)) * 4
+    mean, error = metrics.hdr_flip(reference, reference)
+    assert mean == 0 and error.shape == (64, 96) and not error.any()
+    changed = reference.copy()
+    changed[:8, :8] *= 2
+    mean, error = metrics.hdr_flip(changed, reference)
+    assert mean == pytest.approx(error.mean(), rel=1e-4)
+    assert error[:8, :8].min() > 0.05 and error[32:, 48:].max() < 1e-4
+    assert metrics.hdr_flip(2 * reference, reference)[0] > mean
+    assert metrics.hdr_flip(1e3 * changed, 1e3 * reference)[0] == pytest.approx(mean, rel=1e-3)
+    # The reference decides the exposures, so the order matters.
+    there, back = metrics.hdr_flip(row(0.5), row(1))[0], metrics.hdr_flip(row(1), row(0.5))[0]
+    assert there == pytest.approx(0.232887, abs=1e-4) and back == pytest.approx(0.144833, abs=1e-4)
+
+
+def test_hdr_flip_sees_light_in_black():
+    """A reference that is black for more than half: flip-evaluator 1.6 reports 0 for any image."""
+    reference = np.zeros((16, 16, 3))
+    reference[:4] = 1
+    mean, error = metrics.hdr_flip(reference + 0.1, reference)
+    assert mean > 0.5 and error[8:].min() > 0.5
+
+
+def test_hdr_flip_refuses_what_ends_the_process():
+    """flip-evaluator calls exit() on a black reference; ours raises, in words, and prints nothing.
+
+    In a process of its own: the output of C++ does not pass through Python.
+    """
+    code = """
+import numpy as np, metrics
+dark, gray = np.zeros((4, 4, 3)), np.ones((4, 4, 3))
+for image, reference in ((gray, dark), (gray, 2.3e-7 * gray), (-gray, gray), (1e39 * gray, gray)):
+    try:
+        metrics.hdr_flip(image, reference)
+    except ValueError:
+        continue
+    raise SystemExit("not refused")
+metrics.hdr_flip(gray, 2.5e-7 * gray)
+metrics.hdr_flip(dark, gray)
+"""
+    path = os.path.dirname(metrics.__file__)
+    found = [path, *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(found)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+PAIRS = [
+    metrics.mse,
+    metrics.rel_mse,
+    metrics.mape,
+    metrics.energy_in_black,
+    metrics.delta_e_2000,
+    metrics.delta_e_itp,
+    metrics.hdr_flip,
+]
+
+
+@pytest.mark.parametrize("measure", PAIRS)
+def test_bad_images_are_refused(measure):
+    """Each measure names the parameter, its value and the remedy, on either side."""
+    good, bad = np.ones((2, 4, 3)), np.ones((2, 4, 3))
+    bad[1, 2, 0] = np.nan
+    with pytest.raises(
+        ValueError, match=r"image holds 1 values that are NaN.*nan at index \(1, 2, 0\); find"
+    ):
+        measure(bad, good)
+    bad[1, 3, 0] = np.inf
+    with pytest.raises(ValueError, match="reference holds 2 values that are NaN or infinite"):
+        measure(good, bad)
+    with pytest.raises(ValueError, match=r"image has shape \(4, 2, 3\) and reference \(2, 4, 3\); render"):
+        measure(np.ones((4, 2, 3)), good)
+    with pytest.raises(ValueError, match=r"image has shape \(2, 4, 4\).*drop other channels"):
+        measure(np.ones((2, 4, 4)), good)
+    with pytest.raises(ValueError, match=r"reference has shape \(4, 3\)"):
+        measure(good, np.ones((4, 3)))
+    with pytest.raises(TypeError, match="image has values of type uint8; give linear radiance"):
+        measure(np.ones((2, 4, 3), dtype=np.uint8), good)
+    with pytest.raises(ValueError, match="image holds arrays of unlike shapes"):
+        measure([[[1.0, 2.0, 3.0]], [[1.0]]], good)
+
+
+@pytest.mark.parametrize("measure", [metrics.rel_mse, metrics.mape])
+def test_black_references_are_refused(measure):
+    with pytest.raises(ValueError, match="reference has mean 0.*use mse"):
+        measure(np.ones((2, 2, 3)), np.zeros((2, 2, 3)))
+
+
+@pytest.mark.parametrize("trim", [-0.1, 1, np.nan, 0.99])
+def test_bad_trims_are_refused(trim):
+    """0.99 of 6 values rounds to all of them."""
+    with pytest.raises(ValueError, match="trim="):
+        metrics.rel_mse(row(1, 2), row(1, 2), trim)
+
+
+@pytest.mark.parametrize("value", ["1", None, True])
+def test_what_is_no_number_is_refused(value):
+    with pytest.raises(TypeError, match="exposure=.* must be a number"):
+        metrics.tone_map(row(1), value)
+
+
+def test_tile_means():
+    """Values 0 to 15 in 4 x 4: the upper left tile holds 0, 1, 4, 5, mean 2.5; then 4.5, 10.5, 12.5."""
+    image = np.arange(16.0).reshape(4, 4)[..., None] * [1, 2, 3]
+    expected = np.array([2.5, 4.5, 10.5, 12.5])[:, None] * [1, 2, 3]
+    assert metrics.tile_means(image, 2) == pytest.approx(expected)
+    for tiles in (3, 0, 2.0):
+        with pytest.raises(ValueError, match=f"tiles={tiles}.*divides height 4 and width 4"):
+            metrics.tile_means(image, tiles)
+
+
+def test_welch():
+    """Means 2 and 5, variances 1 and 4, 3 and 4 values: t = 3 / sqrt(1/3 + 1), freedom
+    (4/3)^2 / ((1/3)^2 / 2 + 1^2 / 3) = 1.7777 / 0.38889 = 4.5714. SciPy's `ttest_ind` gives p."""
+    a, b = np.array([1.0, 2, 3]), np.array([3.0, 4, 5, 8])
+    b = 5 + (b - 5) * np.sqrt(4 / np.var(b, ddof=1))
+    found = metrics.welch(Sample.of(a[:, None]), Sample.of(b[:, None]))
+    assert found.value[0] == pytest.approx(-3)
+    assert found.error[0] == pytest.approx(np.sqrt(4 / 3))
+    assert found.freedom[0] == pytest.approx(4.5714, abs=1e-4)
+    assert found.p[0] == pytest.approx(stats.ttest_ind(a, b, equal_var=False).pvalue, rel=1e-3)
+    # Against a known value it is Student's test: freedom 2.
+    found = metrics.welch(Sample.of(a[:, None]), Sample.known([5.0]))
+    assert found.freedom[0] == pytest.approx(2)
+    assert found.p[0] == pytest.approx(stats.ttest_1samp(a, 5).pvalue, rel=1e-3)
+
+
+def test_welch_leaves_out_rounding_and_lumps():
+    """Without noise only differences above 2e-5 count; tiles nonzero in 8 of 10 renders do not."""
+    exact = metrics.welch(Sample.known([1.0, 1.0]), Sample.known([1 + 1e-5, 1 + 3e-5]))
+    assert exact.p.tolist() == [1, 0] and not exact.continuous.any()
+    lumps = np.zeros((10, 2))
+    lumps[:8, 0] = lumps[:9, 1] = 1 + np.arange(9)[:, None][:8, 0].mean()
+    noise = np.random.default_rng(0).normal(0, 0.1, lumps.shape) * (lumps > 0)
+    found = metrics.welch(Sample.of(lumps + noise), Sample.of(0 * lumps))
+    assert found.p[0] == 1 and found.p[1] < 1e-3
+    assert found.continuous.tolist() == [False, True]
+
+
+def test_sidak():
+    """1 - (1 - 0.01)^3 = 0.029701."""
+    assert metrics.sidak([0.01, 0.5, 0.7]) == pytest.approx(0.029701, abs=1e-9)
+
+
+def renders(seed, count=16, shape=(8, 8, 3), mean=1.0):
+    """Renders whose values are uniform in mean * [0.5, 1.5]: variance mean^2 / 12."""
+    return mean * np.random.default_rng(seed).uniform(0.5, 1.5, (count, *shape))
+
+
+def test_bias_check_passes_what_agrees():
+    """No bias: passes; 4 * 4 * 3 tiles and 3 channels of the image make 51 comparisons."""
+    check = metrics.bias_check(renders(1), renders(2, 32))
+    assert check.passed and check.comparisons == 51
+    assert check.family_p == pytest.approx(1 - (1 - check.p) ** 51)
+    assert check.difference.low < 0 < check.difference.high
+    assert check.missing.low < 0 < check.missing.high
+    # The interval at 95 %: error sqrt((1/16 + 1/32) / 12 / 192) = 0.0064, times 2.
+    assert check.missing.high - check.missing.low == pytest.approx(4 * 0.0064, rel=0.4)
+
+
+def test_bias_check_finds_a_tile():
+    """The tile in row 2, column 1 lacks 0.3 in channel 1: it is named, and the missing energy is
+    0.3 / (16 tiles * 3 channels) = 0.6 %. Its p is that of SciPy's test of the tile's means."""
+    images, references = renders(1), renders(2)
+    images[:, 4:6, 2:4, 1] *= 0.7
+    check = metrics.bias_check(images, references)
+    assert not check.passed and (check.tile, check.channel) == ((2, 1), 1)
+    means = [x[:, 4:6, 2:4, 1].mean((1, 2)) for x in (images, references)]
+    test = stats.ttest_ind(*means, equal_var=False)
+    assert check.p == pytest.approx(test.pvalue, rel=1e-2)
+    interval = test.confidence_interval((1 - 1e-3) ** (1 / 51))
+    expected = (means[0].mean() - means[1].mean(), interval.low, interval.high)
+    found = check.difference
+    assert (found.value, found.low, found.high) == pytest.approx(expected, rel=1e-9)
+    whole = 1 - images.mean() / references.mean()
+    assert check.missing.value == pytest.approx(whole, rel=1e-9) and abs(whole - 0.006) < 0.02
+
+
+def test_bias_check_finds_what_is_common_to_all_tiles():
+    """2 % everywhere: in a tile of 4 pixels it is 0.02 / sqrt(2 / 12 / 4 / 16) = 0.4 standard errors,
+    in the image of 1024 pixels 6.3. The missing energy is 2 % within its interval."""
+    shape = (32, 32, 3)
+    check = metrics.bias_check(renders(3, shape=shape, mean=0.98), renders(4, shape=shape), tiles=16)
+    assert not check.passed and check.tile is None
+    assert check.missing.low < 0.02 < check.missing.high and check.missing.low > 0.01
+
+
+def test_bias_check_of_a_black_image():
+    """`path` where it finds nothing: all energy is missing, without doubt."""
+    check = metrics.bias_check(np.zeros((8, 8, 8, 3)), renders(1))
+    assert not check.passed and check.p < 1e-12
+    assert (check.missing.value, check.missing.low, check.missing.high) == (1, 1, 1)
+
+
+def test_bias_check_names_the_largest_of_certain_differences():
+    """Without noise every difference has p = 0: the tile that is off by 0.5 is named, not the first."""
+    image = np.ones((4, 4, 3))
+    image[0, 0], image[2:, 2:, 2] = 1.125, 1.5
+    check = metrics.bias_check([image] * 8, np.ones((4, 4, 3)), 2, standard_error=np.zeros((4, 4, 3)))
+    assert check.p == 0 and (check.tile, check.channel) == ((1, 1), 2)
+    assert check.difference == Estimate(0.5, 0.5, 0.5)
+
+
+def test_bias_check_against_one_reference():
+    """Mean and standard error of many renders serve as they do themselves.
+
+    The tiles' errors follow from the pixels': the interval of the difference agrees within the 20 % by
+    which errors from 16 renders of a tile scatter. A reference without error tests as Student's test does.
+    """
+    images, references = renders(1, 32), renders(2, 16)
+    images[:, :2, :2, 0] *= 0.7
+    runs = metrics.bias_check(images, references)
+    error = references.std(0, ddof=1) / 4
+    single = metrics.bias_check(images, references.mean(0), standard_error=error)
+    assert (single.tile, single.channel, single.passed) == ((0, 0), 0, False)
+    assert single.difference.value == pytest.approx(runs.difference.value)
+    widths = [x.difference.high - x.difference.low for x in (single, runs)]
+    assert widths[0] == pytest.approx(widths[1], rel=0.25)
+    exact = metrics.bias_check(images, references.mean(0), standard_error=0 * error)
+    means = images[:, :2, :2, 0].mean((1, 2))
+    expected = stats.ttest_1samp(means, references[:, :2, :2, 0].mean()).pvalue
+    assert exact.p == pytest.approx(expected, rel=1e-2)
+
+
+def test_error_of_a_tile_follows_from_its_pixels():
+    """Four pixels with standard errors 1, 1, 3, 1: the mean's is sqrt(12) / 4. All 16 pixels of the image,
+    12 others with 0: sqrt(12) / 16; the mean of equal channels has that too, as if fully correlated."""
+    error = np.zeros((4, 4, 3))
+    error[:2, :2] = np.array([[1, 1], [3, 1]])[..., None]
+    columns, whole, _ = metrics._reference_sample(np.ones((4, 4, 3)), error, 2)
+    assert columns.error[:3] == pytest.approx([np.sqrt(12) / 4] * 3)
+    assert columns.error[3:12] == pytest.approx(0)
+    assert columns.error[12:] == pytest.approx([np.sqrt(12) / 16] * 3)
+    assert whole.error == pytest.approx([np.sqrt(12) / 16])
+
+
+def test_missing_energy():
+    """Means 3 +- 0.1 and 4 +- 0.2, freedom 8 and 10: 1 - 3/4. Variances (0.1 / 4)^2 = 0.000625 and
+    (3 * 0.2 / 16)^2 = 0.00140625, freedom 0.00203125^2 / (0.000625^2 / 8 + 0.00140625^2 / 10) = 16.740,
+    t at 97.5 % 2.1124, so +- 2.1124 * 0.0450694 = 0.095205."""
+    one = np.ones(1)
+    found = metrics.missing_energy(Sample(3 * one, 0.1 * one, 8, one), Sample(4 * one, 0.2 * one, 10, one))
+    assert found.value == pytest.approx(0.25)
+    assert (found.low, found.high) == pytest.approx((0.25 - 0.095205, 0.25 + 0.095205), abs=2e-5)
+
+
+def test_bias_check_keeps_its_level():
+    """False alarms at a significance of 5 %, 300 families of 16 renders and 16 references with no bias.
+
+    Expected: 15; Welch's test in the far tail allows twice that. More than 40 have a binomial chance of
+    4 % if the level is 10 %, and fewer than 4 one of 2e-4 if it is 5 %.
+    """
+    failed = 0
+    for seed in range(300):
+        runs = renders(seed, 32, (4, 4, 3))
+        failed += not metrics.bias_check(runs[:16], runs[16:], 2, 0.05).passed
+    assert 4 <= failed <= 40
+
+
+def test_bias_check_refuses():
+    """Wrong shapes, too few renders, a reference without or with too much of an error, a black one."""
+    good, one = renders(1), np.ones((8, 8, 3))
+    with pytest.raises(ValueError, match=r"images has shape \(8, 8, 3\) and must have \(seeds,"):
+        metrics.bias_check(one, good)
+    with pytest.raises(ValueError, match="references has 7 renders, too few.*give 8 or more"):
+        metrics.bias_check(good, good[:7])
+    with pytest.raises(ValueError, match="standard_error=None: with one reference"):
+        metrics.bias_check(good, one)
+    with pytest.raises(ValueError, match="standard_error must be None"):
+        metrics.bias_check(good, good, standard_error=one)
+    with pytest.raises(ValueError, match="standard_error has shape .* from -1"):
+        metrics.bias_check(good, one, standard_error=-one)
+    with pytest.raises(ValueError, match=r"images have shape \(8, 8, 3\) and references \(4, 8, 3\)"):
+        metrics.bias_check(good, good[:, :4])
+    with pytest.raises(ValueError, match="references have mean 0"):
+        metrics.bias_check(good, 0 * good)
+    with pytest.raises(ValueError, match="significance=1 must be"):
+        metrics.bias_check(good, good, significance=1)
+    with pytest.raises(ValueError, match="tiles=5"):
+        metrics.bias_check(good, good, 5)
+
+
+def test_efficiency():
+    """1 / (4 s * 0.05) = 5."""
+    assert metrics.efficiency(4, 0.05) == pytest.approx(5)
+    for seconds, error in ((0, 1), (1, 0), (1, np.nan), (-1, 1)):
+        with pytest.raises(ValueError, match="must be finite and above 0"):
+            metrics.efficiency(seconds, error)
+
+
+def test_speedups():
+    """Ours 2 s and 0.01, the other 3 s and 0.04. In 2 s the other reaches 0.04 * 3 / 2 = 0.06, 6 times our
+    error; for 0.01 it needs 3 * 4 = 12 s, 6 times ours."""
+    ours, other = Measurement(2, 0.01), (3, 0.04)
+    assert metrics.equal_time_speedup(ours, other) == pytest.approx(6)
+    assert metrics.equal_error_speedup(ours, other) == pytest.approx(6)
+    assert metrics.equal_time_speedup(other, ours) == pytest.approx(1 / 6)
+    assert metrics.equal_error_speedup(other, ours) == pytest.approx(1 / 6)
+    for speedup in (metrics.equal_time_speedup, metrics.equal_error_speedup):
+        with pytest.raises(TypeError, match=r"other=3 must be a pair \(seconds, error\)"):
+            speedup(ours, 3)
+        with pytest.raises(ValueError, match="ours.error=0 must be"):
+            speedup((2, 0), other)
+
+
+@quick
+@given(st.tuples(factors, factors), st.tuples(factors, factors))
+def test_speedup_is_the_ratio_of_efficiencies(ours, other):
+    """With error ~ 1 / time both speed-ups are efficiency(ours) / efficiency(other)."""
+    expected = metrics.efficiency(*ours) / metrics.efficiency(*other)
+    assert metrics.equal_time_speedup(ours, other) == pytest.approx(expected)
+    assert metrics.equal_error_speedup(ours, other) == pytest.approx(expected)
+
+
+def test_slope():
+    """x = log 2 * (0, 1, 3), two runs at the first count and the last, four in the middle.
+
+    In units of log 2: mean x = (2 * 0 + 4 * 1 + 2 * 3) / 8 = 1.25, offsets -1.25, -0.25, 1.75,
+    sum of squares 2 * 1.5625 + 4 * 0.0625 + 2 * 3.0625 = 9.5. Mean logs 0, -2, -3:
+    (2 * 0 + 4 * 0.25 * 2 - 2 * 1.75 * 3) / 9.5 = -8.5 / 9.5.
+    """
+    errors = {1: [0.5, 2], 2: [0.25, 0.25, 0.125, 0.5], 8: [0.125, 0.125]}
+    found = metrics.slope(errors.keys(), errors.values())
+    assert found.value == pytest.approx(-8.5 / 9.5, rel=1e-12)
+    assert found.low < found.value < found.high
+    assert metrics.slope(errors.keys(), errors.values(), 0.5).low > found.low
+    scattered = np.random.default_rng(0).uniform(1, 2, (3, 6))
+    a, again, b = (metrics.slope([1, 2, 4], scattered, seed=seed) for seed in (0, 0, 1))
+    assert a == again and a.low != b.low and a.low == pytest.approx(b.low, abs=0.05 * (b.high - b.low))
+
+
+@quick
+@given(st.floats(-3, 3), st.floats(1e-6, 1e6), factors)
+def test_slope_of_a_power_law(exponent, constant, factor):
+    """Errors c n^a have slope a and no spread, whatever the units of samples and errors."""
+    samples = np.array([1, 4, 16]) * factor
+    found = metrics.slope(samples, [[constant * n**exponent] * 3 for n in samples])
+    expected = (found.value, found.low, found.high)
+    assert expected == pytest.approx([exponent] * 3, abs=1e-9)
+
+
+def test_slope_interval_covers():
+    """The 95 % interval holds -1 in 90 to 99.5 % of 200 series of 5 runs at 4 counts (log-normal errors).
+
+    Without the factor sqrt(k / (k - 1)) it is 0.89 of the width; the width is tested against the exact
+    standard error, 0.3 / sqrt(5 * sum of squared offsets), within 10 % on average.
+    """
+    rng = np.random.default_rng(2)
+    samples = np.array([4, 16, 64, 256])
+    hits, widths = 0, []
+    for seed in range(200):
+        errors = np.exp(rng.normal(0, 0.3, (4, 5))) / samples[:, None]
+        found = metrics.slope(samples, errors, seed=seed)
+        hits += found.low <= -1 <= found.high
+        widths.append((found.high - found.low) ** 2)
+    offsets = np.log(samples) - np.log(samples).mean()
+    exact = 2 * 1.96 * 0.3 / np.sqrt(5 * np.sum(offsets**2))
+    assert 180 <= hits <= 199
+    assert np.sqrt(np.mean(widths)) == pytest.approx(exact, rel=0.05)
+
+
+def test_slope_refuses():
+    """Too few counts or runs, equal counts, errors of 0, rows that do not match."""
+    rows = [[1.0, 2.0], [0.5, 0.6]]
+    with pytest.raises(ValueError, match=r"samples has shape \(1,\); give at least 2"):
+        metrics.slope([4], rows[:1])
+    with pytest.raises(ValueError, match="errors has 2 rows for 3 samples"):
+        metrics.slope([1, 2, 4], rows)
+    with pytest.raises(ValueError, match=r"errors\[1\] has shape \(1,\); give at least 2"):
+        metrics.slope([1, 2], [[1, 2], [1]])
+    with pytest.raises(ValueError, match=r"errors\[0\]=.* must be finite and above 0"):
+        metrics.slope([1, 2], [[0, 1], [1, 2]])
+    with pytest.raises(ValueError, match="samples are all the same"):
+        metrics.slope([2, 2], rows)
+    with pytest.raises(TypeError, match=r"errors\[0\]=1 must be a row of numbers"):
+        metrics.slope([1, 2], {1: rows[0], 2: rows[1]})
+
+
+def test_bootstrap_median():
+    """Of 3, 1, 2 the median of a resample is 1 if two or three of it are 1: 3 * (1/9) * (2/3) + 1/27 =
+    7/27 = 26 %. So with tails of 25 % the interval is [1, 3], with tails of 30 % [2, 2]."""
+    assert metrics.bootstrap_median([3, 1, 2], 0.5) == Estimate(2, 1, 3)
+    assert metrics.bootstrap_median([3, 1, 2], 0.4) == Estimate(2, 2, 2)
+    # An even number of values: the mean of the two in the middle.
+    assert metrics.bootstrap_median([1, 2, 4, 50]).value == 3
+    values = np.random.default_rng(0).normal(10, 1, 25)
+    found = metrics.bootstrap_median(values)
+    assert found == metrics.bootstrap_median(values)
+    # The median's standard error is 1.2533 sigma / sqrt(n) = 0.25, so the interval is about 1 wide.
+    assert 0.5 < found.high - found.low < 1.5 and found.low < found.value < found.high
+    for bad in ([1.0], [1, np.nan], [[1, 2]]):
+        with pytest.raises(ValueError, match="values"):
+            metrics.bootstrap_median(bad)
+    with pytest.raises(ValueError, match="confidence=95 must be finite and between 0 and 1"):
+        metrics.bootstrap_median([1, 2, 3], 95)
+
+
+@quick
+@given(st.lists(st.integers(-100, 100), min_size=2, max_size=12), st.integers(-100, 100))
+def test_bootstrap_median_moves_with_its_values(values, shift):
+    """The interval is within the values' range, holds the median, and moves with the values."""
+    found = metrics.bootstrap_median(values)
+    assert min(values) <= found.low <= found.value <= found.high <= max(values)
+    moved = metrics.bootstrap_median([v + shift for v in values])
+    expected = (found.low + shift, found.value + shift, found.high + shift)
+    assert (moved.low, moved.value, moved.high) == pytest.approx(expected)
+
+
+def test_reference_good_enough():
+    """At most 1 %: 0.001 of 0.1 is, 0.0011 is not."""
+    assert metrics.reference_good_enough(0.001, 0.1)
+    assert metrics.reference_good_enough(0, 0.1)
+    assert not metrics.reference_good_enough(0.0011, 0.1)
+    with pytest.raises(ValueError, match="measured_error=0 must be"):
+        metrics.reference_good_enough(0, 0)
+    with pytest.raises(ValueError, match="own_error=-1 must be"):
+        metrics.reference_good_enough(-1, 1)
+
+
+def test_reference_refusal():
+    """0.0023 of 0.1 is 2.3 %, so 2.3 times the samples bring it to 1 %; 2.31 % needs 2.4 times."""
+    assert metrics.reference_refusal(0.0023, 0.1) == (
+        "The reference carries 2.3 % of the error measured with it (2.30e-03 of 1.00e-01) and may carry 1 %: "
+        "render it with at least 2.3 times the samples."
+    )
+    assert "carries 2.31 %" in metrics.reference_refusal(0.00231, 0.1)
+    assert "at least 2.4 times" in metrics.reference_refusal(0.00231, 0.1)
+    with pytest.raises(ValueError, match="own_error=0.001 is good enough"):
+        metrics.reference_refusal(0.001, 0.1)
