@@ -14,6 +14,7 @@ ORDER = (
     ("kernel", "film"),
     ("connect",),
     ("subpath",),
+    ("parameters",),
     ("plan", "emitters", "sensors", "points", "strategies"),
     ("bsdf", "rays", "mis", "sobol"),
     ("llvm", "_version"),

@@ -224,6 +224,21 @@ def test_no_time_at_all_is_one_pass(scene, capsys):
     assert " 1 spp " in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("kind", ["path", "ptracer"])
+def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
+    """Rationale: Mitsuba's integrators render all samples at once in vectorised variants, whatever their
+    timeout. Expected: seeds of 16 spp until the time is over, their mean in the film (2 everywhere).
+    """
+    assert main(["render", str(scene), "--integrator", kind, "--time", "0.3", "-o", "a.exr"]) == 0
+    statistics = json.loads(read("a.exr")[1]["bdptStatistics"])
+    assert statistics["spp"] >= 16 and statistics["spp"] % 16 == 0
+    if kind == "path":
+        np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
+    arguments = ["--integrator", kind, "--time", "60", "--spp", "24", "-o", "b.exr"]
+    assert main(["render", str(scene), *arguments]) == 0
+    assert " 24 spp " in capsys.readouterr().out
+
+
 def test_missing_scene_is_reported(scene, capsys):
     assert main(["render", "missing.xml"]) == 1
     assert "scene='missing.xml' is not a file" in capsys.readouterr().err

@@ -134,6 +134,9 @@ class Emitters:
         by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
         self._any_by_texture, self._by_texture = any(by_texture), mi.Bool(by_texture)
         self._any_by_shape, self._by_shape = any(by_shape), mi.Bool(by_shape)
+        for emitter, t in zip(emitters, textured, strict=True):
+            if t:
+                _check_coordinates(emitter)
         if self._any_by_shape:
             _refuse_curves(scene, emitters[by_shape.index(True)])
         self._inverse = _inverse_table(self._pointers)
@@ -481,6 +484,16 @@ def _sample_shape(emitter, si, u, active):
     return ds, dr.select(ds.pdf > 0, radiance / ds.pdf, 0)
 
 
+def _check_coordinates(emitter):
+    """Raise ``ValueError`` for a texture on a mesh that has no texture coordinates."""
+    shape = emitter.get_shape()
+    if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
+        raise ValueError(
+            f"bdpt: emitter '{emitter.id()}' has a textured radiance on a mesh without texture coordinates "
+            f"('{shape.id()}'); make the radiance uniform, or give the mesh coordinates"
+        )
+
+
 def _refuse_curves(scene, emitter):
     """Raise ``NotImplementedError`` if a call on shapes would meet curves, which have no
     ``sample_position``."""
@@ -498,10 +511,24 @@ def _kind(emitter) -> int:
     name = emitter.class_name()
     if name not in _KINDS:
         raise NotImplementedError(
-            f"emitter '{emitter.id()}' of class {name} is not supported by the bdpt integrator yet; "
-            f"supported are {', '.join(sorted(_KINDS))}. Replace it, or use integrator type 'path'."
+            f"bdpt: emitter '{emitter.id()}' of class {name} is not supported yet; supported are area, "
+            "point, spot, directional, constant and envmap. Replace it, or use integrator type 'path'."
         )
+    if name == "EnvironmentMapEmitter":
+        _check_rotation(emitter)
     return _KINDS[name]
+
+
+def _check_rotation(emitter):
+    """Raise ``ValueError`` unless an environment map's ``to_world`` keeps lengths: with any other matrix
+    Mitsuba's own calls disagree with each other (next-event estimation four times the radiance)."""
+    matrix = np.array(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
+        raise ValueError(
+            f"bdpt: to_world of envmap '{emitter.id()}' is not a rotation (the lengths of its columns are "
+            f"{', '.join(f'{x:.4g}' for x in np.linalg.norm(matrix, axis=0))}); leave out scaling, and give "
+            "rotate an axis of length 1"
+        )
 
 
 @dataclass

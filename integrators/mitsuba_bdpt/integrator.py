@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import time
 from dataclasses import asdict, dataclass, replace
 
@@ -14,17 +13,8 @@ from . import mis, points
 from .emitters import Emitters
 from .film import Accumulator
 from .kernel import Batch, Counters, Kernel, trace
-from .plan import (
-    CONNECTIONS,
-    DEFAULT_STORED,
-    LIGHT_PATHS,
-    MAX_STORED,
-    SKIP,
-    UNLIMITED,
-    Settings,
-    plan,
-    scene_bsdfs,
-)
+from .parameters import integer, is_index, read_settings
+from .plan import UNLIMITED, Settings, plan, scene_bsdfs
 from .sensors import Camera
 from .strategies import layer_names, strategy_count
 
@@ -94,7 +84,7 @@ All of them are combined by multiple importance sampling.
      ``none``, or ``auto`` (default: ``one``, or ``all`` with ``skip=none``).
  * - points
    - |string|
-   - ``sobol`` (default): Owen-scrambled Sobol' points for the first dimensions; ``sampler``: the
+   - ``sobol`` (default): Owen-scrambled Sobol' points for light and BSDF samples; ``sampler``: the
      scene's sampler for them; ``independent``.
  * - stored_vertices
    - |int|
@@ -124,86 +114,6 @@ emitters other than ``area``, ``point``, ``spot``, ``directional``, ``constant``
 """
 
 
-def _integer(value, name, low, high=UNLIMITED):
-    """``value`` as an int within [low, high]; raises ``TypeError`` and ``ValueError``."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or value != int(value):
-        raise TypeError(f"bdpt: {name}={value!r} must be an integer")
-    if not low <= value <= high:
-        raise ValueError(f"bdpt: {name}={value!r} must be between {low} and {high}")
-    return int(value)
-
-
-def _boolean(props, name):
-    value = props.get(name, False)
-    if not isinstance(value, bool):
-        raise TypeError(f"bdpt: {name}={value!r} must be a boolean (true or false)")
-    return value
-
-
-def _choice(props, name, choices):
-    value = props.get(name, choices[0])
-    if value not in choices:
-        raise ValueError(f"bdpt: {name}={value!r} is not known; use one of {', '.join(choices)}")
-    return value
-
-
-def _light_paths(props):
-    value = props.get("light_paths", "auto")
-    if value == "auto":
-        return value
-    if isinstance(value, bool):
-        raise TypeError(f"bdpt: light_paths={value!r} must be a number or 'auto'")
-    try:
-        if isinstance(value, str):
-            top, _, bottom = value.partition("/")
-            number = float(top) / float(bottom or 1)
-        else:
-            number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        number = None
-    if number not in LIGHT_PATHS:
-        raise ValueError(
-            f"bdpt: light_paths={value!r} is not possible; use auto, 0, 1, 1/2, 1/4, 1/8 or 1/16"
-        )
-    return number
-
-
-def read_settings(props) -> Settings:
-    """Read and check the plugin's parameters; raises ``TypeError`` and ``ValueError``."""
-    if "samples_per_pass" in props:
-        raise ValueError(
-            f"bdpt: samples_per_pass={props['samples_per_pass']!r} is deprecated in Mitsuba; use spp_per_pass"
-        )
-    max_depth = _integer(props.get("max_depth", -1), "max_depth", -1)
-    timeout = props.get("timeout", -1.0)
-    if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or timeout != timeout:
-        raise TypeError(f"bdpt: timeout={timeout!r} must be a number of seconds, or -1 for none")
-    settings = Settings(
-        max_depth=UNLIMITED if max_depth < 0 else max_depth,
-        rr_depth=_integer(props.get("rr_depth", 5), "rr_depth", 1),
-        hide_emitters=_boolean(props, "hide_emitters"),
-        heuristic=_choice(props, "heuristic", mis.HEURISTICS),
-        skip=_choice(props, "skip", SKIP),
-        light_paths=_light_paths(props),
-        connections=_choice(props, "connections", CONNECTIONS),
-        points=_choice(props, "points", points.POINTS),
-        stored_vertices=_integer(
-            props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED
-        ),
-        strategy_images=_boolean(props, "strategy_images"),
-        variance=_boolean(props, "variance"),
-        spp_per_pass=_integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
-        timeout=float(timeout),
-    )
-    if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
-        raise ValueError(
-            f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
-            "set max_depth, for example to 5"
-        )
-    return settings
-
-
 def check_variant():
     """Raise ``NotImplementedError`` for variants that the method cannot serve."""
     variant = mi.variant()
@@ -217,6 +127,16 @@ def check_variant():
             f"bdpt: the variant {variant} is polarized, which is not supported; use "
             f"{variant.replace('_polarized', '')}"
         )
+
+
+def check_made_for(integrator, scene):
+    """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
+    for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
+        if not isinstance(thing, kind):
+            raise TypeError(
+                f"bdpt: {name}={type(thing).__name__} was not loaded under the present variant "
+                f"{mi.variant()}; load it again after mi.set_variant"
+            )
 
 
 def check_scene(scene, sensor):
@@ -316,7 +236,7 @@ class Render:
         self.emitters = Emitters(scene)
         self.plan = plan(scene, self.emitters, self.camera, settings)
         if not isinstance(seed, mi.UInt32):
-            seed = _integer(seed, "seed", 0)
+            seed = integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)
         dr.make_opaque(self.seed)
         depth = settings.max_depth if settings.strategy_images else 0
@@ -493,6 +413,7 @@ def _make_class():
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             """Render ``scene``; see ``mi.Integrator.render`` for the arguments."""
+            check_made_for(self, scene)
             sensor = _resolve(scene, sensor)
             spp = _samples(sensor, spp, self.settings)
             render = Render(scene, sensor, self.settings, seed)
@@ -529,7 +450,8 @@ def _make_class():
         def explain(self, scene, sensor=0, spp=None):
             """What will be done for ``scene`` and what is skipped, and why, as text."""
             if spp is not None:
-                _integer(spp, "spp", 0)  # no pilot yet: the decisions do not depend on it
+                integer(spp, "spp", 0)  # no pilot yet: the decisions do not depend on it
+            check_made_for(self, scene)
             return explain(scene, _resolve(scene, sensor), self.settings)
 
         def to_string(self):
@@ -570,6 +492,8 @@ def explain(scene, sensor, settings: Settings) -> str:
     ]
     lines += [f"used: {name}" for name in used]
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
+    if (p.splat or p.connections != "none") and settings.stored_vertices < settings.max_depth:
+        lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
     lines += [f"lost: {text}" for text in lost_paths(scene, emitters, p, settings)]
     return "\n".join(lines)
 
@@ -602,18 +526,18 @@ def lost_paths(scene, emitters: Emitters, p, settings: Settings) -> list[str]:
 def _resolve(scene, sensor):
     if isinstance(sensor, mi.Sensor):
         return sensor
-    if isinstance(sensor, bool) or not isinstance(sensor, int):
-        raise TypeError(f"bdpt: sensor={sensor!r} must be an index or a sensor")
+    if not is_index(sensor):
+        raise TypeError(f"bdpt: sensor={sensor!r} must be an index or one of scene.sensors()")
     sensors = scene.sensors()
     if not sensors:
         raise ValueError("bdpt: the scene has no sensor; add one, for example of type perspective")
     if not 0 <= sensor < len(sensors):
         raise ValueError(f"bdpt: sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
-    return sensors[sensor]
+    return sensors[int(sensor)]
 
 
 def _samples(sensor, spp, settings) -> int:
-    spp = _integer(spp, "spp", 0)  # 0: the sampler's sample_count
+    spp = integer(spp, "spp", 0)  # 0: the sampler's sample_count
     sampler = sensor.sampler()
     if spp and settings.points == "sampler":
         sampler = sampler.clone()
@@ -635,6 +559,12 @@ def _log(statistics: dict):
         f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
         f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
     )
+    if statistics["non_finite"]:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"bdpt: {statistics['non_finite']} samples had no finite value and count as zero; look for "
+            "infinities or NaN in textures, radiances and custom plugins",
+        )
 
 
 _classes = {}

@@ -212,7 +212,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
     if kernel.plan.endpoints:
         c, position = connect.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
         _deposit_splat(kernel, film, c, position, shared, counters)
-    active = (dr.max(mi.unpolarized_spectrum(e.weight)) > 0) & (kernel.last_light >= 1)
+    active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     walk = Walk(
@@ -221,7 +221,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         previous=mi.Point3f(e.si.p),
         throughput=mi.Spectrum(e.weight),
         partial=mis.Partial(h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse))),
-        reference=dr.max(mi.unpolarized_spectrum(e.weight)),
+        reference=dr.max(dr.abs(mi.unpolarized_spectrum(e.weight))),
         eta=mi.Float(1),
         edges=mi.UInt32(1),
         seen=mi.Bool(False),

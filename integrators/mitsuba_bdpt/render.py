@@ -299,6 +299,8 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int]) -> str:
     if rays:
         kinds = ", ".join(f"{kind} {readable(count)}" for kind, count in rays.items())
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
+    if outcome.statistics.get("non_finite"):
+        parts.append(f"{outcome.statistics['non_finite']} samples without a finite value count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
     if outcome.interrupted:
         parts.append("interrupted")

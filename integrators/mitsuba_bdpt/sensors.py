@@ -67,8 +67,8 @@ class Camera:
         name = sensor.class_name()
         if name not in _KINDS:
             raise NotImplementedError(
-                f"sensor '{sensor.id()}' of class {name} is not supported by the bdpt integrator "
-                f"yet; supported are {', '.join(_KINDS)}. Replace it, or use integrator type 'path'."
+                f"bdpt: sensor '{sensor.id()}' of class {name} is not supported yet; supported are "
+                "perspective and thinlens. Replace it, or use integrator type 'path'."
             )
         self.sensor = sensor
         self.lens = name == "ThinLensCamera"

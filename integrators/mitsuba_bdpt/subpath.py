@@ -159,7 +159,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
 
     throughput = walk.throughput * step.weight
     eta = walk.eta * step.eta
-    brightest = dr.max(mi.unpolarized_spectrum(throughput))
+    brightest = dr.max(dr.abs(mi.unpolarized_spectrum(throughput)))
     broken = walk.broken | (active & ~dr.isfinite(brightest))
     active &= (brightest > 0) & ~broken
     # Roulette as in `path`; the weights ignore it (it is not part of any density).

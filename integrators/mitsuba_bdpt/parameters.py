@@ -1,0 +1,116 @@
+"""Reading and checking the plugin's parameters and the arguments of a render."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from fractions import Fraction
+from numbers import Integral, Real
+
+import numpy as np
+
+from . import mis, points
+from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
+
+# What numbers mean, for messages.
+MEANING = {
+    "max_depth": "the longest path in edges, -1 for unlimited",
+    "rr_depth": "the depth at which Russian roulette starts, 1 or more",
+    "stored_vertices": f"the longest path that uses all strategies, 1 to {MAX_STORED}",
+    "spp_per_pass": "samples per pixel in one pass, 0 to choose",
+    "spp": "samples per pixel, 0 for the sampler's sample_count",
+    "seed": "any number from 0 to 2^32 - 1",
+}
+
+
+def integer(value, name: str, low: int, high: int = UNLIMITED) -> int:
+    """``value`` as an int within [low, high]; raises ``TypeError`` and ``ValueError``."""
+    number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
+    if not number or not math.isfinite(value) or value != int(value):
+        raise TypeError(f"bdpt: {name}={value!r} must be an integer: {MEANING[name]}")
+    if not low <= value <= high:
+        raise ValueError(f"bdpt: {name}={value!r} is out of range; it is {MEANING[name]}")
+    return int(value)
+
+
+def is_index(value) -> bool:
+    """Whether ``value`` is a whole number of Python or NumPy, and no boolean."""
+    return isinstance(value, Integral) and not isinstance(value, (bool, np.bool_))
+
+
+def _boolean(props, name):
+    value = props.get(name, False)
+    if not isinstance(value, bool):
+        raise TypeError(f"bdpt: {name}={value!r} must be a boolean (true or false)")
+    return value
+
+
+def _choice(props, name, choices):
+    value = props.get(name, choices[0])
+    if value not in choices:
+        raise ValueError(f"bdpt: {name}={value!r} is not known; use one of {', '.join(choices)}")
+    return value
+
+
+def _light_paths(props):
+    value = props.get("light_paths", "auto")
+    if value == "auto":
+        return value
+    if isinstance(value, bool):
+        raise TypeError(f"bdpt: light_paths={value!r} must be a number or 'auto'")
+    try:
+        number = float(Fraction(value))
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        number = None
+    if number not in LIGHT_PATHS:
+        choices = ", ".join(str(Fraction(n)) for n in LIGHT_PATHS)
+        raise ValueError(f"bdpt: light_paths={value!r} is not possible; use auto, {choices}")
+    return number
+
+
+def _check_names(props):
+    """Raise ``ValueError`` for parameters that do not exist, ``NotImplementedError`` for some that will."""
+    known = [f for f in Settings.__dataclass_fields__]
+    for name in props.keys():
+        if name in known:
+            continue
+        if name in ("aovs", "decisions"):
+            raise NotImplementedError(f"bdpt: {name} is not supported yet; leave it out")
+        remedy = {"samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass"}.get(name)
+        if remedy is None:
+            near = difflib.get_close_matches(name, known, 1)
+            remedy = (f"did you mean {near[0]}? " if near else "") + f"Parameters: {', '.join(known)}"
+        raise ValueError(f"bdpt: {name}={props[name]!r} is not a parameter; {remedy}")
+
+
+def read_settings(props) -> Settings:
+    """Read and check the plugin's parameters; raises ``TypeError``, ``ValueError`` and
+    ``NotImplementedError``."""
+    _check_names(props)
+    max_depth = integer(props.get("max_depth", -1), "max_depth", -1)
+    timeout = props.get("timeout", -1.0)
+    if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or timeout != timeout:
+        raise TypeError(f"bdpt: timeout={timeout!r} must be a number of seconds, or -1 for none")
+    settings = Settings(
+        max_depth=UNLIMITED if max_depth < 0 else max_depth,
+        rr_depth=integer(props.get("rr_depth", 5), "rr_depth", 1),
+        hide_emitters=_boolean(props, "hide_emitters"),
+        heuristic=_choice(props, "heuristic", mis.HEURISTICS),
+        skip=_choice(props, "skip", SKIP),
+        light_paths=_light_paths(props),
+        connections=_choice(props, "connections", CONNECTIONS),
+        points=_choice(props, "points", points.POINTS),
+        stored_vertices=integer(
+            props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED
+        ),
+        strategy_images=_boolean(props, "strategy_images"),
+        variance=_boolean(props, "variance"),
+        spp_per_pass=integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
+        timeout=float(timeout),
+    )
+    if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
+        raise ValueError(
+            f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
+            "set max_depth, for example to 5"
+        )
+    return settings
