@@ -23,14 +23,15 @@ gallery: $(INSTALLED)
 	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
 
 # The figures of the README; best on a quiet machine.
+BENCHMARK := $(VENV)/bin/python scripts/benchmark.py --json docs/benchmark.json --seeds 9
 benchmark: $(INSTALLED)
-	$(VENV)/bin/python scripts/benchmark.py cost --json docs/benchmark.json
-	$(VENV)/bin/python scripts/benchmark.py efficiency cornell_box --json docs/benchmark.json
-	$(VENV)/bin/python scripts/benchmark.py efficiency uplight_room --json docs/benchmark.json
-	$(VENV)/bin/python scripts/benchmark.py coldstart --json docs/benchmark.json
-	$(VENV)/bin/python scripts/benchmark.py points cornell_box --json docs/benchmark.json
-	$(VENV)/bin/python scripts/benchmark.py points uplight_room --json docs/benchmark.json
-	$(VENV)/bin/python scripts/benchmark.py memory --json docs/benchmark.json
+	$(BENCHMARK) cost
+	$(BENCHMARK) efficiency cornell_box
+	$(BENCHMARK) efficiency uplight_room
+	$(BENCHMARK) points cornell_box
+	$(BENCHMARK) points uplight_room
+	$(BENCHMARK) coldstart
+	$(BENCHMARK) memory
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .

@@ -28,6 +28,7 @@ import numpy as np
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
+from mitsuba_bdpt import render  # isort: skip
 
 ROOT = Path(__file__).parent.parent
 CORNELL_DEPTH = 6  # where the others have a depth of their own in the file
@@ -82,7 +83,8 @@ def cost(args):
     print(f"cost per sample, cornell_box, depth {depth}, {args.spp} spp, {args.seeds} rounds")
     for name, r in ratios.items():
         print(f"  {name:22} {np.median(r):.2f}x  (min {r.min():.2f}, max {r.max():.2f})")
-    return {name: float(np.median(r)) for name, r in ratios.items()}
+    result = {name: float(np.median(r)) for name, r in ratios.items()}
+    return result | {"depth": depth, "resolution": args.resolution or 256}
 
 
 def reference(scene, name, resolution, depth, error):
@@ -118,10 +120,9 @@ def efficiency(args):
     sides = integrators(depth)
     ours, path = sides["bdpt skip=impossible"], sides["path"]
     trial, _ = timed(scene, ours, args.spp, 1)
-    _, seconds_ours = timed(scene, ours, args.spp, 2)
-    timed(scene, path, 16, 1)
-    _, seconds_path = timed(scene, path, args.spp, 2)
-    spp_path = max(round(args.spp * seconds_ours / seconds_path), 1)
+    timed(scene, path, args.spp, 1)
+    ratios = [timed(scene, ours, args.spp, s)[1] / timed(scene, path, args.spp, s)[1] for s in (2, 3, 4)]
+    spp_path = max(round(args.spp * float(np.median(ratios))), 1)
     ref, own = reference(scene, args.scene, resolution, depth, 1.0)
     ref, own = reference(scene, args.scene, resolution, depth, 0.01 * rel_mse(trial, ref, 0.001))
     rows = {"independent": [], "multijitter": []}
@@ -155,8 +156,11 @@ def efficiency(args):
             f"({r[:, 0].min():.2f}..{r[:, 0].max():.2f}), raw {np.median(r[:, 1]):.2f}x "
             f"({r[:, 1].min():.2f}..{r[:, 1].max():.2f})"
         )
-        result[sampler] = {"trimmed": float(np.median(r[:, 0])), "raw": float(np.median(r[:, 1]))}
-    return result
+        result[sampler] = {
+            name: dict(zip(("min", "median", "max"), np.quantile(column, (0, 0.5, 1)).tolist(), strict=True))
+            for name, column in zip(("trimmed", "raw"), r.T, strict=True)
+        }
+    return result | {"depth": depth, "resolution": resolution, "spp of path": spp_path}
 
 
 def points(args):
@@ -180,7 +184,7 @@ def points(args):
         + ", ".join(f"{n} {errors[n]:.5f} ({g:.2f}x)" for n, g in gains.items())
         + " (sampler: multijitter)"
     )
-    return gains
+    return gains | {"depth": depth, "resolution": resolution}
 
 
 MEMORY = """
@@ -241,11 +245,21 @@ def coldstart(args):
     return result
 
 
+COMMANDS = {
+    "cost": cost,
+    "efficiency": efficiency,
+    "coldstart": coldstart,
+    "points": points,
+    "memory": memory,
+}
+
+
 def main():
+    """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("cost", "efficiency", "coldstart", "points", "memory"))
+    parser.add_argument("what", choices=COMMANDS)
     parser.add_argument("scene", nargs="?", default="cornell_box", help="name in scenes/")
     parser.add_argument("--spp", type=int, default=64)
     parser.add_argument("--seeds", type=int, default=5)
@@ -254,8 +268,9 @@ def main():
     parser.add_argument("--json", type=Path, help="also add the result to this file")
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
-    result = globals()[args.what](args)
+    result = COMMANDS[args.what](args)
     if args.json:
+        result |= {"spp": args.spp, "seeds": args.seeds, "versions": render.versions()}
         kept = json.loads(args.json.read_text()) if args.json.exists() else {}
         key = f"{args.what} {args.scene}" if args.what in ("efficiency", "points") else args.what
         kept[key] = result
