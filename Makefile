@@ -23,7 +23,7 @@ gallery: $(INSTALLED)
 	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
 
 # The figures of the README; best on a quiet machine.
-BENCHMARK := $(VENV)/bin/python scripts/benchmark.py --json docs/benchmark.json --seeds 9
+BENCHMARK := $(VENV)/bin/python scripts/benchmark.py --json docs/benchmark.json --seeds 5
 benchmark: $(INSTALLED)
 	$(BENCHMARK) cost
 	$(BENCHMARK) efficiency cornell_box

@@ -43,6 +43,23 @@ CUT_GLASS = np.array(
 )
 CUT_GLASS_SIDES = 12
 
+# The water of pool: its corners (x, z), the edge of its squares, and its waves (wavelength, angle of
+# travel from the x axis in degrees, amplitude, phase), in metres.
+POOL_CORNERS = ((-2.02, -1.62), (2.02, 0.82))
+POOL_GRID = (80, 48)
+POOL_WAVES = np.array(
+    [
+        (1.30, 75.0, 0.0075, 0.0),
+        (0.97, 118.0, 0.0055, 1.7),
+        (0.74, 31.0, 0.0040, 4.0),
+        (0.58, 152.0, 0.0030, 2.9),
+        (0.46, 84.0, 0.0022, 5.5),
+    ]
+)
+
+RING_INNER, RING_OUTER, RING_HEIGHT = 0.88, 1.0, 0.34  # the ring of ring_caustic
+MIRROR_RIM = 3.0  # radius of the headlight's mirror, in focal lengths
+
 
 def egg_profile(rows):
     """Height, radius and outward normal (in the profile's plane) of the egg at `rows` + 1 angles.
@@ -149,6 +166,55 @@ def cut_glass():
     return vertices, None, faces
 
 
+def pool_water():
+    """Sum of plane waves over a rectangle, normals up."""
+    (left, back), (right, front) = POOL_CORNERS
+    columns, rows = POOL_GRID
+    z, x = np.meshgrid(
+        np.linspace(back, front, rows + 1), np.linspace(left, right, columns + 1), indexing="ij"
+    )
+    length, angle, amplitude, phase = POOL_WAVES.T
+    wave_x = 2.0 * np.pi / length * np.cos(np.radians(angle))
+    wave_z = 2.0 * np.pi / length * np.sin(np.radians(angle))
+    at = x[..., None] * wave_x + z[..., None] * wave_z + phase
+    y = np.sin(at) @ amplitude
+    slope_x, slope_z = np.cos(at) @ (amplitude * wave_x), np.cos(at) @ (amplitude * wave_z)
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    normals = np.stack([-slope_x, np.ones_like(y), -slope_z], axis=-1).reshape(-1, 3)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    a = row * (columns + 1) + column
+    b, c, d = a + 1, a + columns + 1, a + columns + 2
+    faces = np.concatenate([np.stack([a, c, d], axis=1), np.stack([a, d, b], axis=1)])
+    return vertices, normals, faces.astype(np.int32)
+
+
+def ring():
+    """Band with a rounded section (a superellipse of exponent 4) that stands on y = 0."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 29)
+    sin, cos = np.sin(angle), np.cos(angle)
+    half = 0.5 * np.array((RING_OUTER - RING_INNER, RING_HEIGHT))
+    # Both roots of the ellipse's coordinates; the gradient of x^4 + y^4 is the normal.
+    across, up = np.sign(cos) * np.sqrt(np.abs(cos)), np.sign(sin) * np.sqrt(np.abs(sin))
+    normal_r, normal_y = across**3 / half[0], up**3 / half[1]
+    size = np.hypot(normal_r, normal_y)
+    # From top to bottom on the outer side, and up again on the inner one.
+    order = np.roll(np.arange(28)[::-1], 8)
+    order = np.append(order, order[0])
+    radius = 0.5 * (RING_OUTER + RING_INNER) + half[0] * across
+    y = half[1] * (1.0 + up)
+    return revolve(y[order], radius[order], (normal_r / size)[order], (normal_y / size)[order], sides=128)
+
+
+def headlight_mirror():
+    """Paraboloid with focal length 1 and its vertex at the origin, open towards +y; normals point in."""
+    radius = np.linspace(0.0, MIRROR_RIM, 33)  # upwards, so that the faces look in
+    slope = 0.5 * radius
+    size = np.hypot(1.0, slope)
+    return revolve(0.25 * radius**2, radius, -slope / size, 1.0 / size, sides=64)
+
+
 def write_ply(path, vertices, normals, faces):
     """Binary little-endian PLY with float32 vertices and, unless None, normals."""
     names = ["x", "y", "z"] + ([] if normals is None else ["nx", "ny", "nz"])
@@ -169,6 +235,9 @@ MESHES = {
     "veach_bidir_lamp_head": lamp_head,
     "veach_bidir_spot_cap": spot_cap,
     "cut_glass": cut_glass,
+    "pool_water": pool_water,
+    "ring": ring,
+    "headlight_mirror": headlight_mirror,
 }
 
 

@@ -303,7 +303,7 @@ def test_borders_of_a_furnace_are_flat(rfilter, border):
     """
     scene, answer = sphere_lit_by("point", camera(rfilter=rfilter, size=16, sample_border=border))
     bdpt = integrator(max_depth=3, strategy_images=True, skip="none")
-    images = render(scene, bdpt, range(16), 256)
+    images = render(scene, bdpt, range(16), 320)
     ring = np.ones((16, 16), dtype=bool)
     ring[1:-1, 1:-1] = False
     names = bdpt.aov_names()

@@ -518,7 +518,7 @@ class Lights:
         )
         return emitters.Direct(
             weight=mi.Spectrum(1),
-            pdf=self.direct,
+            pdf_w=self.direct,
             d=w.towards(1, 0),
             anchor=rays.free_anchor(w.point(0)),
             infinite=self.infinite,
@@ -571,6 +571,8 @@ class Sensor:
 class Flat:
     """Stand-in for `rays.Quadrics`: no shape is curved."""
 
+    any = False
+
     def starts(self, *_):
         return mi.Float(0)
 
@@ -579,6 +581,8 @@ class Flat:
 
 class Nothing:
     """Accepts any call: film, and points (every number is a half)."""
+
+    alpha = False
 
     def put_camera(self, *_):
         pass
@@ -693,7 +697,8 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
-    kernel._camera_subpath(k_, Nothing(), place, u32(0), shared, path, counters, mi.Bool(True))
+    lane = kernel._Lane(place, shared, path)
+    kernel._camera_subpath(k_, Nothing(), lane, u32(0), counters, mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
     return columns(result, world.n)

@@ -45,8 +45,8 @@ def test_weighted_variance_of_a_mean():
     [
         ("box", {}),
         ("gaussian", {"skip": "none"}),
-        ("box", {"points": "independent", "light_paths": 0}),
-        ("box", {"points": "sampler"}),
+        pytest.param("box", {"points": "independent", "light_paths": 0}, marks=pytest.mark.slow),
+        pytest.param("box", {"points": "sampler"}, marks=pytest.mark.slow),
     ],
 )
 def test_variance_is_the_spread_over_seeds(rfilter, parameters):
