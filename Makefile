@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 
-.PHONY: render test lint gallery benchmark slow
+.PHONY: render test lint gallery benchmark slow sweep
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -21,6 +21,11 @@ gallery: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
 	mkdir -p docs/images
 	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
+
+# A small sweep of time against error, some five minutes on two cores; goes on where it was stopped.
+sweep: $(INSTALLED)
+	$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --seconds 60
+	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
 
 # The figures of the README; best on a quiet machine.
 BENCHMARK := $(VENV)/bin/python scripts/benchmark.py --json docs/benchmark.json --seeds 5
