@@ -25,12 +25,13 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
+from metrics import rel_mse
+from reference import FIRST_SEED, PASS_SPP, SUMS, Halves, default_depth, digest, load_scene, scene_file
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
 
-ROOT = Path(__file__).parent.parent
 CORNELL_DEPTH = 6  # where the others have a depth of their own in the file
 
 
@@ -43,21 +44,10 @@ def timed(scene, integrator, spp, seed):
     return np.array(image)[..., :3], time.perf_counter() - start
 
 
-def rel_mse(image, reference, trim=0.0):
-    """relMSE; ``trim`` is the share of the worst values that is left out."""
-    error = (image - reference) ** 2 / (reference**2 + 0.01 * reference.mean() ** 2)
-    values = np.sort(error.ravel())
-    return float(values[: round(len(values) * (1 - trim))].mean())
-
-
 def load(name, resolution, max_depth):
     """A scene of scenes/ and its depth."""
-    path = str(ROOT / "scenes" / f"{name}.xml")
-    default = CORNELL_DEPTH
-    if name != "cornell_box":
-        default = mi.load_file(path, resolution=1, parallel=False).integrator().max_depth
-    depth = max_depth or default
-    return mi.load_file(path, resolution=resolution, max_depth=depth, parallel=False), depth
+    depth = max_depth or (CORNELL_DEPTH if name == "cornell_box" else default_depth(name))
+    return load_scene(name, resolution=resolution, max_depth=depth), depth
 
 
 def integrators(depth):
@@ -89,28 +79,14 @@ def cost(args):
 
 def reference(scene, name, resolution, depth, error):
     """Reference image whose own relMSE is below ``error``, and that relMSE."""
-    cache = ROOT / "renders" / f"reference_{name}_{resolution}_{depth}.npz"
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "light_paths": "1/4"})
-    halves, rounds = [0.0, 0.0], 0
-    if cache.exists():
-        kept = np.load(cache)
-        halves, rounds = list(kept["halves"]), int(kept["rounds"])
-    while True:
-        if rounds:
-            a, b = (h / rounds for h in halves)
-            mean = (a + b) / 2
-            # The halves differ by twice the standard error of their mean.
-            own = rel_mse((a - b) / 2 + mean, mean)
-            if own < error:
-                return mean, own
-        for half in range(2):
-            image, _ = timed(scene, integrator, 256, 10**6 + 2 * rounds + half)
-            halves[half] = halves[half] + image.astype(np.float64)
-        rounds += 1
-        cache.parent.mkdir(exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=cache.parent, suffix=".npz", delete=False) as f:
-            np.savez(f, halves=np.array(halves), rounds=rounds)
-        os.replace(f.name, cache)
+    parameters = {"type": "bdpt", "max_depth": depth, "light_paths": "1/4"}
+    integrator = mi.load_dict(parameters)
+    key = json.dumps([digest(scene_file(name)), resolution, parameters])
+    halves = Halves(SUMS / f"benchmark_{name}_{resolution}_{depth}.npz", key)
+    while halves.error() >= error:
+        seeds = (FIRST_SEED + 2 * halves.rounds, FIRST_SEED + 2 * halves.rounds + 1)
+        halves.add([timed(scene, integrator, PASS_SPP, s)[0].astype(np.float64) for s in seeds])
+    return halves.mean()[0], halves.error()
 
 
 def efficiency(args):
@@ -127,14 +103,9 @@ def efficiency(args):
     ref, own = reference(scene, args.scene, resolution, depth, 0.01 * rel_mse(trial, ref, 0.001))
     rows = {"independent": [], "multijitter": []}
     scenes = {"independent": scene}
-    loaded = mi.load_file(
-        str(ROOT / "scenes" / f"{args.scene}.xml"),
-        resolution=resolution,
-        max_depth=depth,
-        sampler="multijitter",
-        parallel=False,
+    scenes["multijitter"] = load_scene(
+        args.scene, resolution=resolution, max_depth=depth, sampler="multijitter"
     )
-    scenes["multijitter"] = loaded
     for sampler in rows:
         for seed in range(args.seeds + 1):
             a, ta = timed(scene, ours, args.spp, seed)
@@ -167,10 +138,7 @@ def points(args):
     """Error of each point set against independent numbers, at equal samples."""
     resolution = args.resolution or 128
     scene, depth = load(args.scene, resolution, args.max_depth)
-    path = str(ROOT / "scenes" / f"{args.scene}.xml")
-    jittered = mi.load_file(
-        path, resolution=resolution, max_depth=depth, sampler="multijitter", parallel=False
-    )
+    jittered = load_scene(args.scene, resolution=resolution, max_depth=depth, sampler="multijitter")
     ref, _ = reference(scene, args.scene, resolution, depth, 1.0)
     errors = {}
     for name in ("independent", "sobol", "sampler"):

@@ -42,7 +42,6 @@ NOT_BY_PATH = {
     "headlight",
     "lamp_behind_glass",
     "pool",
-    "pool_underwater",
     "ring_caustic",
     "smallvcm_cornell_point",
     "smallvcm_cornell_sun",
