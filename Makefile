@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 
-.PHONY: render test lint gallery benchmark slow sweep
+.PHONY: render test lint gallery references benchmark slow sweep
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -24,19 +24,19 @@ gallery: $(INSTALLED)
 
 # A small sweep of time against error, some five minutes on two cores; goes on where it was stopped.
 sweep: $(INSTALLED)
-	$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --seconds 60
+	$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --seconds 100
 	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
 
-# The figures of the README; best on a quiet machine.
-BENCHMARK := $(VENV)/bin/python scripts/benchmark.py --json docs/benchmark.json --seeds 5
+# The references of the benchmark, about two hours on two cores; goes on where it was stopped.
+references: $(INSTALLED)
+	$(VENV)/bin/python scripts/reference.py --all --seconds 1200
+	$(VENV)/bin/python scripts/reference.py cornell_box --max-depth 6 --seconds 1200
+
+# The tables and plots of the README, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
-	$(BENCHMARK) cost
-	$(BENCHMARK) efficiency cornell_box
-	$(BENCHMARK) efficiency uplight_room
-	$(BENCHMARK) points cornell_box
-	$(BENCHMARK) points uplight_room
-	$(BENCHMARK) coldstart
-	$(BENCHMARK) memory
+	$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
+	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/benchmark
+	$(VENV)/bin/python scripts/report.py docs/benchmark
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .

@@ -37,8 +37,15 @@ NONZERO_SHARE = 0.9
 # the chance of a false alarm is 4 % for 5 renders, 0.9 % for 8, 0.2 % for 12 and 16 (8000 simulated).
 FEWEST_RUNS = 8
 
+# Tiles of a bias check along an edge of the image, and the chance of a false alarm of a whole check.
+TILES = 4
+SIGNIFICANCE = 1e-3
+
 # Luminance of display white in cd/m^2: that of standard-dynamic-range video, ITU-R BT.2035.
 WHITE = 100.0
+
+# Share of the worst values that the trimmed relMSE leaves out.
+TRIM = 0.001
 
 # Share of the measured error that the reference's own error may have.
 REFERENCE_SHARE = 0.01
@@ -370,24 +377,53 @@ class BiasCheck:
     missing: Estimate
 
 
-def _columns(image, tiles) -> np.ndarray:
-    """What is compared: tile means by row, column and channel, then the image's mean by channel."""
+def tile_columns(image, tiles=TILES) -> np.ndarray:
+    """What a bias check compares, (3 tiles^2 + 3,): `tile_means` by row, column and channel, then the mean
+    of the whole image by channel."""
     return np.concatenate([tile_means(image, tiles).ravel(), tile_means(image, 1).ravel()])
 
 
-def _runs_sample(name, runs, tiles):
-    """Samples of `_columns` and of the image's mean, from ``runs`` (seeds, height, width, 3)."""
+@dataclass(frozen=True)
+class Means:
+    """`tile_columns` of renders as a sample, and the mean of the whole image over its channels as another.
+
+    All that `compare_means` needs of a set of renders; small enough to keep beside a reference or in a table.
+    """
+
+    columns: Sample
+    whole: Sample
+
+    @staticmethod
+    def of(columns, name="columns") -> Means:
+        """From ``columns`` (renders, 3 tiles^2 + 3), renders with seeds of their own."""
+        columns = np.asarray(columns, dtype=np.float64)
+        if len(columns) < FEWEST_RUNS:
+            raise ValueError(
+                f"{name} has {len(columns)} renders, too few for the test's level; give {FEWEST_RUNS} or "
+                "more."
+            )
+        return Means(Sample.of(columns), Sample.of(columns[:, -3:].mean(1, keepdims=True)))
+
+    @staticmethod
+    def known(image, tiles=TILES) -> Means:
+        """Of an image without error."""
+        columns = tile_columns(image, tiles)
+        return Means(Sample.known(columns), Sample.known(columns[-3:].mean(keepdims=True)))
+
+    @property
+    def tiles(self) -> int:
+        """Tiles along an edge of the image."""
+        return math.isqrt(len(self.columns.mean) // 3 - 1)
+
+
+def _means_of_runs(name, runs, tiles):
+    """`Means` of ``runs`` (seeds, height, width, 3), and the shape of one."""
     runs = _floats(name, runs, ("seeds", "height", "width", "3"))
-    if len(runs) < FEWEST_RUNS:
-        raise ValueError(
-            f"{name} has {len(runs)} renders, too few for the test's level; give {FEWEST_RUNS} or more."
-        )
-    columns = np.array([_columns(run, tiles) for run in runs])
-    return Sample.of(columns), Sample.of(columns[:, -3:].mean(1, keepdims=True)), runs.shape[1:]
+    return Means.of([tile_columns(run, tiles) for run in runs], name), runs.shape[1:]
 
 
-def _reference_sample(reference, standard_error, tiles):
-    """As `_runs_sample`, from one image and the standard error of its values (height, width, 3).
+def _means_of_reference(reference, standard_error, tiles):
+    """As `_means_of_runs`, from one image and the standard error of its values (height, width, 3).
 
     Pixels are taken for independent, the channels of a pixel for fully correlated.
     """
@@ -401,10 +437,10 @@ def _reference_sample(reference, standard_error, tiles):
     pixels = reference.shape[0] * reference.shape[1]
     area = np.full(3 * tiles * tiles + 3, pixels / tiles**2)
     area[-3:] = pixels
-    errors = np.sqrt(_columns(standard_error**2, tiles) / area)
-    columns = _columns(reference, tiles)
+    errors = np.sqrt(tile_columns(standard_error**2, tiles) / area)
+    columns = tile_columns(reference, tiles)
     whole = Sample.known(columns[-3:].mean(keepdims=True), errors[-3:].mean(keepdims=True))
-    return Sample.known(columns, errors), whole, reference.shape
+    return Means(Sample.known(columns, errors), whole), reference.shape
 
 
 def _student(value, error, freedom, confidence) -> Estimate:
@@ -427,7 +463,7 @@ def missing_energy(image: Sample, reference: Sample) -> Estimate:
     return _student(1 - x / r, math.sqrt(sum(parts)), freedom, CONFIDENCE)
 
 
-def bias_check(images, references, tiles=4, significance=1e-3, standard_error=None) -> BiasCheck:
+def bias_check(images, references, tiles=TILES, significance=SIGNIFICANCE, standard_error=None) -> BiasCheck:
     """Whether the renders agree with the reference within their noise.
 
     `welch` over the means of ``tiles`` x ``tiles`` tiles and of the whole image, channel by channel, with
@@ -442,19 +478,29 @@ def bias_check(images, references, tiles=4, significance=1e-3, standard_error=No
     width of the intervals). An integrator whose energy sits in events rarer than the samples fails too:
     what it misses in practice and what it can never find look the same.
     """
-    significance = _number("significance", significance, 0, 1)
-    ours, our_mean, shape = _runs_sample("images", images, tiles)
+    ours, shape = _means_of_runs("images", images, tiles)
     if np.ndim(references) == 3:
         if standard_error is None:
             raise ValueError("standard_error=None: with one reference, give it as an image of its shape.")
-        theirs, their_mean, their_shape = _reference_sample(references, standard_error, tiles)
+        theirs, their_shape = _means_of_reference(references, standard_error, tiles)
     else:
         if standard_error is not None:
             raise ValueError("standard_error must be None with several references: their spread gives it.")
-        theirs, their_mean, their_shape = _runs_sample("references", references, tiles)
+        theirs, their_shape = _means_of_runs("references", references, tiles)
     if shape != their_shape:
         raise ValueError(f"images have shape {shape} and references {their_shape}; render both at one size.")
-    found = welch(ours, theirs)
+    return compare_means(ours, theirs, significance)
+
+
+def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> BiasCheck:
+    """`bias_check` of what was kept of the renders on both sides."""
+    significance = _number("significance", significance, 0, 1)
+    if ours.tiles != theirs.tiles:
+        raise ValueError(
+            f"ours has {ours.tiles} tiles along an edge and theirs {theirs.tiles}; take the same."
+        )
+    tiles = ours.tiles
+    found = welch(ours.columns, theirs.columns)
     worst = int(np.lexsort((-np.abs(found.value), found.p))[0])
     tile, channel = divmod(worst, 3)
     family = sidak(found.p)
@@ -467,7 +513,7 @@ def bias_check(images, references, tiles=4, significance=1e-3, standard_error=No
         tile=divmod(tile, tiles) if tile < tiles**2 else None,
         channel=channel,
         difference=_student(found.value[worst], found.error[worst], found.freedom[worst], 1 - each),
-        missing=missing_energy(our_mean, their_mean),
+        missing=missing_energy(ours.whole, theirs.whole),
     )
 
 

@@ -3,13 +3,13 @@
     python scripts/sweep.py presets/small.toml -o results/small
     python scripts/sweep.py presets/small.toml -o results/small     # again: goes on where it was stopped
 
-A preset (TOML) names scenes, a resolution, the number of seeds, the samples per pixel of the first integrator
-and the integrators with their parameters; ``match = "seconds"`` gives another one the samples that fit into
-the first one's time, ``match = "spp"`` the same samples. For each scene, number of samples and seed all
-integrators follow one another, so that a noisy machine is noisy for all. Every finished render is a file of
-its own in OUTPUT/cells, named after a hash of all that determines it, and is not rendered again; a cell that
-fails is reported and tried again the next time. OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the
-preset. Errors are taken against the references of scripts/reference.py.
+Presets (see scripts/preset.py) say what is rendered. For each scene, budget and seed all integrators follow
+one another, so that a noisy machine is noisy for all. Every finished render is a file of its own in
+OUTPUT/cells, named after a hash of all that determines it (parameters, scene, versions, the plugin's source),
+and is not rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the
+next time. Errors are taken against the references of scripts/reference.py, and anew when a reference has
+become better. OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what
+scripts/probes.py measures.
 """
 
 from __future__ import annotations
@@ -21,90 +21,25 @@ import json
 import os
 import platform
 import time
-import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import analysis
 import metrics
-import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
+import mitsuba_bdpt
 import numpy as np
+import OpenEXR
+import probes
 import reference
+from preset import Preset, Subject, read_preset
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
 
-TRIM = 0.001  # share of the worst values that the trimmed relMSE leaves out
 CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up
-
-
-@dataclass(frozen=True)
-class Method:
-    """An integrator of a preset: ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it
-    has in common with the first one, ``seconds`` or ``spp``."""
-
-    name: str
-    parameters: tuple
-    sampler: str
-    match: str
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A sweep; ``spp`` are those of the first method, ``max_depth`` None for each scene's own."""
-
-    scenes: tuple
-    methods: tuple
-    spp: tuple
-    seeds: int
-    resolution: int
-    max_depth: int | None
-
-
-def read_preset(path: Path) -> Preset:
-    """Read and check a TOML file; raises ``ValueError`` and ``TypeError`` naming the key."""
-    data = tomllib.loads(path.read_text())
-    needed = {"scenes", "spp", "seeds", "resolution", "integrator"}
-    if unknown := sorted(set(data) - needed - {"max_depth"}):
-        raise ValueError(
-            f"{path}: {unknown[0]} is not a key of a preset; there are {sorted(needed | {'max_depth'})}"
-        )
-    if missing := sorted(needed - set(data)):
-        raise ValueError(f"{path}: {missing[0]} is missing")
-    for name in data["scenes"]:
-        reference.scene_file(name)
-    for key in {"seeds", "resolution", "max_depth"} & set(data):
-        if type(data[key]) is not int or data[key] < 1:
-            raise ValueError(f"{path}: {key}={data[key]!r} must be a whole number of at least 1")
-    if not data["spp"] or not all(type(n) is int and n > 0 for n in data["spp"]):
-        raise ValueError(f"{path}: spp={data['spp']!r} must be a list of whole numbers of at least 1")
-    methods = tuple(_method(path, dict(entry)) for entry in data["integrator"])
-    if len({m.name for m in methods}) < len(methods):
-        raise ValueError(f"{path}: two integrators have the same name")
-    return Preset(
-        scenes=tuple(data["scenes"]),
-        methods=methods,
-        spp=tuple(data["spp"]),
-        seeds=data["seeds"],
-        resolution=data["resolution"],
-        max_depth=data.get("max_depth"),
-    )
-
-
-def _method(path, entry) -> Method:
-    if "type" not in entry:
-        raise ValueError(f"{path}: an integrator without type: {entry!r}")
-    name, sampler = entry.pop("name", entry["type"]), entry.pop("sampler", "independent")
-    match = entry.pop("match", "spp")
-    if "max_depth" in entry:
-        raise ValueError(
-            f"{path}: max_depth of integrator {name!r} would compare different images; set it for all"
-        )
-    if match not in ("spp", "seconds"):
-        raise ValueError(f"{path}: match={match!r} of integrator {name!r} must be 'spp' or 'seconds'")
-    return Method(name, tuple(sorted(entry.items())), sampler, match)
 
 
 @dataclass(frozen=True)
@@ -125,93 +60,151 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Name of the cell's file."""
+        """Name of the cell's files."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
 
 
-def cells(preset: Preset, scene: str) -> list[Cell]:
-    """The cells of a scene, integrators innermost."""
-    common = {
-        "scene": scene,
-        "scene_sha256": reference.digest(reference.scene_file(scene)),
-        "resolution": preset.resolution,
-        "max_depth": preset.max_depth or reference.default_depth(scene),
-        "versions": tuple(render.versions().items()),
-    }
-    return [
-        Cell(
-            **common,
-            **{k: getattr(m, k) for k in ("parameters", "sampler", "match")},
-            method=m.name,
-            budget=spp,
-            seed=seed,
-        )
-        for spp in preset.spp
-        for seed in range(FIRST_SEED, FIRST_SEED + preset.seeds)
-        for m in preset.methods
-    ]
+def source_digest() -> str:
+    """SHA-256 of the plugin's source files, shortened."""
+    files = sorted(Path(mitsuba_bdpt.__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+class Cells:
+    """The cells of a scene of a preset, integrators innermost."""
+
+    def __init__(self, preset: Preset, subject: Subject):
+        self.subject, self.more = subject, preset.more
+        self.methods = [m for m in preset.methods if m.scenes is None or subject.name in m.scenes]
+        self.common = {
+            "scene": subject.name,
+            "scene_sha256": reference.digest(reference.scene_file(subject.name)),
+            "resolution": preset.resolution,
+            "max_depth": subject.max_depth,
+            "versions": (*render.versions().items(), ("source", source_digest())),
+        }
+
+    def of(self, budget: int, seed: int, names=None) -> list[Cell]:
+        """A cell per integrator, of those in ``names``."""
+        return [
+            Cell(
+                **self.common,
+                **{k: getattr(m, k) for k in ("parameters", "sampler", "match")},
+                method=m.name,
+                budget=budget,
+                seed=seed,
+            )
+            for m in self.methods
+            if names is None or m.name in names
+        ]
+
+    def planned(self) -> list[Cell]:
+        """Those that are rendered in any case."""
+        found = [
+            cell
+            for spp, seeds in zip(self.subject.spp, self.subject.seeds, strict=True)
+            for seed in range(FIRST_SEED, FIRST_SEED + seeds)
+            for cell in self.of(spp, seed)
+        ]
+        known = {cell.key for cell in found}
+        first = [cell for seed in range(self.fewest()) for cell in self.further(seed)]
+        return found + [cell for cell in first if cell.key not in known]
+
+    def fewest(self) -> int:
+        """Seeds that [more] takes at least, 0 if the scene is not among its own."""
+        return self.more.at_least if self.more and self.subject.name in self.more.scenes else 0
+
+    def further(self, index: int) -> list[Cell]:
+        """The cells of [more] with its ``index``-th seed."""
+        return self.of(self.more.spp, FIRST_SEED + index, self.more.methods)
 
 
 class Bench:
     """The loaded scenes and integrators of one scene's cells, warm."""
 
-    def __init__(self, preset: Preset, scene: str):
-        self.preset, self.name = preset, scene
-        self._scenes, self._integrators, self._spp = {}, {}, {}
-        self.depth = preset.max_depth or reference.default_depth(scene)
-        self.reference = reference.load_reference(scene, preset.resolution, self.depth)
+    def __init__(self, cells: Cells, output: Path):
+        self.cells, self.output, self.name = cells, output, cells.subject.name
+        self.resolution, self.depth = cells.common["resolution"], cells.subject.max_depth
+        self._scenes, self._integrators, self._compile, self._spp = {}, {}, {}, {}
+        self.reference = load_reference(self.name, self.resolution, self.depth)
 
     def scene(self, sampler: str):
         """The scene with that sampler."""
         if sampler not in self._scenes:
             self._scenes[sampler] = reference.load_scene(
-                self.name, resolution=self.preset.resolution, sampler=sampler
+                self.name, resolution=self.resolution, sampler=sampler
             )
         return self._scenes[sampler]
 
-    def integrator(self, method):
-        """The plugin of a `Method` or `Cell`."""
-        if method.parameters not in self._integrators:
-            parameters = dict(method.parameters) | {"max_depth": self.depth}
-            self._integrators[method.parameters] = mi.load_dict(parameters)
-        return self._integrators[method.parameters]
+    def integrator(self, cell: Cell):
+        """The plugin of a cell."""
+        if cell.parameters not in self._integrators:
+            parameters = dict(cell.parameters) | {"max_depth": self.depth}
+            self._integrators[cell.parameters] = mi.load_dict(parameters)
+        return self._integrators[cell.parameters]
 
-    def timed(self, method, spp: int, seed: int):
+    def timed(self, cell: Cell, spp: int, seed: int):
         """Image and wall seconds of a render."""
-        scene, integrator = self.scene(method.sampler), self.integrator(method)
+        scene, integrator = self.scene(cell.sampler), self.integrator(cell)
         start = time.perf_counter()
         image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
         dr.eval(image)
         dr.sync_thread()
         return np.array(image, dtype=np.float64)[..., :3], time.perf_counter() - start
 
-    def spp_of(self, cell: Cell) -> int:
-        """Samples of a cell: its budget, or what fits into the first method's seconds for it."""
-        first = self.preset.methods[0]
-        if cell.match == "spp" or cell.method == first.name:
-            return cell.budget
-        key = (cell.method, cell.budget)
-        if key not in self._spp:
-            ratios = []
-            for seed in range(CALIBRATIONS + 1):
-                ours, theirs = (self.timed(m, cell.budget, seed)[1] for m in (first, cell))
-                if seed:  # seed 0 compiles
-                    ratios.append(ours / theirs)
-            self._spp[key] = max(round(cell.budget * float(np.median(ratios))), 1)
-        return self._spp[key]
+    def compile_seconds(self, cell: Cell) -> float:
+        """Seconds for the kernels of an integrator (less where they come from the cache on disk); afterwards
+        it is warm."""
+        if cell.method not in self._compile:
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+                dr.kernel_history_clear()
+                self.timed(cell, 2, 0)
+                kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            statistics = getattr(self.integrator(cell), "statistics", None)
+            self._compile[cell.method] = (
+                statistics["seconds"]["compile"]
+                if statistics
+                else sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+            )
+        return self._compile[cell.method]
 
-    def warm(self, cell: Cell):
-        """Compile what the cell needs."""
-        key = ("warm", cell.method)
-        if key not in self._spp:
-            self.timed(cell, 2, 0)
-            self._spp[key] = 0
+    def spp_of(self, cell: Cell) -> int:
+        """Samples of a cell: its budget, or what fits into the first method's seconds for it.
+
+        The ratio of seconds is measured once, at the largest budget, and kept.
+        """
+        first, largest = self.cells.of(cell.budget, cell.seed)[0], max(self.cells.subject.spp)
+        if cell.match == "spp" or cell.method == first.method:
+            return self._possible(cell.sampler, cell.budget)
+        if cell.method not in self._spp:
+            one = [c for c in self.cells.of(largest, 0) if c.method == cell.method][0]
+            kept = self.output / "ratios" / f"{one.key}.json"
+            if not kept.exists():
+                self.compile_seconds(first), self.compile_seconds(cell)
+                pairs = [
+                    [self.timed(c, largest, seed)[1] for c in (first, cell)] for seed in range(CALIBRATIONS)
+                ]
+                write_json(kept, float(np.median([ours / theirs for ours, theirs in pairs])))
+            self._spp[cell.method] = json.loads(kept.read_text())
+        return self._possible(cell.sampler, max(round(cell.budget * self._spp[cell.method]), 1))
+
+    def _possible(self, sampler: str, spp: int) -> int:
+        """The samples that a sampler makes of so many: stratified ones round up."""
+        fork = self.scene(sampler).sensors()[0].sampler().fork()
+        fork.set_sample_count(spp)
+        return int(fork.sample_count())
+
+
+def load_reference(scene: str, resolution: int, depth: int):
+    """A reference, and the SHA-256 of its file."""
+    found = reference.load_reference(scene, resolution, depth)
+    return found, reference.digest(reference.reference_path(scene, resolution, depth))
 
 
 def measure(bench: Bench, cell: Cell) -> dict:
     """Render a cell; its row."""
     spp = bench.spp_of(cell)
-    bench.warm(cell)
+    compile_seconds = bench.compile_seconds(cell)
     image, seconds = bench.timed(cell, spp, cell.seed)
     statistics = getattr(bench.integrator(cell), "statistics", {})
     row = {
@@ -222,21 +215,29 @@ def measure(bench: Bench, cell: Cell) -> dict:
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "spp": spp,
         "seconds": seconds,
-        "seconds_compile": statistics.get("seconds", {}).get("compile"),
-        "mean": float(image.mean()),
+        "seconds_compile": compile_seconds,
         "statistics": json.dumps(statistics),
+        "decisions": json.dumps(statistics.get("decisions")),
     }
     row |= {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}
-    return row | errors(image, bench.reference)
+    path = image_file(bench.output, cell)
+    reference.write_exr(path, {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
+    return row | errors(image, *bench.reference)
 
 
-def errors(image, ref: reference.Reference) -> dict:
-    """All metrics of an image; ``judged`` is false where the reference is not good enough for them."""
-    trimmed = metrics.rel_mse(image, ref.image, trim=TRIM)
+def errors(image, ref: reference.Reference, ref_sha256: str) -> dict:
+    """All measures of an image; ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not
+    good enough for them."""
+    raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
     flip, _ = metrics.hdr_flip(image, ref.image)
     return {
+        "reference_sha256": ref_sha256,
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "mean": float(image.mean()),
+        "tile_means": [float(f"{x:.7g}") for x in metrics.tile_columns(image)],
         "mse": metrics.mse(image, ref.image),
-        "rel_mse": metrics.rel_mse(image, ref.image),
+        "rel_mse": raw,
         "rel_mse_trimmed": trimmed,
         "rel_mse_epsilon": metrics.rel_mse_epsilon(ref.image),
         "mape": metrics.mape(image, ref.image),
@@ -245,8 +246,15 @@ def errors(image, ref: reference.Reference) -> dict:
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
         "energy_in_black": metrics.energy_in_black(image, ref.image),
         "reference_rel_mse": ref.error,
-        "judged": metrics.reference_good_enough(ref.error, trimmed),
+        "reference_rel_mse_trimmed": ref.error_trimmed,
+        "judged": _judged(ref.error, raw),
+        "judged_trimmed": _judged(ref.error_trimmed, trimmed),
     }
+
+
+def _judged(own: float, measured: float) -> bool:
+    """Whether the reference is good enough; an image without any error needs one without."""
+    return metrics.reference_good_enough(own, measured) if measured > 0 else own == 0
 
 
 def write_json(path: Path, value) -> None:
@@ -257,22 +265,65 @@ def write_json(path: Path, value) -> None:
     os.replace(temporary, path)
 
 
-def run(preset: Preset, output: Path, progress: Progress) -> list[str]:
-    """Render all cells that are not there yet; returns what failed, a text each."""
-    todo = {s: [c for c in cells(preset, s) if not cell_file(output, c).exists()] for s in preset.scenes}
-    task = progress.add_task("", total=sum(len(c) for c in todo.values()))
-    failed = []
-    for scene, missing in todo.items():
-        bench = None
-        for cell in missing:
-            progress.update(task, description=f"{scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}")
+class Sweep:
+    """A preset being rendered into a folder; ``failed``: what went wrong, a text each."""
+
+    def __init__(self, preset: Preset, output: Path, progress: Progress):
+        self.preset, self.output, self.progress, self.failed = preset, output, progress, []
+
+    def run(self):
+        """Render all that is not there yet."""
+        scenes = [Cells(self.preset, subject) for subject in self.preset.subjects]
+        todo = [[c for c in cells.planned() if not cell_file(self.output, c).exists()] for cells in scenes]
+        task = self.progress.add_task("", total=sum(map(len, todo)) + len(self.preset.probes))
+        self._probes(task)
+        for cells, missing in zip(scenes, todo, strict=True):
+            bench = None
+            for cell in missing:
+                bench = self._cell(task, bench, cells, cell)
+            self._more(task, bench, cells)
+
+    def _probes(self, task):
+        file = self.output / "probes.json"
+        kept = json.loads(file.read_text()) if file.exists() else {}
+        for name, rounds in self.preset.probes.items():
+            self.progress.update(task, description=name)
+            key = {"rounds": rounds, "versions": render.versions() | {"source": source_digest()}}
             try:
-                bench = bench or Bench(preset, scene)
-                write_json(cell_file(output, cell), measure(bench, cell))
-            except Exception as error:  # one cell must not cost the others
-                failed.append(f"{scene}, {cell.method}, {cell.budget} spp, seed {cell.seed}: {error}")
-            progress.advance(task)
-    return failed
+                if {k: kept.get(name, {}).get(k) for k in key} != key:
+                    kept[name] = key | {"values": probes.PROBES[name](rounds)}
+                    write_json(file, kept)
+            except Exception as error:  # a probe must not cost the cells
+                self.failed.append(f"{name}: {error}")
+            self.progress.advance(task)
+
+    def _cell(self, task, bench, cells: Cells, cell: Cell):
+        """Render a cell; the bench, made if there was none."""
+        description = f"{cell.scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}"
+        self.progress.update(task, description=description)
+        try:
+            bench = bench or Bench(cells, self.output)
+            write_json(cell_file(self.output, cell), measure(bench, cell))
+        except Exception as error:  # one cell must not cost the others
+            self.failed.append(f"{description}: {error}")
+        self.progress.advance(task)
+        return bench
+
+    def _more(self, task, bench, cells: Cells):
+        """Further seeds until the interval is narrow enough, or there are enough of them."""
+        if not cells.fewest():
+            return
+        for seeds in range(cells.fewest(), cells.more.at_most + 1):
+            found = [c for seed in range(seeds) for c in cells.further(seed)]
+            if not all(cell_file(self.output, c).exists() for c in found):
+                return  # one of them failed
+            widths = analysis.widths(read_rows(self.output, found), cells.more.methods)
+            if max(widths.values()) < cells.more.width or seeds == cells.more.at_most:
+                return
+            missing = [c for c in cells.further(seeds) if not cell_file(self.output, c).exists()]
+            self.progress.update(task, total=self.progress.tasks[task].total + len(missing))
+            for cell in missing:
+                bench = self._cell(task, bench, cells, cell)
 
 
 def cell_file(output: Path, cell: Cell) -> Path:
@@ -280,10 +331,39 @@ def cell_file(output: Path, cell: Cell) -> Path:
     return output / "cells" / f"{cell.key}.json"
 
 
+def image_file(output: Path, cell: Cell) -> Path:
+    """Where its image lies."""
+    return output / "images" / cell.scene / f"{cell.key}.exr"
+
+
+def read_rows(output: Path, cells) -> list[dict]:
+    """The rows of those cells that are finished; their errors anew where the reference is another now."""
+    found = []
+    for cell in cells:
+        file = cell_file(output, cell)
+        if not file.exists():
+            continue
+        row = json.loads(file.read_text())
+        where = cell.scene, cell.resolution, cell.max_depth
+        if row["reference_sha256"] != reference.digest(reference.reference_path(*where)):
+            with OpenEXR.File(str(image_file(output, cell)), separate_channels=True) as image:
+                pixels = np.stack([image.channels()[c].pixels for c in "RGB"], axis=-1)
+            row |= errors(pixels.astype(np.float64), *load_reference(*where))
+            write_json(file, row)
+        found.append(row)
+    return found
+
+
 def rows(preset: Preset, output: Path) -> list[dict]:
     """The rows of all finished cells of the preset, in its order."""
-    files = [cell_file(output, c) for scene in preset.scenes for c in cells(preset, scene)]
-    return [json.loads(f.read_text()) for f in files if f.exists()]
+    found = []
+    for subject in preset.subjects:
+        cells = Cells(preset, subject)
+        wanted = {c.key: c for c in cells.planned()}
+        if cells.fewest():
+            wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
+        found += read_rows(output, wanted.values())
+    return found
 
 
 def write_tables(table: list[dict], output: Path) -> None:
@@ -299,7 +379,10 @@ def write_tables(table: list[dict], output: Path) -> None:
         writer.writeheader()
         writer.writerows(table)
     os.replace(temporary, output / "rows.csv")
-    pyarrow.parquet.write_table(pa.Table.from_pylist(table), temporary)
+    arrays = pa.Table.from_pylist(table)
+    place = columns.index("tile_means")
+    means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits were written
+    pyarrow.parquet.write_table(arrays.set_column(place, "tile_means", means), temporary, compression="zstd")
     os.replace(temporary, output / "rows.parquet")
 
 
@@ -312,16 +395,17 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, help="default: results/NAME_OF_PRESET")
     args = parser.parse_args()
     output = args.output or Path("results") / args.preset.stem
-    preset = read_preset(args.preset)
     mi.set_variant("llvm_ad_rgb")
+    preset = read_preset(args.preset)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as progress:
-        failed = run(preset, output, progress)
+        sweep = Sweep(preset, output, progress)
+        sweep.run()
     table = rows(preset, output)
     if table:
         write_tables(table, output)
-    print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in failed))
-    return 1 if failed else 0
+    print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
+    return 1 if sweep.failed else 0
 
 
 if __name__ == "__main__":

@@ -399,12 +399,30 @@ def test_bias_check_against_one_reference():
     assert exact.p == pytest.approx(expected, rel=1e-2)
 
 
+def test_what_was_kept_of_renders_serves_as_they_do():
+    """Expected: the check of the tile means alone finds what the check of the images finds, and an exact
+    reference is the one without error."""
+    images, references = renders(1), renders(2)
+    images[:, 4:6, 2:4, 1] *= 0.7
+    means = [metrics.Means.of([metrics.tile_columns(x) for x in runs]) for runs in (images, references)]
+    assert means[0].tiles == 4
+    assert metrics.compare_means(*means) == metrics.bias_check(images, references)
+    exact = np.ones((8, 8, 3))
+    kept = metrics.compare_means(means[0], metrics.Means.known(exact))
+    assert kept == metrics.bias_check(images, exact, standard_error=0 * exact)
+    with pytest.raises(ValueError, match="columns has 7 renders"):
+        metrics.Means.of(np.ones((7, 51)))
+    with pytest.raises(ValueError, match="ours has 4 tiles along an edge and theirs 2"):
+        metrics.compare_means(means[0], metrics.Means.known(exact, 2))
+
+
 def test_error_of_a_tile_follows_from_its_pixels():
     """Four pixels with standard errors 1, 1, 3, 1: the mean's is sqrt(12) / 4. All 16 pixels of the image,
     12 others with 0: sqrt(12) / 16; the mean of equal channels has that too, as if fully correlated."""
     error = np.zeros((4, 4, 3))
     error[:2, :2] = np.array([[1, 1], [3, 1]])[..., None]
-    columns, whole, _ = metrics._reference_sample(np.ones((4, 4, 3)), error, 2)
+    means, _ = metrics._means_of_reference(np.ones((4, 4, 3)), error, 2)
+    columns, whole = means.columns, means.whole
     assert columns.error[:3] == pytest.approx([np.sqrt(12) / 4] * 3)
     assert columns.error[3:12] == pytest.approx(0)
     assert columns.error[12:] == pytest.approx([np.sqrt(12) / 16] * 3)

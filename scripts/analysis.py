@@ -1,0 +1,192 @@
+"""What the rows of a sweep say: efficiencies, slopes, bias, costs. Pure functions; a row is a dictionary.
+
+Efficiency = 1 / (seconds * error); comparisons pair the renders of one seed, which followed one another in
+time. A figure whose reference is not good enough (`judged` is false) is refused: `Refused` says why.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from metrics import (
+    FEWEST_RUNS,
+    BiasCheck,
+    Estimate,
+    Means,
+    Measurement,
+    bootstrap_median,
+    compare_means,
+    equal_time_speedup,
+    reference_good_enough,
+    reference_refusal,
+    slope,
+)
+
+# Errors of a row, and the reference's own.
+OWN = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_trimmed"}
+
+
+# Samples per pixel of the first integrator at which efficiencies are compared, and with whom.
+DECIDING = 64
+RIVALS = ("path", "path multijitter")
+
+
+class Refused(ValueError):
+    """A figure that the data cannot give; the text says why."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median, extremes and 95 % interval of the median of ``count`` ratios."""
+
+    median: float
+    low: float
+    high: float
+    smallest: float
+    largest: float
+    count: int
+
+
+def spread(values) -> Spread:
+    """`Spread` of at least two values."""
+    middle = bootstrap_median(values)
+    return Spread(middle.value, middle.low, middle.high, min(values), max(values), len(values))
+
+
+def select(rows, **wanted) -> list[dict]:
+    """Rows with these values."""
+    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
+
+
+def check_judged(rows, error: str) -> None:
+    """Raise `Refused` if the reference is too noisy for the median of the errors."""
+    measured, own = float(np.median([row[error] for row in rows])), rows[0][OWN[error]]
+    if measured == 0 and own > 0:
+        raise Refused("every value is exactly that of the reference, which has an error of its own")
+    if measured > 0 and not reference_good_enough(own, measured):
+        raise Refused(reference_refusal(own, measured))
+
+
+def pair_ratios(ours, theirs, error="rel_mse_trimmed") -> list[float]:
+    """Ratio of efficiencies, ours over theirs, of each seed that both have."""
+    by_seed = {row["seed"]: row for row in theirs}
+    pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
+    return [equal_time_speedup(*(Measurement(row["seconds"], row[error]) for row in pair)) for pair in pairs]
+
+
+def efficiency(ours, theirs, error="rel_mse_trimmed") -> Spread:
+    """Spread of `pair_ratios`; raises `Refused` where the reference is too noisy or an error is 0."""
+    if len(ours) < 2 or len(theirs) < 2:
+        raise Refused("fewer than two renders")
+    for rows in (ours, theirs):
+        if any(row[error] == 0 for row in rows):
+            raise Refused(f"{rows[0]['method']} is exact here")
+        check_judged(rows, error)
+    return spread(pair_ratios(ours, theirs, error))
+
+
+def widths(rows, methods) -> dict[str, float]:
+    """Width of the interval of the median ratio of efficiencies (trimmed) of the first method over each
+    other one."""
+    ours = select(rows, method=methods[0])
+    return {
+        name: (lambda m: m.high - m.low)(bootstrap_median(pair_ratios(ours, select(rows, method=name))))
+        for name in methods[1:]
+    }
+
+
+def cost(ours, theirs) -> Spread:
+    """Spread of the ratio of seconds per sample per pixel, pairs of seeds."""
+    by_seed = {row["seed"]: row["seconds"] / row["spp"] for row in theirs}
+    ratios = [row["seconds"] / row["spp"] / by_seed[row["seed"]] for row in ours if row["seed"] in by_seed]
+    if len(ratios) < 2:
+        raise Refused("fewer than two renders")
+    return spread(ratios)
+
+
+def convergence(rows, error="rel_mse") -> Estimate:
+    """Slope of log(error) over log(samples), all renders of one method in one scene; budgets whose error
+    the reference cannot judge are left out."""
+    runs = {}
+    for budget in sorted({row["budget"] for row in rows}):
+        at = select(rows, budget=budget)
+        if len(at) >= 2 and all(row[error] > 0 for row in at):
+            try:
+                check_judged(at, error)
+            except Refused:
+                continue
+            runs[float(np.median([row["spp"] for row in at]))] = [row[error] for row in at]
+    if len(runs) < 2:
+        raise Refused("fewer than two budgets with errors that the reference can judge")
+    return slope(list(runs), list(runs.values()))
+
+
+def bias(rows, reference: Means) -> BiasCheck:
+    """Bias check of one method in one scene against the reference, with the budget that has most samples
+    among those with enough renders."""
+    budgets = {row["budget"]: select(rows, budget=row["budget"]) for row in rows}
+    enough = [at for at in budgets.values() if len(at) >= FEWEST_RUNS]
+    if not enough:
+        raise Refused(f"fewer than {FEWEST_RUNS} renders of one budget")
+    best = max(enough, key=lambda at: sum(row["spp"] for row in at))
+    return compare_means(Means.of([row["tile_means"] for row in best]), reference)
+
+
+def geometric_mean(values) -> float:
+    """exp(mean(log))."""
+    return math.exp(float(np.mean(np.log(values))))
+
+
+@dataclass(frozen=True)
+class Results:
+    """The rows of a sweep with the tile means of its references by scene, and what its probes measured."""
+
+    rows: list
+    references: dict
+    probes: dict
+
+    @property
+    def scenes(self) -> list[str]:
+        """Scenes, in the order of the rows."""
+        return list(dict.fromkeys(row["scene"] for row in self.rows))
+
+    @property
+    def methods(self) -> list[str]:
+        """Integrators, in the order of the rows; the first one is what the others are compared with."""
+        return list(dict.fromkeys(row["method"] for row in self.rows))
+
+    def of(self, scene: str, method: str, budget: int | None = None) -> list[dict]:
+        """Rows of an integrator in a scene."""
+        rows = select(self.rows, scene=scene, method=method)
+        return rows if budget is None else select(rows, budget=budget)
+
+    def bias(self, scene: str, method: str) -> BiasCheck:
+        """Bias check against the scene's reference."""
+        if scene not in self.references:
+            raise Refused("not rendered")
+        return bias(self.of(scene, method), self.references[scene])
+
+    def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=DECIDING) -> Spread:
+        """Of the first integrator over another one."""
+        return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
+
+    def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=DECIDING) -> Spread:
+        """As `efficiency`; raises `Refused` with the missing energy where the other fails the bias check."""
+        check = self.bias(scene, rival)
+        if not check.passed:
+            raise Refused(missing(check))
+        return self.efficiency(scene, rival, error, budget)
+
+    def against_path(self, scene, error="rel_mse_trimmed", budget=DECIDING) -> Spread:
+        """Over the stronger of `path` and `path` with multijitter: that with the smaller ratio."""
+        found = [self.efficiency(scene, rival, error, budget) for rival in RIVALS]
+        return min(found, key=lambda ratio: ratio.median)
+
+
+def missing(check: BiasCheck) -> str:
+    """The missing energy in words."""
+    share = check.missing
+    low, high = 100 * share.low, 100 * share.high
+    return f"{100 * share.value:.2g} % of the energy is missing ({low:.2g} to {high:.2g})"

@@ -1,0 +1,180 @@
+"""The plots of a sweep, readable in print: each integrator has a marker and a dash of its own."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from analysis import DECIDING, Refused, Results  # noqa: E402
+from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
+
+# Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
+STYLES = {
+    "bdpt": ("#0072B2", "o", "-"),
+    "bdpt skip=none": ("#56B4E9", "v", "--"),
+    "bdpt points=independent": ("#009E73", "^", ":"),
+    "bdpt light_paths=0": ("#F0E442", "P", "-."),
+    "path": ("#D55E00", "s", "-"),
+    "path multijitter": ("#E69F00", "D", "--"),
+    "ptracer": ("#CC79A7", "x", ":"),
+}
+PLAIN = ("#000000", ".", "-")
+RAYS = {
+    "camera": ("#0072B2", ""),
+    "light": ("#E69F00", "//"),
+    "shadow_s1": ("#009E73", ".."),
+    "shadow_t1": ("#D55E00", "xx"),
+    "shadow_inner": ("#CC79A7", "\\\\"),
+}
+COLUMNS = 4
+
+
+def style(method: str) -> dict:
+    """Colour, marker and dash of an integrator."""
+    colour, marker, dash = STYLES.get(method, PLAIN)
+    return {"color": colour, "marker": marker, "linestyle": dash, "markersize": 4, "linewidth": 1.2}
+
+
+def convergence(results: Results, against: str, path: Path):
+    """relMSE over ``against``, "seconds" or "spp", a panel per scene, medians over seeds with the range of
+    all; the dotted line falls with slope -1."""
+    rows = math.ceil(len(results.scenes) / COLUMNS)
+    figure, axes = plt.subplots(rows, COLUMNS, figsize=(11, 2.5 * rows), squeeze=False)
+    for scene, axis in zip(results.scenes, axes.flat, strict=False):
+        for method in results.methods:
+            _curve(axis, results.of(scene, method), against, method)
+        _ideal(axis, results.of(scene, results.methods[0]), against)
+        axis.set(xscale="log", yscale="log")
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_minor_formatter(NullFormatter())
+        axis.set_title(scene, fontsize=9)
+        axis.tick_params(labelsize=7)
+    for axis in axes.flat[len(results.scenes) :]:
+        axis.set_axis_off()
+    handles = {label: h for a in axes.flat for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
+    figure.supxlabel({"seconds": "seconds", "spp": "samples per pixel"}[against], fontsize=10)
+    figure.supylabel("relMSE, raw", fontsize=10)
+    figure.tight_layout()
+    figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0),
+        ncols=4,
+        fontsize=9,
+        frameon=False,
+    )
+    _save(figure, path)
+
+
+def _curve(axis, rows, against, method):
+    points = []
+    for budget in sorted({row["budget"] for row in rows}):
+        at = [row for row in rows if row["budget"] == budget]
+        errors = [row["rel_mse"] for row in at]
+        if min(errors) > 0:
+            points.append([np.median([row[against] for row in at]), *np.quantile(errors, (0, 0.5, 1))])
+    if points:
+        x, low, middle, high = np.array(points).T
+        axis.plot(x, middle, label=method, **style(method))
+        axis.fill_between(x, low, high, color=style(method)["color"], alpha=0.15, linewidth=0)
+
+
+def _ideal(axis, rows, against):
+    """A line of slope -1 through the first budget's median of the first integrator."""
+    budgets = sorted({row["budget"] for row in rows})
+    if not budgets or min(row["rel_mse"] for row in rows) == 0:
+        return
+    medians = [
+        [np.median([row[key] for row in rows if row["budget"] == b]) for key in (against, "rel_mse")]
+        for b in (budgets[0], budgets[-1])
+    ]
+    (x0, y0), (x1, _) = medians
+    axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8)
+    axis.text(x1, y0 * x0 / x1, " −1", fontsize=7, va="center")
+
+
+def efficiencies(results: Results, rivals, path: Path):
+    """Ratio of efficiencies per scene, median and range over seeds, trimmed and raw; an integrator that
+    fails the bias check has none."""
+    figure, axes = plt.subplots(1, len(rivals), figsize=(11, 0.28 * len(results.scenes) + 1.2), sharey=True)
+    for rival, axis in zip(rivals, np.atleast_1d(axes), strict=True):
+        for offset, (error, marker, colour) in enumerate(
+            (("rel_mse_trimmed", "o", "#0072B2"), ("rel_mse", "s", "#D55E00"))
+        ):
+            for place, scene in enumerate(results.scenes):
+                y = place + 0.3 * offset - 0.15
+                try:
+                    ratio = results.fair_efficiency(scene, rival, error)
+                except Refused as why:
+                    if offset == 0:
+                        text = "misses energy" if "missing" in str(why) else "not judged"
+                        axis.text(1, place, text, fontsize=7, va="center", ha="center", color="0.4")
+                    continue
+                axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
+                axis.plot(
+                    ratio.median,
+                    y,
+                    marker=marker,
+                    color=colour,
+                    markersize=4,
+                    linestyle="none",
+                    label={"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}[error],
+                )
+        axis.axvline(1, color="black", linewidth=0.8)
+        axis.set(xscale="log", title=f"efficiency over {rival}, {DECIDING} spp")
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}x"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.title.set_fontsize(10)
+        axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)
+        axis.set_ylim(len(results.scenes) - 0.5, -0.5)
+        axis.grid(axis="x", linewidth=0.3)
+        unique = dict(reversed(list(zip(*axis.get_legend_handles_labels()[::-1], strict=True))))
+        axis.legend(unique.values(), unique.keys(), fontsize=8, loc="lower right")
+    figure.tight_layout()
+    _save(figure, path)
+
+
+def rays(results: Results, path: Path):
+    """Rays per sample of the first integrator by kind, a bar per scene."""
+    figure, axis = plt.subplots(figsize=(9, 0.28 * len(results.scenes) + 1.4))
+    left = np.zeros(len(results.scenes))
+    for kind, (colour, hatch) in RAYS.items():
+        widths = np.array([_rays_per_sample(results, scene, kind) for scene in results.scenes])
+        axis.barh(
+            range(len(results.scenes)),
+            widths,
+            left=left,
+            color=colour,
+            hatch=hatch,
+            edgecolor="white",
+            linewidth=0.3,
+            label=kind.replace("shadow_s1", "visibility, s = 1")
+            .replace("shadow_t1", "visibility, t = 1")
+            .replace("shadow_inner", "visibility, s ≥ 2, t ≥ 2"),
+        )
+        left += widths
+    axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {DECIDING} spp")
+    axis.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.45, 1))
+    figure.tight_layout()
+    _save(figure, path)
+
+
+def _rays_per_sample(results, scene, kind) -> float:
+    rows = results.of(scene, results.methods[0], DECIDING)
+    pixels = [row["width"] * row["height"] for row in rows]
+    counts = [row[f"rays_{kind}"] / row["spp"] / n for row, n in zip(rows, pixels, strict=True)]
+    return float(np.median(counts)) if counts else 0.0
+
+
+def _save(figure, path: Path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, bbox_inches="tight", metadata={"Software": None})
+    plt.close(figure)

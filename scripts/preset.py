@@ -1,0 +1,191 @@
+"""Presets: what a sweep renders, as TOML.
+
+    resolution = 128
+    scenes = ["cornell_box", "open_sky"]
+    spp = [4, 16, 64]      # samples per pixel of the first integrator: the budgets
+    seeds = [5, 16, 5]     # renders of each; one number for all
+
+    [[integrator]]         # the first one sets the time
+    type = "bdpt"
+
+    [[integrator]]
+    name = "path multijitter"
+    type = "path"
+    sampler = "multijitter"
+    match = "seconds"      # as many samples as fit into the seconds of the first; or "spp", the same samples
+    scenes = ["open_sky"]  # only there; default: in all
+
+    [scene.cornell_box]    # where a scene differs: max_depth (default: the scene's own), spp, seeds
+    max_depth = 6
+
+    [more]                 # further seeds until the interval of a median is narrow enough
+    scenes = ["open_sky"]
+    integrators = ["bdpt", "path multijitter"]
+    spp = 64
+    seeds = [20, 60]       # at least, at most
+    width = 0.04           # of the 95 % interval of the ratio of efficiencies, in all pairs with the first
+
+    [probes]               # of scripts/probes.py: how often each is repeated
+    coldstart = 5
+
+Further keys of an integrator are parameters of the plugin.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import probes
+import reference
+
+MATCHES = ("seconds", "spp")
+
+
+@dataclass(frozen=True)
+class Method:
+    """An integrator of a preset: ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it
+    has in common with the first one, ``scenes`` where it takes part (None: everywhere)."""
+
+    name: str
+    parameters: tuple
+    sampler: str
+    match: str
+    scenes: tuple | None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A scene of a preset: ``max_depth``, samples per pixel of each budget, number of seeds of each."""
+
+    name: str
+    max_depth: int
+    spp: tuple
+    seeds: tuple
+
+
+@dataclass(frozen=True)
+class More:
+    """Further seeds of some ``methods`` in some scenes at one budget, ``at_least`` to ``at_most``, until the
+    interval of the median ratio of efficiencies is narrower than ``width``."""
+
+    scenes: tuple
+    methods: tuple
+    spp: int
+    at_least: int
+    at_most: int
+    width: float
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A sweep."""
+
+    subjects: tuple
+    methods: tuple
+    resolution: int
+    more: More | None
+    probes: dict
+
+
+def read_preset(path: Path) -> Preset:
+    """Read and check a TOML file; raises ``ValueError`` naming the file and the key."""
+    data = tomllib.loads(path.read_text())
+    keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
+    _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
+    for key in {"resolution", "max_depth"} & set(data):
+        _whole(path, key, data[key])
+    for name in data.get("scene", {}):
+        if name not in data["scenes"]:
+            raise ValueError(f"{path}: [scene.{name}] is not among the scenes {data['scenes']}")
+    methods = tuple(_method(path, dict(entry), data["scenes"]) for entry in data["integrator"])
+    if len({m.name for m in methods}) < len(methods):
+        raise ValueError(f"{path}: two integrators have the same name")
+    counts = data.get("probes", {})
+    for name, count in counts.items():
+        if name not in probes.PROBES:
+            raise ValueError(f"{path}: probe {name!r} is unknown; there are {sorted(probes.PROBES)}")
+        _whole(path, name, count)
+    return Preset(
+        subjects=tuple(_subject(path, data, name) for name in data["scenes"]),
+        methods=methods,
+        resolution=data["resolution"],
+        more=_more(path, data["more"], data["scenes"], methods) if "more" in data else None,
+        probes=counts,
+    )
+
+
+def _check_keys(path, entry, needed, allowed, what):
+    if unknown := sorted(set(entry) - allowed):
+        raise ValueError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
+    if missing := sorted(needed - set(entry)):
+        raise ValueError(f"{path}: {missing[0]} is missing")
+
+
+def _whole(path, key, value) -> int:
+    if type(value) is not int or value < 1:
+        raise ValueError(f"{path}: {key}={value!r} must be a whole number of at least 1")
+    return value
+
+
+def _row(path, key, value) -> tuple:
+    if not isinstance(value, list) or not value or not all(type(n) is int and n > 0 for n in value):
+        raise ValueError(f"{path}: {key}={value!r} must be a list of whole numbers of at least 1")
+    return tuple(value)
+
+
+def _subject(path, data, name) -> Subject:
+    reference.scene_file(name)
+    own = data.get("scene", {}).get(name, {})
+    _check_keys(path, own, set(), {"max_depth", "spp", "seeds"}, f"[scene.{name}]")
+    merged = data | own
+    spp, seeds = _row(path, "spp", merged["spp"]), merged["seeds"]
+    if isinstance(seeds, list):
+        seeds = _row(path, "seeds", seeds)
+        if len(seeds) != len(spp):
+            raise ValueError(f"{path}: seeds={list(seeds)} of {name} must be as many as spp={list(spp)}")
+    else:
+        seeds = (_whole(path, "seeds", seeds),) * len(spp)
+    if "max_depth" in merged:
+        depth = _whole(path, "max_depth", merged["max_depth"])
+    else:
+        depth = reference.default_depth(name)
+    return Subject(name, depth, spp, seeds)
+
+
+def _method(path, entry, scenes) -> Method:
+    if "type" not in entry:
+        raise ValueError(f"{path}: an integrator without type: {entry!r}")
+    name, sampler = entry.pop("name", entry["type"]), entry.pop("sampler", "independent")
+    match, only = entry.pop("match", "spp"), entry.pop("scenes", None)
+    if "max_depth" in entry:
+        raise ValueError(
+            f"{path}: max_depth of integrator {name!r} would compare different images; set it for all"
+        )
+    if match not in MATCHES:
+        raise ValueError(f"{path}: match={match!r} of integrator {name!r} must be one of {MATCHES}")
+    if unknown := [scene for scene in only or () if scene not in scenes]:
+        raise ValueError(f"{path}: scene {unknown[0]!r} of integrator {name!r} is not in the preset")
+    return Method(name, tuple(sorted(entry.items())), sampler, match, tuple(only) if only else None)
+
+
+def _more(path, entry, scenes, methods) -> More:
+    keys = {"scenes", "integrators", "spp", "seeds", "width"}
+    _check_keys(path, entry, keys, keys, "[more]")
+    for key, known in (("scenes", scenes), ("integrators", [m.name for m in methods])):
+        if unknown := [name for name in entry[key] if name not in known]:
+            raise ValueError(f"{path}: {unknown[0]!r} of [more] {key} is not in the preset")
+    if entry["integrators"][:1] != [methods[0].name] or len(entry["integrators"]) < 2:
+        raise ValueError(
+            f"{path}: integrators of [more] must be the first one, {methods[0].name!r}, and its rivals"
+        )
+    seeds = _row(path, "seeds of [more]", entry["seeds"])
+    if len(seeds) != 2 or not 2 <= seeds[0] <= seeds[1]:
+        raise ValueError(f"{path}: seeds={entry['seeds']!r} of [more] must be [at least, at most]")
+    if not 0 < entry["width"] < 1:
+        raise ValueError(f"{path}: width={entry['width']!r} of [more] must be between 0 and 1")
+    spp = _whole(path, "spp of [more]", entry["spp"])
+    return More(
+        tuple(entry["scenes"]), tuple(entry["integrators"]), spp, seeds[0], seeds[1], float(entry["width"])
+    )

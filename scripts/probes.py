@@ -1,0 +1,61 @@
+"""What a render costs besides its samples: the first image from an empty kernel cache, and memory.
+
+Each probe takes the number of repetitions and returns plain numbers; a repetition is a process of its own.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+
+COLD = """
+import time; start = time.perf_counter()
+import mitsuba_bdpt, mitsuba as mi, drjit as dr
+mi.set_variant('llvm_ad_rgb')
+scene = mi.load_dict(mi.cornell_box())
+integrator = mi.load_dict({'type': '%s', 'max_depth': 6})
+loaded = time.perf_counter()
+image = mi.render(scene, integrator=integrator, spp=16); dr.eval(image); dr.sync_thread()
+print(time.perf_counter() - loaded)
+"""
+
+MEMORY = """
+import resource
+import mitsuba_bdpt, mitsuba as mi
+mi.set_variant('llvm_ad_rgb')
+d = mi.cornell_box()
+d['sensor']['film']['width'], d['sensor']['film']['height'] = 1920, 1080
+mi.render(mi.load_dict(d), integrator=mi.load_dict({'type': 'bdpt', 'max_depth': 8}), spp=%d)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
+
+
+def _printed(code, environment=None) -> float:
+    """The number that a new process prints."""
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
+    )
+    return float(done.stdout.split()[-1])
+
+
+def coldstart(rounds: int) -> dict:
+    """Seconds from an empty kernel cache to the first image of the Cornell box, 256x256, depth 6, 16 spp, by
+    integrator, a value per round; imports and loading apart."""
+    seconds = {"path": [], "bdpt": []}
+    for _ in range(rounds):
+        for name, values in seconds.items():
+            with tempfile.TemporaryDirectory() as cache:
+                empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
+                values.append(_printed(COLD % name, empty))
+    return seconds
+
+
+def memory(rounds: int) -> dict:
+    """Peak resident GiB of a process that renders the Cornell box at 1920x1080, depth 8, by samples per
+    pixel, a value per round."""
+    return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
+
+
+PROBES = {"coldstart": coldstart, "memory": memory}
