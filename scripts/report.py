@@ -291,11 +291,11 @@ def page(results: Results, goals, notes) -> str:
 Made by `python scripts/report.py docs/benchmark` from the data beside it; `make benchmark` measures them:
 {machine(results)}.
 
-Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed
-one another; median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²),
-*trimmed* without the worst 0.1 % of values, {DECIDING} samples per pixel unless said. An integrator that fails
-the bias check has its missing energy reported instead. A figure is refused where the reference's own error is
-above 1 % of the error measured.
+Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
+median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed* without
+the worst 0.1 % of values, {DECIDING} samples per pixel unless said. An integrator that fails the bias check has
+its missing energy reported instead. A figure is refused where the reference's own error is above 1 % of the
+error measured.
 
 ## Goals
 
