@@ -32,20 +32,22 @@ from analysis import (
     geometric_mean,
     missing,
 )
+from metrics import rel_mse_epsilon
 
 ROOT = Path(__file__).resolve().parents[1]
 NONE = "bdpt skip=none"
 
 
-def load(folder: Path) -> Results:
-    """The data of a folder, with the references of its scenes."""
+def load(folder: Path) -> tuple[Results, dict]:
+    """The data of a folder, and the references of its scenes by name."""
     rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
     wanted = {row["scene"]: (row["scene"], row["resolution"], row["max_depth"]) for row in rows}
-    means = {scene: reference.load_reference(*key).means for scene, key in wanted.items()}
-    if without := [scene for scene, kept in means.items() if kept is None]:
+    made = {scene: reference.load_reference(*key) for scene, key in wanted.items()}
+    if without := [scene for scene, kept in made.items() if kept.means is None]:
         raise ValueError(f"{folder}: the reference of {without[0]} has too few renders for a bias check")
     file = folder / "probes.json"
-    return Results(rows, means, json.loads(file.read_text()) if file.exists() else {})
+    measured = json.loads(file.read_text()) if file.exists() else {}
+    return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made
 
 
 def table(head, rows) -> str:
@@ -150,6 +152,34 @@ def budgets_table(results: Results) -> str:
                 for error in ("rel_mse_trimmed", "rel_mse"):
                     figure = said(lambda s=scene, e=error, b=budget: results.against_path(s, e, b))
                     lines[-1].append(figure if "x" in figure[:8] else "–")
+    return table(head, lines)
+
+
+def references_table(made: dict) -> str:
+    """What each scene is compared with."""
+    head = [
+        "scene",
+        "max_depth",
+        "by",
+        "samples per pixel",
+        "own relMSE, raw",
+        "trimmed",
+        "epsilon of relMSE",
+    ]
+    lines = []
+    for scene, kept in made.items():
+        by = kept.provenance["integrator"]
+        lines.append(
+            [
+                f"`{scene}`",
+                str(kept.provenance["max_depth"]),
+                by if isinstance(by, str) else f"`{by['type']}`",
+                str(kept.provenance.get("spp", "–")),
+                f"{kept.error:.1e}",
+                f"{kept.error_trimmed:.1e}",
+                f"{rel_mse_epsilon(kept.image):.3g}",
+            ]
+        )
     return table(head, lines)
 
 
@@ -284,7 +314,7 @@ def machine(results: Results) -> str:
     return f"{row['machine']}; {versions}"
 
 
-def page(results: Results, goals, notes) -> str:
+def page(results: Results, made: dict, goals, notes) -> str:
     """The page of all tables, as Markdown."""
     return f"""# Benchmark
 
@@ -293,9 +323,9 @@ Made by `python scripts/report.py docs/benchmark` from the data beside it; `make
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed* without
-the worst 0.1 % of values, {DECIDING} samples per pixel unless said. An integrator that fails the bias check has
-its missing energy reported instead. A figure is refused where the reference's own error is above 1 % of the
-error measured.
+the worst 0.1 % of values, {DECIDING} samples per pixel unless said. An integrator that fails the bias
+check has its missing energy reported instead. A figure is refused where the reference's own error is above
+1 % of the error measured.
 
 ## Goals
 
@@ -320,7 +350,10 @@ Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, and 
 ![relMSE over seconds](seconds.png)
 
 ![Rays by kind](rays.png)
-"""
+
+## References
+
+{references_table(made)}"""
 
 
 def main():
@@ -331,14 +364,14 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--readme", type=Path, default=ROOT / "README.md")
     args = parser.parse_args()
-    results = load(args.folder)
+    results, made = load(args.folder)
     goals = tomllib.loads((args.folder / "goals.toml").read_text())["goal"]
     notes = tomllib.loads((args.folder / "notes.toml").read_text())
     figures.efficiencies(results, RIVALS, args.folder / "efficiency.png")
     figures.convergence(results, "seconds", args.folder / "seconds.png")
     figures.convergence(results, "spp", args.folder / "samples.png")
     figures.rays(results, args.folder / "rays.png")
-    write_text(args.folder / "README.md", page(results, goals, notes))
+    write_text(args.folder / "README.md", page(results, made, goals, notes))
     readme = replace_part(args.readme.read_text(), "goals", goals_table(results, goals))
     write_text(args.readme, replace_part(readme, "efficiency", efficiency_table(results)))
 

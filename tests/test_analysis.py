@@ -13,6 +13,7 @@ import pytest
 import report
 from analysis import Refused, Results
 from metrics import Means
+from reference import Reference
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUE = np.full(51, 2.0)
@@ -214,12 +215,15 @@ def test_a_report_is_written(results, tmp_path, monkeypatch):
     (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = "1x"\n')
     (tmp_path / "notes.toml").write_text('dark = "why"\n')
     readme = tmp_path / "TOP.md"
+    provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096}
+    exact = Reference(np.full((4, 4, 3), 2.0), 1e-5, 5e-6, KNOWN, provenance)
     readme.write_text("".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("goals", "efficiency")))
-    monkeypatch.setattr(report, "load", lambda folder: results)
+    monkeypatch.setattr(report, "load", lambda folder: (results, {"box": exact}))
     monkeypatch.setattr("sys.argv", ["report.py", str(tmp_path), "--readme", str(readme)])
     report.main()
     page = (tmp_path / "README.md").read_text()
     assert "* `dark`: why" in page and cells(page, "floor") == ["1x", "not measured yet"]
+    assert "| `box` | 3 | `path` | 4096 | 1.0e-05 | 5.0e-06 | 0.04 |" in page
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
     for name in ("efficiency", "seconds", "samples", "rays"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
