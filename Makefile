@@ -22,21 +22,23 @@ gallery: $(INSTALLED)
 	mkdir -p docs/images
 	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
 
-# A small sweep of time against error, some five minutes on two cores; goes on where it was stopped.
+# A small sweep of time against error, under ten minutes on two cores; goes on where it was stopped.
 sweep: $(INSTALLED)
-	$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --seconds 100
+	-$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --spp 128 --seconds 120
 	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
+	$(VENV)/bin/python scripts/report.py results/small
 
-# The references of the benchmark, about two hours on two cores; goes on where it was stopped.
+# The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)
-	$(VENV)/bin/python scripts/reference.py --all --seconds 1200
-	$(VENV)/bin/python scripts/reference.py cornell_box --max-depth 6 --seconds 1200
+	$(VENV)/bin/python scripts/reference.py --all --seconds 3600
+	$(VENV)/bin/python scripts/reference.py glass_caustics --spp 256 --seconds 7200
+	$(VENV)/bin/python scripts/reference.py cornell_box --max-depth 6 --spp 256 --seconds 3600
 
 # The tables and plots of the README, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
-	$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
+	-$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
 	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/benchmark
-	$(VENV)/bin/python scripts/report.py docs/benchmark
+	$(VENV)/bin/python scripts/report.py docs/benchmark --readme README.md
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .

@@ -1,7 +1,7 @@
 """What the rows of a sweep say: efficiencies, slopes, bias, costs. Pure functions; a row is a dictionary.
 
 Efficiency = 1 / (seconds * error); comparisons pair the renders of one seed, which followed one another in
-time. A figure whose reference is not good enough (`judged` is false) is refused: `Refused` says why.
+time. A figure that the data cannot give is refused: `Refused` says why, `Biased` with the missing energy.
 """
 
 from __future__ import annotations
@@ -28,13 +28,23 @@ from metrics import (
 OWN = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_trimmed"}
 
 
-# Samples per pixel of the first integrator at which efficiencies are compared, and with whom.
-DECIDING = 64
+# Names of integrators that the report looks for, as presets/benchmark.toml has them.
 RIVALS = ("path", "path multijitter")
+NONE = "bdpt skip=none"
+INDEPENDENT = "bdpt points=independent"
+ALONE = "bdpt light_paths=0"
+LIGHT_TRACER = "ptracer"
+
+# Samples per pixel of the first integrator at which efficiencies are compared, if there are such renders.
+DECIDING = 64
 
 
 class Refused(ValueError):
     """A figure that the data cannot give; the text says why."""
+
+
+class Biased(Refused):
+    """An efficiency over an integrator that fails the bias check; the text says what it lacks."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +72,7 @@ def select(rows, **wanted) -> list[dict]:
 
 def check_judged(rows, error: str) -> None:
     """Raise `Refused` if the reference is too noisy for the median of the errors."""
-    measured, own = float(np.median([row[error] for row in rows])), rows[0][OWN[error]]
+    measured, own = (float(np.median([row[key] for row in rows])) for key in (error, OWN[error]))
     if measured == 0 and own > 0:
         raise Refused("every value is exactly that of the reference, which has an error of its own")
     if measured > 0 and not reference_good_enough(own, measured):
@@ -84,17 +94,18 @@ def efficiency(ours, theirs, error="rel_mse_trimmed") -> Spread:
         if any(row[error] == 0 for row in rows):
             raise Refused(f"{rows[0]['method']} is exact here")
         check_judged(rows, error)
-    return spread(pair_ratios(ours, theirs, error))
+    ratios = pair_ratios(ours, theirs, error)
+    if len(ratios) < 2:
+        raise Refused("fewer than two pairs of seeds")
+    return spread(ratios)
 
 
 def widths(rows, methods) -> dict[str, float]:
     """Width of the interval of the median ratio of efficiencies (trimmed) of the first method over each
-    other one."""
+    other one, without regard to the reference."""
     ours = select(rows, method=methods[0])
-    return {
-        name: (lambda m: m.high - m.low)(bootstrap_median(pair_ratios(ours, select(rows, method=name))))
-        for name in methods[1:]
-    }
+    found = {name: bootstrap_median(pair_ratios(ours, select(rows, method=name))) for name in methods[1:]}
+    return {name: middle.high - middle.low for name, middle in found.items()}
 
 
 def cost(ours, theirs) -> Spread:
@@ -102,7 +113,7 @@ def cost(ours, theirs) -> Spread:
     by_seed = {row["seed"]: row["seconds"] / row["spp"] for row in theirs}
     ratios = [row["seconds"] / row["spp"] / by_seed[row["seed"]] for row in ours if row["seed"] in by_seed]
     if len(ratios) < 2:
-        raise Refused("fewer than two renders")
+        raise Refused("fewer than two pairs of seeds")
     return spread(ratios)
 
 
@@ -118,6 +129,8 @@ def convergence(rows, error="rel_mse") -> Estimate:
             except Refused:
                 continue
             runs[float(np.median([row["spp"] for row in at]))] = [row[error] for row in at]
+    if not rows:
+        raise Refused("not rendered")
     if len(runs) < 2:
         raise Refused("fewer than two budgets with errors that the reference can judge")
     return slope(list(runs), list(runs.values()))
@@ -154,8 +167,15 @@ class Results:
 
     @property
     def methods(self) -> list[str]:
-        """Integrators, in the order of the rows; the first one is what the others are compared with."""
-        return list(dict.fromkeys(row["method"] for row in self.rows))
+        """Integrators, first the one that the others are compared with."""
+        return list(dict.fromkeys([self.rows[0]["first"], *(row["method"] for row in self.rows)]))
+
+    @property
+    def deciding(self) -> int:
+        """The budget that decides: `DECIDING`, or the largest that every scene has."""
+        budgets = [{row["budget"] for row in select(self.rows, scene=scene)} for scene in self.scenes]
+        common = set.intersection(*budgets)
+        return DECIDING if DECIDING in common or not common else max(common)
 
     def of(self, scene: str, method: str, budget: int | None = None) -> list[dict]:
         """Rows of an integrator in a scene."""
@@ -168,25 +188,42 @@ class Results:
             raise Refused("not rendered")
         return bias(self.of(scene, method), self.references[scene])
 
-    def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=DECIDING) -> Spread:
-        """Of the first integrator over another one."""
+    def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Spread:
+        """Of the first integrator over another one, at the deciding budget unless said."""
+        budget = budget or self.deciding
         return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
 
-    def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=DECIDING) -> Spread:
-        """As `efficiency`; raises `Refused` with the missing energy where the other fails the bias check."""
+    def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Spread:
+        """As `efficiency`; raises `Biased` where the other fails the bias check."""
         check = self.bias(scene, rival)
         if not check.passed:
-            raise Refused(missing(check))
+            raise Biased(missing(check))
         return self.efficiency(scene, rival, error, budget)
 
-    def against_path(self, scene, error="rel_mse_trimmed", budget=DECIDING) -> Spread:
-        """Over the stronger of `path` and `path` with multijitter: that with the smaller ratio."""
-        found = [self.efficiency(scene, rival, error, budget) for rival in RIVALS]
+    def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Spread:
+        """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
+        that pass the bias check; raises `Biased` if neither does."""
+        found, biased = [], []
+        for rival in RIVALS:
+            try:
+                found.append(self.fair_efficiency(scene, rival, error, budget))
+            except Biased as why:
+                biased.append(f"{rival}: {why}")
+        if not found:
+            raise Biased("; ".join(biased))
         return min(found, key=lambda ratio: ratio.median)
 
 
 def missing(check: BiasCheck) -> str:
-    """The missing energy in words."""
+    """What an integrator lacks that fails the bias check, in words."""
     share = check.missing
-    low, high = 100 * share.low, 100 * share.high
-    return f"{100 * share.value:.2g} % of the energy is missing ({low:.2g} to {high:.2g})"
+    low, high = sorted((abs(100 * share.low), abs(100 * share.high)))
+    if share.low <= 0 <= share.high:
+        where = (
+            "the whole image"
+            if check.tile is None
+            else f"the tile in row {check.tile[0]}, column {check.tile[1]}"
+        )
+        return f"wrong in {where} of 4 x 4, by {check.difference.value:.2g}"
+    what = "of the energy is missing" if share.value > 0 else "too much energy"
+    return f"{abs(100 * share.value):.2g} % {what} ({low:.2g} to {high:.2g})"

@@ -10,18 +10,28 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from analysis import DECIDING, Refused, Results  # noqa: E402
+from analysis import (  # noqa: E402
+    ALONE,
+    INDEPENDENT,
+    LIGHT_TRACER,
+    NONE,
+    RIVALS,
+    Biased,
+    Refused,
+    Results,
+    check_judged,
+)
 from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {
     "bdpt": ("#0072B2", "o", "-"),
-    "bdpt skip=none": ("#56B4E9", "v", "--"),
-    "bdpt points=independent": ("#009E73", "^", ":"),
-    "bdpt light_paths=0": ("#F0E442", "P", "-."),
-    "path": ("#D55E00", "s", "-"),
-    "path multijitter": ("#E69F00", "D", "--"),
-    "ptracer": ("#CC79A7", "x", ":"),
+    NONE: ("#56B4E9", "v", "--"),
+    INDEPENDENT: ("#009E73", "^", ":"),
+    ALONE: ("#F0E442", "P", "-."),
+    RIVALS[0]: ("#D55E00", "s", "-"),
+    RIVALS[1]: ("#E69F00", "D", "--"),
+    LIGHT_TRACER: ("#CC79A7", "x", ":"),
 }
 PLAIN = ("#000000", ".", "-")
 RAYS = {
@@ -42,7 +52,7 @@ def style(method: str) -> dict:
 
 def convergence(results: Results, against: str, path: Path):
     """relMSE over ``against``, "seconds" or "spp", a panel per scene, medians over seeds with the range of
-    all; the dotted line falls with slope -1."""
+    all; hollow where the reference is too noisy for the error; the dotted line falls with slope -1."""
     rows = math.ceil(len(results.scenes) / COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(11, 2.5 * rows), squeeze=False)
     for scene, axis in zip(results.scenes, axes.flat, strict=False):
@@ -79,10 +89,20 @@ def _curve(axis, rows, against, method):
         errors = [row["rel_mse"] for row in at]
         if min(errors) > 0:
             points.append([np.median([row[against] for row in at]), *np.quantile(errors, (0, 0.5, 1))])
+            if not _judged(at):
+                axis.plot(*points[-1][:3:2], **style(method) | {"markerfacecolor": "white", "zorder": 3})
     if points:
         x, low, middle, high = np.array(points).T
         axis.plot(x, middle, label=method, **style(method))
         axis.fill_between(x, low, high, color=style(method)["color"], alpha=0.15, linewidth=0)
+
+
+def _judged(rows) -> bool:
+    try:
+        check_judged(rows, "rel_mse")
+    except Refused:
+        return False
+    return True
 
 
 def _ideal(axis, rows, against):
@@ -113,7 +133,7 @@ def efficiencies(results: Results, rivals, path: Path):
                     ratio = results.fair_efficiency(scene, rival, error)
                 except Refused as why:
                     if offset == 0:
-                        text = "misses energy" if "missing" in str(why) else "not judged"
+                        text = "fails the bias check" if isinstance(why, Biased) else "not judged"
                         axis.text(1, place, text, fontsize=7, va="center", ha="center", color="0.4")
                     continue
                 axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
@@ -127,7 +147,7 @@ def efficiencies(results: Results, rivals, path: Path):
                     label={"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}[error],
                 )
         axis.axvline(1, color="black", linewidth=0.8)
-        axis.set(xscale="log", title=f"efficiency over {rival}, {DECIDING} spp")
+        axis.set(xscale="log", title=f"efficiency over {rival}, {results.deciding} spp")
         axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}x"))
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.title.set_fontsize(10)
@@ -161,14 +181,14 @@ def rays(results: Results, path: Path):
         left += widths
     axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)
     axis.invert_yaxis()
-    axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {DECIDING} spp")
+    axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {results.deciding} spp")
     axis.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.45, 1))
     figure.tight_layout()
     _save(figure, path)
 
 
 def _rays_per_sample(results, scene, kind) -> float:
-    rows = results.of(scene, results.methods[0], DECIDING)
+    rows = results.of(scene, results.methods[0], results.deciding)
     pixels = [row["width"] * row["height"] for row in rows]
     counts = [row[f"rays_{kind}"] / row["spp"] / n for row, n in zip(rows, pixels, strict=True)]
     return float(np.median(counts)) if counts else 0.0

@@ -162,6 +162,25 @@ def rel_mse(image, reference, trim=0.0) -> float:
     than 500 values 0.001 of them rounds to none. Trimmed figures depend on the budget (more samples have more
     rare values): state the samples with them.
     """
+    error, kept = _relative_errors(image, reference, trim)
+    return float(error[kept].mean())
+
+
+def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
+    """What the reference's own error adds to ``rel_mse(image, reference, trim)``.
+
+    ``difference``: an image of the reference's error, as half the difference of two halves of it. Its relMSE
+    over the values that the measurement keeps: those that are trimmed are the image's worst, not the
+    reference's.
+    """
+    _, kept = _relative_errors(image, reference, trim)
+    difference = _image("difference", difference)
+    own, _ = _relative_errors(_image("reference", reference) + difference, reference, 0.0)
+    return float(own[kept].mean())
+
+
+def _relative_errors(image, reference, trim):
+    """Squared relative errors (n,), and the indices of those that are not trimmed."""
     image, reference = _pair(image, reference)
     if trim != 0:
         trim = _number("trim", trim, 0, 1)
@@ -169,7 +188,7 @@ def rel_mse(image, reference, trim=0.0) -> float:
     keep = len(error) - round(trim * len(error))
     if keep == 0:
         raise ValueError(f"trim={trim} leaves none of {len(error)} values; choose a smaller share.")
-    return float(np.partition(error, keep - 1)[:keep].mean())
+    return error, np.argpartition(error, keep - 1)[:keep]
 
 
 def mape(image, reference) -> float:

@@ -14,6 +14,7 @@
     sampler = "multijitter"
     match = "seconds"      # as many samples as fit into the seconds of the first; or "spp", the same samples
     scenes = ["open_sky"]  # only there; default: in all
+    seeds = 5              # at most so many; default: all
 
     [scene.cornell_box]    # where a scene differs: max_depth (default: the scene's own), spp, seeds
     max_depth = 6
@@ -39,6 +40,7 @@ from pathlib import Path
 
 import probes
 import reference
+from metrics import TILES
 
 MATCHES = ("seconds", "spp")
 
@@ -46,13 +48,15 @@ MATCHES = ("seconds", "spp")
 @dataclass(frozen=True)
 class Method:
     """An integrator of a preset: ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it
-    has in common with the first one, ``scenes`` where it takes part (None: everywhere)."""
+    has in common with the first one, ``scenes`` where it takes part (None: everywhere), ``seeds`` of a budget
+    that it takes at most (None: all)."""
 
     name: str
     parameters: tuple
     sampler: str
     match: str
     scenes: tuple | None
+    seeds: int | None
 
 
 @dataclass(frozen=True)
@@ -96,12 +100,24 @@ def read_preset(path: Path) -> Preset:
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
     for key in {"resolution", "max_depth"} & set(data):
         _whole(path, key, data[key])
+    if data["resolution"] % TILES:
+        raise ValueError(f"{path}: resolution={data['resolution']} must be divisible by {TILES}")
+    for key in ("scenes", "integrator"):
+        if not isinstance(data[key], list) or not data[key]:
+            raise ValueError(f"{path}: {key}={data[key]!r} must be a list with at least one entry")
+    if len(set(data["scenes"])) < len(data["scenes"]):
+        raise ValueError(f"{path}: scenes={data['scenes']!r} names one twice")
     for name in data.get("scene", {}):
         if name not in data["scenes"]:
             raise ValueError(f"{path}: [scene.{name}] is not among the scenes {data['scenes']}")
     methods = tuple(_method(path, dict(entry), data["scenes"]) for entry in data["integrator"])
     if len({m.name for m in methods}) < len(methods):
         raise ValueError(f"{path}: two integrators have the same name")
+    if methods[0].scenes is not None or methods[0].seeds is not None or methods[0].match == "seconds":
+        raise ValueError(
+            f"{path}: the first integrator, {methods[0].name!r}, sets the time of the others; it takes "
+            "neither scenes nor seeds nor match = 'seconds'"
+        )
     counts = data.get("probes", {})
     for name, count in counts.items():
         if name not in probes.PROBES:
@@ -141,6 +157,8 @@ def _subject(path, data, name) -> Subject:
     _check_keys(path, own, set(), {"max_depth", "spp", "seeds"}, f"[scene.{name}]")
     merged = data | own
     spp, seeds = _row(path, "spp", merged["spp"]), merged["seeds"]
+    if len(set(spp)) < len(spp):
+        raise ValueError(f"{path}: spp={list(spp)} of {name} names a budget twice")
     if isinstance(seeds, list):
         seeds = _row(path, "seeds", seeds)
         if len(seeds) != len(spp):
@@ -158,7 +176,7 @@ def _method(path, entry, scenes) -> Method:
     if "type" not in entry:
         raise ValueError(f"{path}: an integrator without type: {entry!r}")
     name, sampler = entry.pop("name", entry["type"]), entry.pop("sampler", "independent")
-    match, only = entry.pop("match", "spp"), entry.pop("scenes", None)
+    match, only, seeds = entry.pop("match", "spp"), entry.pop("scenes", None), entry.pop("seeds", None)
     if "max_depth" in entry:
         raise ValueError(
             f"{path}: max_depth of integrator {name!r} would compare different images; set it for all"
@@ -167,7 +185,9 @@ def _method(path, entry, scenes) -> Method:
         raise ValueError(f"{path}: match={match!r} of integrator {name!r} must be one of {MATCHES}")
     if unknown := [scene for scene in only or () if scene not in scenes]:
         raise ValueError(f"{path}: scene {unknown[0]!r} of integrator {name!r} is not in the preset")
-    return Method(name, tuple(sorted(entry.items())), sampler, match, tuple(only) if only else None)
+    if seeds is not None:
+        _whole(path, f"seeds of integrator {name!r}", seeds)
+    return Method(name, tuple(sorted(entry.items())), sampler, match, tuple(only) if only else None, seeds)
 
 
 def _more(path, entry, scenes, methods) -> More:
@@ -183,6 +203,9 @@ def _more(path, entry, scenes, methods) -> More:
     seeds = _row(path, "seeds of [more]", entry["seeds"])
     if len(seeds) != 2 or not 2 <= seeds[0] <= seeds[1]:
         raise ValueError(f"{path}: seeds={entry['seeds']!r} of [more] must be [at least, at most]")
+    limited = [m.name for m in methods if m.name in entry["integrators"] and (m.scenes or m.seeds)]
+    if limited:
+        raise ValueError(f"{path}: {limited[0]!r} of [more] is limited by scenes or seeds of its own")
     if not 0 < entry["width"] < 1:
         raise ValueError(f"{path}: width={entry['width']!r} of [more] must be between 0 and 1")
     spp = _whole(path, "spp of [more]", entry["spp"])

@@ -34,9 +34,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 
 def _printed(code, environment=None) -> float:
     """The number that a new process prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"a probe ended with status {done.returncode}: {done.stderr[-500:]}")
     return float(done.stdout.split()[-1])
 
 

@@ -3,14 +3,14 @@
     python scripts/reference.py --all                       # every scene, good enough to judge 64 spp
     python scripts/reference.py glass_caustics --spp 256 --seconds 3000
 
-A reference is good enough if its own relMSE, raw and trimmed, is at most 1 % of that of `bdpt` with ``--spp``
-samples per pixel (with a margin, for integrators that are better). It is the mean of two halves with seeds of
-their own, rendered in turn until that is reached or the time is over; the halves differ by twice the standard
-error of their mean. A scene is rendered by `path` where that converges, so that `bdpt` is judged by another
-integrator, else by `bdpt` with everything switched on; furnaces are known exactly. Files lie in references/:
-EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R ...), and the
-provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept in renders/,
-so that a further run improves a reference instead of starting anew.
+A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
+``--spp`` samples per pixel (with a margin, for integrators that are better). It is the mean of two halves with
+seeds of their own, rendered in turn until that is reached or the time is over; the halves differ by twice the
+standard error of their mean. A scene is rendered by `path` where that converges, so that `bdpt` is judged by
+another integrator, else by `bdpt` with everything switched on; furnaces are known exactly. Files lie in
+references/: EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R
+...), and the provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept
+in renders/, so that a further run improves a reference instead of starting anew.
 """
 
 from __future__ import annotations
@@ -27,10 +27,20 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
+import mitsuba_bdpt  # chooses LLVM before Dr.Jit is imported
 import numpy as np
 import OpenEXR
-from metrics import FEWEST_RUNS, REFERENCE_SHARE, TRIM, Means, Sample, rel_mse, tile_columns
+from metrics import (
+    FEWEST_RUNS,
+    REFERENCE_SHARE,
+    TILES,
+    TRIM,
+    Means,
+    Sample,
+    reference_rel_mse,
+    rel_mse,
+    tile_columns,
+)
 
 import mitsuba as mi  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
@@ -74,14 +84,22 @@ HALF_MAX = 65504.0  # largest number in half precision
 
 @dataclass(frozen=True)
 class Reference:
-    """``image`` (height, width, 3); its own relMSE, ``error`` and ``error_trimmed``; ``means`` for bias
+    """``image`` and ``difference`` (height, width, 3), half the difference of the halves; ``means`` for bias
     checks, None if too few renders made it; ``provenance`` what made it."""
 
     image: np.ndarray
-    error: float
-    error_trimmed: float
+    difference: np.ndarray
     means: Means | None
     provenance: dict
+
+    @property
+    def error(self) -> float:
+        """Its own relMSE."""
+        return rel_mse(self.image + self.difference, self.image)
+
+    def share_of(self, image, trim: float) -> float:
+        """What its own error adds to ``rel_mse(image, self.image, trim)``."""
+        return reference_rel_mse(self.difference, image, self.image, trim)
 
 
 def scene_file(name: str) -> Path:
@@ -129,14 +147,11 @@ def load_reference(name: str, resolution: int, max_depth: int) -> Reference:
             for layer in ("", "difference.")
         )
         provenance = json.loads(file.header()["provenance"])
-    if provenance["scene_sha256"] != digest(scene_file(name)):
-        raise ValueError(f"the reference {path.name} was made of another {name}.xml; {remedy}")
-    return Reference(image, *own_errors(image, difference), _means(provenance["means"]), provenance)
-
-
-def own_errors(image, difference):
-    """A reference's own relMSE, raw and trimmed, from half the difference of its halves."""
-    return tuple(rel_mse(image + difference, image, trim) for trim in (0.0, TRIM))
+    if provenance["scene_sha256"] != scene_digest(name):
+        raise ValueError(
+            f"the reference {path.name} was made of another {name}.xml, mesh or texture; {remedy}"
+        )
+    return Reference(image, difference, _means(provenance["means"]), provenance)
 
 
 def _means(kept) -> Means | None:
@@ -168,21 +183,37 @@ def _kept(means: Means | None):
     return plain
 
 
-def digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def digest(*paths: Path) -> str:
+    """SHA-256 of files, one after the other."""
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+
+
+def scene_digest(name: str) -> str:
+    """SHA-256 of a scene's file and of the meshes and textures that it names."""
+    file = scene_file(name)
+    named = re.findall(r'name="filename" value="([^"$]+)"', file.read_text())
+    return digest(file, *(file.parent / path for path in named))
+
+
+def source_digest() -> str:
+    """SHA-256 of the plugin's source files, shortened."""
+    return digest(*sorted(Path(mitsuba_bdpt.__file__).parent.glob("*.py")))[:12]
 
 
 class Halves:
-    """Sums of two independent halves and the tile means of each render, kept in a file between runs."""
+    """Sums of two independent halves, the tile means of each render, and the digests of the plugin's source
+    that made them, kept in a file between runs."""
 
     def __init__(self, path: Path, key: str):
         self.path, self.key, self.rounds, self.sums, self.columns = path, key, 0, [0.0, 0.0], []
+        self.sources = set()
         if path.is_file():
             kept = np.load(path)
             if str(kept["key"]) == key:
                 self.rounds, self.sums = int(kept["rounds"]), list(kept["sums"])
                 self.columns = list(kept["columns"])
+                self.sources = set(kept["sources"].tolist()) if "sources" in kept else {"unknown"}
+        self.sources.add(source_digest())
 
     def add(self, images):
         """Add an image to each half, and keep the sums."""
@@ -191,8 +222,8 @@ class Halves:
         self.rounds += 1
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=self.path.parent, suffix=".npz", delete=False) as file:
-            kept = {"rounds": self.rounds, "sums": np.array(self.sums), "columns": np.array(self.columns)}
-            np.savez(file, key=self.key, **kept)
+            kept = {"sums": np.array(self.sums), "columns": np.array(self.columns)}
+            np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
         os.replace(file.name, self.path)
 
     def mean(self):
@@ -204,7 +235,7 @@ class Halves:
         """What there is after at least one round."""
         image, difference = self.mean()
         means = Means.of(self.columns) if len(self.columns) >= FEWEST_RUNS else None
-        return Reference(image, *own_errors(image, difference), means, provenance)
+        return Reference(image, difference, means, provenance)
 
 
 def _pixels(image):
@@ -223,11 +254,12 @@ class Aim:
         """Whether the reference carries little enough of their errors, and can serve in a bias check."""
         if reference.means is None:
             return False
-        for own, trim in ((reference.error, 0.0), (reference.error_trimmed, TRIM)):
-            measured = np.median([rel_mse(image, reference.image, trim) for image in self.images])
-            if own > self.margin * REFERENCE_SHARE * measured:
-                return False
-        return True
+        return all(
+            reference.share_of(image, trim)
+            <= self.margin * REFERENCE_SHARE * rel_mse(image, reference.image, trim)
+            for image in self.images
+            for trim in (0.0, TRIM)
+        )
 
 
 @dataclass(frozen=True)
@@ -244,15 +276,15 @@ class Job:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it; also whether it is."""
     depth = job.max_depth or default_depth(job.scene)
-    reference, difference, reached = (_known if job.scene in KNOWN else _rendered)(job, depth)
-    write(reference_path(job.scene, job.resolution, depth), reference, difference)
+    reference, reached = (_known if job.scene in KNOWN else _rendered)(job, depth)
+    write(reference_path(job.scene, job.resolution, depth), reference)
     return reference, reached
 
 
 def _provenance(job: Job, depth: int, **more) -> dict:
     return {
         "scene": job.scene,
-        "scene_sha256": digest(scene_file(job.scene)),
+        "scene_sha256": scene_digest(job.scene),
         "resolution": job.resolution,
         "max_depth": depth,
         "date": datetime.date.today().isoformat(),
@@ -263,11 +295,11 @@ def _provenance(job: Job, depth: int, **more) -> dict:
 
 
 def _known(job: Job, depth: int):
-    """The same radiance everywhere, without error: reference, half the difference of its halves, True."""
+    """The same radiance everywhere, without error, and True."""
     width, height = load_scene(job.scene, resolution=job.resolution).sensors()[0].film().size()
     image = np.full((int(height), int(width), 3), KNOWN[job.scene](depth))
     provenance = _provenance(job, depth, integrator="known answer")
-    return Reference(image, 0.0, 0.0, Means.known(image), provenance), 0 * image, True
+    return Reference(image, 0 * image, Means.known(image), provenance), True
 
 
 def _rendered(job: Job, depth: int):
@@ -276,7 +308,7 @@ def _rendered(job: Job, depth: int):
     by_path = job.scene not in NOT_BY_PATH
     parameters = dict(BY_PATH if by_path else BY_BDPT, max_depth=depth)
     integrator = mi.load_dict(parameters)
-    key = json.dumps([digest(scene_file(job.scene)), job.resolution, parameters, PASS_SPP, SAMPLER])
+    key = json.dumps([scene_digest(job.scene), job.resolution, parameters, PASS_SPP, SAMPLER])
     halves = Halves(SUMS / f"reference_{job.scene}_{job.resolution}_{depth}.npz", key)
     aim = Aim(scene, depth, job.spp, MARGIN_BY_PATH if by_path else MARGIN_BY_BDPT)
     started, seed = time.perf_counter(), FIRST_SEED + 2 * halves.rounds
@@ -294,24 +326,29 @@ def _rendered(job: Job, depth: int):
         sampler=SAMPLER,
         spp=2 * halves.rounds * PASS_SPP,
         first_seed=FIRST_SEED,
+        sources=sorted(halves.sources),
         judges_spp=job.spp,
     )
-    return halves.reference(provenance), halves.mean()[1], reached
+    return halves.reference(provenance), reached
 
 
-def write(path: Path, reference: Reference, difference):
+def raise_interrupt(error: BaseException | None):
+    """Raise the ``KeyboardInterrupt`` that an error comes from, if any: `mitsuba.render` wraps them."""
+    while error is not None:
+        if isinstance(error, KeyboardInterrupt):
+            raise error
+        error = error.__cause__ or error.__context__
+
+
+def write(path: Path, reference: Reference):
     """Write a reference; whoever looks at ``path`` never sees half a file."""
     brightest = float(reference.image.max())
     if brightest > HALF_MAX:
         raise ValueError(
             f"{path.name}: radiance {brightest:g} does not fit into half precision; scale the lamps"
         )
-    layers = {"": reference.image, "difference.": difference}
-    header = reference.provenance | {
-        "rel_mse": reference.error,
-        "rel_mse_trimmed": reference.error_trimmed,
-        "means": _kept(reference.means),
-    }
+    layers = {"": reference.image, "difference.": reference.difference}
+    header = reference.provenance | {"rel_mse": reference.error, "means": _kept(reference.means)}
     write_exr(path, layers, {"provenance": json.dumps(header)})
 
 
@@ -333,8 +370,8 @@ def write_exr(path: Path, layers: dict, header: dict, dtype=np.float16):
         temporary.unlink(missing_ok=True)
 
 
-def main():
-    """Run the command line."""
+def main() -> int:
+    """Run the command line; the exit status is 1 if a reference failed or is not good enough."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -345,20 +382,35 @@ def main():
     parser.add_argument("--resolution", type=int, default=128, help="width; default %(default)s")
     parser.add_argument("--max-depth", type=int, help="default: the scene's own")
     args = parser.parse_args()
+    for key in ("spp", "resolution"):
+        if getattr(args, key) < 1:
+            parser.error(f"--{key} {getattr(args, key)} must be at least 1")
+    if args.resolution % TILES:
+        parser.error(f"--resolution {args.resolution} must be divisible by {TILES}")
+    if args.max_depth == 0 or (args.max_depth or 1) < -1:
+        parser.error(f"--max-depth {args.max_depth} must be at least 1, or -1 for no limit")
     names = sorted(p.stem for p in (ROOT / "scenes").glob("*.xml")) if args.all else args.scenes
     if not names:
         parser.error("name a scene, or give --all")
     mi.set_variant("llvm_ad_rgb")
+    status = 0
     for name in names:
         job = Job(name, args.resolution, args.max_depth, args.spp, args.seconds)
-        made, reached = make(job)
+        try:
+            made, reached = make(job)
+        except (ValueError, RuntimeError, NotImplementedError) as error:  # go on with the other scenes
+            raise_interrupt(error)
+            print(f"{name}: failed: {error}", flush=True)
+            status = 1
+            continue
+        status |= not reached
         print(
-            f"{name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e} "
-            f"(trimmed {made.error_trimmed:.1e})"
+            f"{name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e}"
             + ("" if reached else f", not good enough for {job.spp} spp: go on with the same command"),
             flush=True,
         )
+    return int(status)
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import datetime
 import hashlib
 import json
 import os
@@ -26,7 +27,7 @@ from pathlib import Path
 
 import analysis
 import metrics
-import mitsuba_bdpt
+import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import OpenEXR
 import probes
@@ -38,13 +39,14 @@ import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
 
-CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
+CALIBRATIONS = 2  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One render, and all that determines it."""
+    """One render, and all that determines it; ``against``: for equal seconds, parameters and sampler of the
+    first integrator and the samples at which the two were timed."""
 
     scene: str
     scene_sha256: str
@@ -54,9 +56,11 @@ class Cell:
     parameters: tuple
     sampler: str
     match: str
+    against: tuple
     budget: int
     seed: int
     versions: tuple
+    machine: str
 
     @property
     def key(self) -> str:
@@ -64,10 +68,15 @@ class Cell:
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
 
 
-def source_digest() -> str:
-    """SHA-256 of the plugin's source files, shortened."""
-    files = sorted(Path(mitsuba_bdpt.__file__).parent.glob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+def machine() -> str:
+    """Processor and number of cores."""
+    names = [line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
+
+
+def _cpuinfo() -> list[str]:
+    file = Path("/proc/cpuinfo")
+    return file.read_text().splitlines() if file.exists() else []
 
 
 class Cells:
@@ -78,11 +87,14 @@ class Cells:
         self.methods = [m for m in preset.methods if m.scenes is None or subject.name in m.scenes]
         self.common = {
             "scene": subject.name,
-            "scene_sha256": reference.digest(reference.scene_file(subject.name)),
+            "scene_sha256": reference.scene_digest(subject.name),
             "resolution": preset.resolution,
             "max_depth": subject.max_depth,
-            "versions": (*render.versions().items(), ("source", source_digest())),
+            "versions": (*render.versions().items(), ("source", reference.source_digest())),
+            "machine": machine(),
         }
+        first = self.methods[0]
+        self.against = first.parameters, first.sampler, max(subject.spp)
 
     def of(self, budget: int, seed: int, names=None) -> list[Cell]:
         """A cell per integrator, of those in ``names``."""
@@ -91,11 +103,12 @@ class Cells:
                 **self.common,
                 **{k: getattr(m, k) for k in ("parameters", "sampler", "match")},
                 method=m.name,
+                against=self.against if m.match == "seconds" else (),
                 budget=budget,
                 seed=seed,
             )
             for m in self.methods
-            if names is None or m.name in names
+            if (names is None or m.name in names) and seed < FIRST_SEED + (m.seeds or np.inf)
         ]
 
     def planned(self) -> list[Cell]:
@@ -104,11 +117,15 @@ class Cells:
             cell
             for spp, seeds in zip(self.subject.spp, self.subject.seeds, strict=True)
             for seed in range(FIRST_SEED, FIRST_SEED + seeds)
-            for cell in self.of(spp, seed)
+            for cell in self._turn(self.of(spp, seed))
         ]
         known = {cell.key for cell in found}
         first = [cell for seed in range(self.fewest()) for cell in self.further(seed)]
         return found + [cell for cell in first if cell.key not in known]
+
+    def where(self) -> tuple:
+        """What names the reference."""
+        return self.subject.name, self.common["resolution"], self.subject.max_depth
 
     def fewest(self) -> int:
         """Seeds that [more] takes at least, 0 if the scene is not among its own."""
@@ -116,7 +133,12 @@ class Cells:
 
     def further(self, index: int) -> list[Cell]:
         """The cells of [more] with its ``index``-th seed."""
-        return self.of(self.more.spp, FIRST_SEED + index, self.more.methods)
+        return self._turn(self.of(self.more.spp, FIRST_SEED + index, self.more.methods))
+
+    @staticmethod
+    def _turn(found: list[Cell]) -> list[Cell]:
+        """There for odd seeds and back for even ones: a drift of the machine's speed favours nobody."""
+        return found[::-1] if found and found[0].seed % 2 == 0 else found
 
 
 class Bench:
@@ -124,9 +146,9 @@ class Bench:
 
     def __init__(self, cells: Cells, output: Path):
         self.cells, self.output, self.name = cells, output, cells.subject.name
-        self.resolution, self.depth = cells.common["resolution"], cells.subject.max_depth
+        self.resolution, self.depth = cells.where()[1:]
         self._scenes, self._integrators, self._compile, self._spp = {}, {}, {}, {}
-        self.reference = load_reference(self.name, self.resolution, self.depth)
+        self.reference = judge_of(*cells.where())
 
     def scene(self, sampler: str):
         """The scene with that sampler."""
@@ -152,21 +174,22 @@ class Bench:
         dr.sync_thread()
         return np.array(image, dtype=np.float64)[..., :3], time.perf_counter() - start
 
-    def compile_seconds(self, cell: Cell) -> float:
+    def compile_seconds(self, cell: Cell, spp: int) -> float:
         """Seconds for the kernels of an integrator (less where they come from the cache on disk); afterwards
-        it is warm."""
-        if cell.method not in self._compile:
+        it is warm. Mitsuba's integrators have kernels of their own for each number of samples."""
+        key = cell.method, spp
+        if key not in self._compile:
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
                 dr.kernel_history_clear()
-                self.timed(cell, 2, 0)
+                self.timed(cell, spp, 0)
                 kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
             statistics = getattr(self.integrator(cell), "statistics", None)
-            self._compile[cell.method] = (
+            self._compile[key] = (
                 statistics["seconds"]["compile"]
                 if statistics
                 else sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
             )
-        return self._compile[cell.method]
+        return self._compile[key]
 
     def spp_of(self, cell: Cell) -> int:
         """Samples of a cell: its budget, or what fits into the first method's seconds for it.
@@ -180,7 +203,7 @@ class Bench:
             one = [c for c in self.cells.of(largest, 0) if c.method == cell.method][0]
             kept = self.output / "ratios" / f"{one.key}.json"
             if not kept.exists():
-                self.compile_seconds(first), self.compile_seconds(cell)
+                self.compile_seconds(first, largest), self.compile_seconds(cell, largest)
                 pairs = [
                     [self.timed(c, largest, seed)[1] for c in (first, cell)] for seed in range(CALIBRATIONS)
                 ]
@@ -195,24 +218,27 @@ class Bench:
         return int(fork.sample_count())
 
 
-def load_reference(scene: str, resolution: int, depth: int):
-    """A reference, and the SHA-256 of its file."""
-    found = reference.load_reference(scene, resolution, depth)
-    return found, reference.digest(reference.reference_path(scene, resolution, depth))
+def judge_of(scene: str, resolution: int, depth: int):
+    """A reference, and the SHA-256 of its file, taken before: should another one replace it meanwhile, the
+    next run takes the errors anew."""
+    path = reference.reference_path(scene, resolution, depth)
+    sha256 = reference.digest(path) if path.exists() else ""
+    return reference.load_reference(scene, resolution, depth), sha256
 
 
 def measure(bench: Bench, cell: Cell) -> dict:
     """Render a cell; its row."""
     spp = bench.spp_of(cell)
-    compile_seconds = bench.compile_seconds(cell)
+    compile_seconds = bench.compile_seconds(cell, spp)
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     image, seconds = bench.timed(cell, spp, cell.seed)
     statistics = getattr(bench.integrator(cell), "statistics", {})
     row = {
         "key": cell.key,
-        **{k: v for k, v in asdict(cell).items() if k not in ("parameters", "versions")},
+        **{k: v for k, v in asdict(cell).items() if k not in ("parameters", "versions", "against")},
         "parameters": json.dumps(dict(cell.parameters)),
         "versions": json.dumps(dict(cell.versions)),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "started": started,
         "spp": spp,
         "seconds": seconds,
         "seconds_compile": compile_seconds,
@@ -229,6 +255,7 @@ def errors(image, ref: reference.Reference, ref_sha256: str) -> dict:
     """All measures of an image; ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not
     good enough for them."""
     raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
+    own = [ref.share_of(image, trim) for trim in (0.0, metrics.TRIM)]
     flip, _ = metrics.hdr_flip(image, ref.image)
     return {
         "reference_sha256": ref_sha256,
@@ -245,10 +272,10 @@ def errors(image, ref: reference.Reference, ref_sha256: str) -> dict:
         "delta_e_2000": metrics.delta_e_2000(image, ref.image),
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
         "energy_in_black": metrics.energy_in_black(image, ref.image),
-        "reference_rel_mse": ref.error,
-        "reference_rel_mse_trimmed": ref.error_trimmed,
-        "judged": _judged(ref.error, raw),
-        "judged_trimmed": _judged(ref.error_trimmed, trimmed),
+        "reference_rel_mse": own[0],
+        "reference_rel_mse_trimmed": own[1],
+        "judged": _judged(own[0], raw),
+        "judged_trimmed": _judged(own[1], trimmed),
     }
 
 
@@ -276,6 +303,9 @@ class Sweep:
         scenes = [Cells(self.preset, subject) for subject in self.preset.subjects]
         todo = [[c for c in cells.planned() if not cell_file(self.output, c).exists()] for cells in scenes]
         task = self.progress.add_task("", total=sum(map(len, todo)) + len(self.preset.probes))
+        for cells, missing in zip(scenes, todo, strict=True):
+            if missing:  # complain before hours of rendering, not after
+                reference.load_reference(*cells.where())
         self._probes(task)
         for cells, missing in zip(scenes, todo, strict=True):
             bench = None
@@ -288,7 +318,10 @@ class Sweep:
         kept = json.loads(file.read_text()) if file.exists() else {}
         for name, rounds in self.preset.probes.items():
             self.progress.update(task, description=name)
-            key = {"rounds": rounds, "versions": render.versions() | {"source": source_digest()}}
+            key = {
+                "rounds": rounds,
+                "versions": render.versions() | {"source": reference.source_digest(), "machine": machine()},
+            }
             try:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
                     kept[name] = key | {"values": probes.PROBES[name](rounds)}
@@ -305,6 +338,7 @@ class Sweep:
             bench = bench or Bench(cells, self.output)
             write_json(cell_file(self.output, cell), measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
+            reference.raise_interrupt(error)
             self.failed.append(f"{description}: {error}")
         self.progress.advance(task)
         return bench
@@ -317,7 +351,11 @@ class Sweep:
             found = [c for seed in range(seeds) for c in cells.further(seed)]
             if not all(cell_file(self.output, c).exists() for c in found):
                 return  # one of them failed
-            widths = analysis.widths(read_rows(self.output, found), cells.more.methods)
+            try:
+                widths = analysis.widths(read_rows(self.output, found), cells.more.methods)
+            except ValueError as error:
+                self.failed.append(f"further seeds in {cells.subject.name}: {error}")
+                return
             if max(widths.values()) < cells.more.width or seeds == cells.more.at_most:
                 return
             missing = [c for c in cells.further(seeds) if not cell_file(self.output, c).exists()]
@@ -345,10 +383,11 @@ def read_rows(output: Path, cells) -> list[dict]:
             continue
         row = json.loads(file.read_text())
         where = cell.scene, cell.resolution, cell.max_depth
-        if row["reference_sha256"] != reference.digest(reference.reference_path(*where)):
+        path = reference.reference_path(*where)
+        if not path.exists() or row["reference_sha256"] != reference.digest(path):
             with OpenEXR.File(str(image_file(output, cell)), separate_channels=True) as image:
                 pixels = np.stack([image.channels()[c].pixels for c in "RGB"], axis=-1)
-            row |= errors(pixels.astype(np.float64), *load_reference(*where))
+            row |= errors(pixels.astype(np.float64), *judge_of(*where))
             write_json(file, row)
         found.append(row)
     return found
@@ -363,7 +402,7 @@ def rows(preset: Preset, output: Path) -> list[dict]:
         if cells.fewest():
             wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
         found += read_rows(output, wanted.values())
-    return found
+    return [row | {"first": preset.methods[0].name} for row in found]
 
 
 def write_tables(table: list[dict], output: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import analysis
@@ -10,9 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+import reference
 import report
-from analysis import Refused, Results
+from analysis import Biased, Refused, Results
 from metrics import Means
+from preset import read_preset
 from reference import Reference
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -38,6 +41,8 @@ def row(method="bdpt", seed=1, **values):
         "max_depth": 3,
         "machine": "a machine",
         "versions": '{"mitsuba": "3.9.1"}',
+        "first": "bdpt",
+        "reference_sha256": "",
         "tile_means": list(TRUE),
     }
     rays = {f"rays_{kind}": 640 for kind in ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")}
@@ -56,6 +61,8 @@ def noisy(method, count, factor=1.0, **values):
 
 
 KNOWN = Means.known(np.full((4, 4, 3), 2.0))
+BY_PATH = Reference(None, None, KNOWN, {"integrator": {"type": "path"}})
+MADE = {"box": BY_PATH, "dark": BY_PATH}
 
 
 # -- figures ----------------------------------------------------------------------------------
@@ -135,7 +142,8 @@ def results():
     rows += noisy("bdpt skip=none", 16, seconds=3.0) + noisy("ptracer", 16, 0.5)
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
-    probes = {"coldstart": {"values": {"path": [1.0, 3.0], "bdpt": [4.0, 4.0]}}}
+    values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}
+    probes = {"coldstart": {"versions": {"mitsuba": "3.9.1", "machine": "a machine"}, "values": values}}
     return Results(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes)
 
 
@@ -144,6 +152,8 @@ def test_the_stronger_path_decides(results):
     assert results.fair_efficiency("box", "path").median == pytest.approx(2)
     with pytest.raises(Refused, match="9.8 % of the energy is missing"):
         results.fair_efficiency("dark", "path")
+    with pytest.raises(Biased, match="path: 9.8 % .*; path multijitter: .* missing"):
+        results.against_path("dark")
     with pytest.raises(Refused, match="not rendered"):
         results.fair_efficiency("pool", "path")
 
@@ -164,7 +174,7 @@ def test_tables_say_what_the_rows_say(results):
     ]
     dark = cells(text, "`dark`")
     assert dark[0].startswith("9.8 % of the energy is missing") and dark[1] == "–"
-    checks = cells(report.checks_table(results), "`box`")
+    checks = cells(report.checks_table(results, MADE, {}), "`box`")
     assert checks[:3] == [
         "1x (1–1)",
         "3x (3–3)",
@@ -177,6 +187,9 @@ def test_goals_stand_beside_what_is_measured(results):
     goals = [
         {"what": "box", "at_least": "1.4x", "measure": "efficiency", "scene": "box"},
         {"what": "worst", "at_least": "0.97x", "measure": "worst"},
+        {"what": "near", "at_least": "0.96x", "measure": "near one", "scene": "box"},
+        {"what": "cost", "at_least": "3x", "measure": "cost", "scene": "box"},
+        {"what": "alone", "at_least": "1x", "measure": "alone", "scene": "box"},
         {"what": "none", "at_least": "2x", "measure": "against none"},
         {"what": "cold", "at_least": "4x", "measure": "coldstart"},
         {"what": "memory", "at_least": "1 GiB", "measure": "memory"},
@@ -185,12 +198,61 @@ def test_goals_stand_beside_what_is_measured(results):
     ]
     text = report.goals_table(results, goals)
     assert cells(text, "box") == ["1.4x", "0.8x (0.8–0.8)"]
-    assert cells(text, "worst") == ["0.97x", "0.8x, `box`, of 1 scenes that can be judged"]
-    assert cells(text, "none") == ["2x", "3x, 2 scenes"]
-    assert cells(text, "cold") == ["4x", "4.00 s, 2x `path`'s"]
+    near = "0.800x, interval 0.800–0.800, 16 pairs"
+    assert cells(text, "worst") == ["0.97x", f"`box` of 1 scenes: {near}"]
+    assert cells(text, "near") == [
+        "0.96x",
+        f"{near.replace('0.8', '2.0')} over path; {near} over path multijitter",
+    ]
+    assert cells(text, "cost") == ["3x", "3x (3–3) / 1x (1–1)"]
+    assert cells(text, "alone") == [
+        "1x",
+        "fewer than two renders at 64 spp, fewer than two renders at 256 spp",
+    ]
+    assert cells(text, "none") == ["2x", "3x, 2 of 2 scenes"]
+    assert cells(text, "cold") == ["4x", "4.00 s, 2x (2–2) `path`'s"]
     assert cells(text, "memory") == ["1 GiB", "not measured"]
     assert cells(text, "floor") == ["1x", "not measured yet"]
-    assert cells(text, "dark") == ["1x", "0.8x (0.8–0.8); path and path multijitter fail the bias check"]
+    dark = cells(text, "dark")[1]
+    assert dark.startswith("path: 9.8 % of the energy is missing")
+    assert dark.endswith("(against their error all the same: 2x (2–2), 0.8x (0.8–0.8))")
+
+
+def test_slopes_need_an_explanation():
+    """Errors that fall as samples^-2: marked, unless there is a note on the scene."""
+    rows = runs("bdpt", 2, budget=4, spp=4) + runs("bdpt", 2, rel_mse=0.02 / 256)
+    results = Results(rows, {"box": KNOWN}, {})
+    for notes, expected in (({}, ", **unexplained**"), ({"box": "points"}, "")):
+        assert (
+            cells(report.checks_table(results, MADE, notes), "`box`")[2]
+            == "-2.00 (-2.00 to -2.00)" + expected
+        )
+
+
+def test_what_a_biased_integrator_lacks_is_said():
+    """Too dark, too bright, and right as a whole but wrong in a tile."""
+    for factor, text in ((0.95, "4.9 % of the energy is missing"), (1.1, "10 % too much energy")):
+        with pytest.raises(Biased, match=text):
+            Results(noisy("path", 12, factor), {"box": KNOWN}, {}).fair_efficiency("box", "path")
+    rows = noisy("path", 12)
+    for r in rows:
+        r["tile_means"][:6] = [
+            m + d for m, d in zip(r["tile_means"][:6], [0.5] * 3 + [-0.5] * 3, strict=True)
+        ]
+    with pytest.raises(Biased, match="wrong in the tile in row 0, column [01] of 4 x 4, by -?0.[45]"):
+        Results(rows, {"box": KNOWN}, {}).fair_efficiency("box", "path")
+
+
+def test_names_are_those_of_the_preset():
+    """Expected: every integrator that the report looks for is one of presets/benchmark.toml."""
+    names = {m.name for m in read_preset(ROOT / "presets" / "benchmark.toml").methods}
+    assert names >= {
+        *analysis.RIVALS,
+        analysis.NONE,
+        analysis.INDEPENDENT,
+        analysis.ALONE,
+        analysis.LIGHT_TRACER,
+    }
 
 
 def test_the_goals_of_the_project_can_be_measured(results):
@@ -210,22 +272,33 @@ def test_parts_of_the_readme_are_replaced():
 
 def test_a_report_is_written(results, tmp_path, monkeypatch):
     """Expected: from the data of a folder the page, the plots, and the project's README's parts."""
-    pyarrow.parquet.write_table(pa.Table.from_pylist(results.rows), tmp_path / "rows.parquet")
+    only = [r for r in results.rows if r["scene"] == "box"]
+    monkeypatch.setattr(reference, "REFERENCES", tmp_path)
+    monkeypatch.setattr(reference, "scene_digest", lambda name: "the scene")
+    provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096, "scene_sha256": "the scene"}
+    kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), KNOWN, provenance)
+    file = reference.reference_path("box", 8, 3)
+    reference.write(file, kept)
+    table = [r | {"reference_sha256": reference.digest(file)} for r in only]
+    pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
     (tmp_path / "probes.json").write_text(json.dumps(results.probes))
     (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = "1x"\n')
-    (tmp_path / "notes.toml").write_text('dark = "why"\n')
+    (tmp_path / "notes.toml").write_text('box = "why"\n')
     readme = tmp_path / "TOP.md"
-    provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096}
-    exact = Reference(np.full((4, 4, 3), 2.0), 1e-5, 5e-6, KNOWN, provenance)
     readme.write_text("".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("goals", "efficiency")))
-    monkeypatch.setattr(report, "load", lambda folder: (results, {"box": exact}))
     monkeypatch.setattr("sys.argv", ["report.py", str(tmp_path), "--readme", str(readme)])
     report.main()
     page = (tmp_path / "README.md").read_text()
-    assert "* `dark`: why" in page and cells(page, "floor") == ["1x", "not measured yet"]
-    assert "| `box` | 3 | `path` | 4096 | 1.0e-05 | 5.0e-06 | 0.04 |" in page
+    assert "* `box`: why" in page and cells(page, "floor") == ["1x", "not measured yet"]
+    assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
     for name in ("efficiency", "seconds", "samples", "rays"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
         assert f"({name}.png)" in page
     assert not list(tmp_path.glob(".*"))
+    reference.write(file, replace(kept, image=kept.image * 2))
+    with pytest.raises(ValueError, match="in box were taken against another reference; run scripts/sweep.py"):
+        report.main()
+    (tmp_path / "notes.toml").write_text('nowhere = "why"\n')
+    with pytest.raises(ValueError, match="'nowhere' is not among the scenes"):
+        report.page(results, {}, [], {"nowhere": "why"})

@@ -270,6 +270,16 @@ def test_bad_trims_are_refused(trim):
         metrics.rel_mse(row(1, 2), row(1, 2), trim)
 
 
+def test_what_the_reference_adds():
+    """Relative errors of the image 1, 0, 9, 0 (over r^2 + eps = 1.01), of the reference 0.01, 0.04, 0.09 and
+    0.16: all of them, mean 0.075 / 1.01; without the image's worst quarter 0.07 / 1.01.
+    """
+    reference, image = row(1, 1, 1, 1), row(2, 1, 4, 1)
+    difference = row(0.1, -0.2, 0.3, 0.4)
+    assert metrics.reference_rel_mse(difference, image, reference) == pytest.approx(0.075 / 1.01)
+    assert metrics.reference_rel_mse(difference, image, reference, 0.25) == pytest.approx(0.07 / 1.01)
+
+
 @pytest.mark.parametrize("value", ["1", None, True])
 def test_what_is_no_number_is_refused(value):
     with pytest.raises(TypeError, match="exposure=.* must be a number"):
