@@ -3,14 +3,15 @@
     python scripts/reference.py --all                       # every scene, good enough to judge 64 spp
     python scripts/reference.py glass_caustics --spp 256 --seconds 3000
 
-A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
-``--spp`` samples per pixel (with a margin, for integrators that are better). It is the mean of two halves with
-seeds of their own, rendered in turn until that is reached or the time is over; the halves differ by twice the
-standard error of their mean. A scene is rendered by `path` where that converges, so that `bdpt` is judged by
-another integrator, else by `bdpt` with everything switched on; furnaces are known exactly. Files lie in
-references/: EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R
-...), and the provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept
-in renders/, so that a further run improves a reference instead of starting anew.
+A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt`
+with ``--spp`` samples per pixel (with a margin, for integrators that are better). It is the mean of two
+halves with seeds of their own, rendered in turn until that is reached or the time is over; the halves
+differ by twice the standard error of their mean. A scene is rendered by `path` where that converges, so
+that `bdpt` is judged by another integrator, else by `bdpt` with everything switched on; furnaces are
+known exactly. Files lie in references/: EXR in half precision with the image (R, G, B), half the
+difference of the halves (difference.R ...), and the provenance as JSON in the header, with what a bias
+check needs. Sums in double precision are kept in renders/, so that a further run improves a reference
+instead of starting anew.
 """
 
 from __future__ import annotations

@@ -364,12 +364,13 @@ def page(results: Results, made: dict, goals: list, notes: dict) -> str:
 Made by `python scripts/report.py` from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
-median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed* without
-the worst 0.1 % of values, {results.deciding} samples per pixel unless said. An integrator that fails the bias
-check has its missing energy reported instead. A figure is refused where the reference's own error is above
-1 % of the error measured. Samples for equal time follow from the seconds at the largest budget; seconds
-are those measured, so other budgets are compared as if errors fell with 1 / time. Where seeds were added until
-an interval was narrow enough, it is slightly too narrow (it holds the median in 90 % of cases, not 95 %).
+median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
+without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. An integrator that
+fails the bias check has its missing energy reported instead. A figure is refused where the reference's
+own error is above 1 % of the error measured. Samples for equal time follow from the seconds at the
+largest budget; seconds are those measured, so other budgets are compared as if errors fell with 1 / time.
+Where seeds were added until an interval was narrow enough, it is slightly too narrow (it holds the median
+in 90 % of cases, not 95 %).
 """
     ]
     if goals:
@@ -387,10 +388,10 @@ By budget, over the stronger `path` that passes the bias check:
     parts.append(
         f"""## Cost, convergence, bias
 
-Slope: exponent of raw relMSE over samples, −1 for independent samples, with its 95 % interval. Bias check:
-Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy, and what
-the reference was made by: where that is `bdpt`, with nothing skipped and other counts, what both have in common
-is tested elsewhere (tests/).
+Slope: exponent of raw relMSE over samples, −1 for independent samples, with its 95 % interval. Bias
+check: Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy,
+and what the reference was made by: where that is `bdpt`, with nothing skipped and other counts, what both
+have in common is tested elsewhere (tests/).
 
 {checks_table(results, made, notes)}
 {notes_text(notes)}
