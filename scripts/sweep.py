@@ -5,10 +5,11 @@
 
 Presets (see scripts/preset.py) say what is rendered. For each scene, budget and seed all integrators follow
 one another, so that a noisy machine is noisy for all. Every finished render is a file of its own in
-OUTPUT/cells, named after a hash of all that determines it (parameters, scene, versions, the plugin's source),
-and is not rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the
-next time. Errors are taken against the references of scripts/reference.py, and anew when a reference has
-become better. OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what
+OUTPUT/cells, named after a hash of all that determines it (parameters, scene, versions, the plugin's
+source), and is not rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried
+again the next time. Errors are taken against the references of scripts/reference.py, and anew when a
+reference has become better; HDR-FLIP for the first seed alone, since it takes longer than most renders.
+OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what
 scripts/probes.py measures.
 """
 
@@ -248,15 +249,14 @@ def measure(bench: Bench, cell: Cell) -> dict:
     row |= {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}
     path = image_file(bench.output, cell)
     reference.write_exr(path, {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
-    return row | errors(image, *bench.reference)
+    return row | errors(image, *bench.reference, cell.seed == FIRST_SEED)
 
 
-def errors(image, ref: reference.Reference, ref_sha256: str) -> dict:
+def errors(image, ref: reference.Reference, ref_sha256: str, flip: bool) -> dict:
     """All measures of an image; ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not
-    good enough for them."""
+    good enough for them. HDR-FLIP takes longer than most renders: only where ``flip``, else None."""
     raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
     own = [ref.share_of(image, trim) for trim in (0.0, metrics.TRIM)]
-    flip, _ = metrics.hdr_flip(image, ref.image)
     return {
         "reference_sha256": ref_sha256,
         "width": image.shape[1],
@@ -268,7 +268,7 @@ def errors(image, ref: reference.Reference, ref_sha256: str) -> dict:
         "rel_mse_trimmed": trimmed,
         "rel_mse_epsilon": metrics.rel_mse_epsilon(ref.image),
         "mape": metrics.mape(image, ref.image),
-        "flip": flip,
+        "flip": metrics.hdr_flip(image, ref.image)[0] if flip else None,
         "delta_e_2000": metrics.delta_e_2000(image, ref.image),
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
         "energy_in_black": metrics.energy_in_black(image, ref.image),
@@ -387,7 +387,7 @@ def read_rows(output: Path, cells) -> list[dict]:
         if not path.exists() or row["reference_sha256"] != reference.digest(path):
             with OpenEXR.File(str(image_file(output, cell)), separate_channels=True) as image:
                 pixels = np.stack([image.channels()[c].pixels for c in "RGB"], axis=-1)
-            row |= errors(pixels.astype(np.float64), *judge_of(*where))
+            row |= errors(pixels.astype(np.float64), *judge_of(*where), cell.seed == FIRST_SEED)
             write_json(file, row)
         found.append(row)
     return found

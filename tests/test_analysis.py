@@ -155,7 +155,9 @@ def test_the_stronger_path_decides(results):
     with pytest.raises(Biased, match="path: 9.8 % .*; path multijitter: .* missing"):
         results.against_path("dark")
     with pytest.raises(Refused, match="not rendered"):
-        results.fair_efficiency("pool", "path")
+        results.bias("pool", "path")
+    few = Results(runs("bdpt", 3) + runs("path", 3, rel_mse=0.1), {"box": KNOWN}, {})
+    assert few.fair_efficiency("box", "path", "rel_mse").median == pytest.approx(5)
 
 
 # -- report -----------------------------------------------------------------------------------

@@ -345,10 +345,11 @@ def test_a_reference_that_is_too_noisy_judges_nothing():
     image = np.random.default_rng(1).random((8, 8, 3)) + 0.5
     for own, judged in ((1e-9, True), (1.0, False)):
         ref = reference.Reference(np.ones((8, 8, 3)), np.full((8, 8, 3), own**0.5), None, {})
-        row = sweep.errors(image, ref, "")
+        row = sweep.errors(image, ref, "", False)
         assert row["judged"] is row["judged_trimmed"] is judged
-    exact = sweep.errors(ref.image, ref, "")
+    exact = sweep.errors(ref.image, ref, "", True)
     assert exact["rel_mse"] == 0 and not exact["judged"]
+    assert row["flip"] is None and exact["flip"] == 0
 
 
 def test_rows_follow_a_better_reference(folder, monkeypatch):
