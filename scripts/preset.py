@@ -12,7 +12,8 @@
     name = "path multijitter"
     type = "path"
     sampler = "multijitter"
-    match = "seconds"      # as many samples as fit into the seconds of the first; or "spp", the same samples
+    match = "seconds"      # as many samples as fit into the seconds of the first (the nearest power of two,
+                           # if the sampler is stratified); or "spp", the same samples
     scenes = ["open_sky"]  # only there; default: in all
     seeds = 5              # at most so many; default: all
 

@@ -3,15 +3,15 @@
     python scripts/reference.py --all                       # every scene, good enough to judge 64 spp
     python scripts/reference.py glass_caustics --spp 256 --seconds 3000
 
-A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt`
-with ``--spp`` samples per pixel (with a margin, for integrators that are better). It is the mean of two
+A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
+``--spp`` samples per pixel, and of `path` in the same time where that converges. It is the mean of two
 halves with seeds of their own, rendered in turn until that is reached or the time is over; the halves
 differ by twice the standard error of their mean. A scene is rendered by `path` where that converges, so
-that `bdpt` is judged by another integrator, else by `bdpt` with everything switched on; furnaces are
-known exactly. Files lie in references/: EXR in half precision with the image (R, G, B), half the
-difference of the halves (difference.R ...), and the provenance as JSON in the header, with what a bias
-check needs. Sums in double precision are kept in renders/, so that a further run improves a reference
-instead of starting anew.
+that `bdpt` is judged by another integrator, else by `bdpt` with everything switched on; furnaces are known
+exactly. Files lie in references/: EXR in half precision with the image (R, G, B), half the difference of
+the halves (difference.R ...), and the provenance as JSON in the header, with what a bias check needs. Sums
+in double precision are kept in renders/, so that a further run improves a reference instead of starting
+anew.
 """
 
 from __future__ import annotations
@@ -76,10 +76,8 @@ KNOWN = {
 FIRST_SEED = 1_000_000  # far from the seeds of measurements
 PASS_SPP = 256
 TRIALS = 3  # renders of bdpt that say what it has to judge
-MARGIN_BY_PATH = (
-    0.6  # of the share that a reference may carry: where `path` is used, it may be the better one
-)
-MARGIN_BY_BDPT = 0.9
+TWICE = 2  # samples of `path` in the time of one of `bdpt`, roughly
+MARGIN = 0.9  # of the share that a reference may carry
 HALF_MAX = 65504.0  # largest number in half precision
 
 
@@ -244,12 +242,16 @@ def _pixels(image):
 
 
 class Aim:
-    """What a reference has to judge: renders of default `bdpt` with ``spp`` samples per pixel."""
+    """What a reference has to judge: renders of default `bdpt` with ``spp`` samples per pixel, and of `path`
+    in the same time where that converges."""
 
-    def __init__(self, scene, depth: int, spp: int, margin: float):
-        self.margin = margin
-        ours = mi.load_dict({"type": "bdpt", "max_depth": depth})
-        self.images = [_pixels(mi.render(scene, integrator=ours, spp=spp, seed=s)) for s in range(TRIALS)]
+    def __init__(self, scene, depth: int, spp: int, by_path: bool):
+        rivals = [({"type": "bdpt"}, spp)] + [(BY_PATH, TWICE * spp)] * by_path
+        self.images = []
+        for parameters, samples in rivals:
+            rival = mi.load_dict(parameters | {"max_depth": depth})
+            for seed in range(TRIALS):
+                self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
 
     def reached(self, reference: Reference) -> bool:
         """Whether the reference carries little enough of their errors, and can serve in a bias check."""
@@ -257,7 +259,7 @@ class Aim:
             return False
         return all(
             reference.share_of(image, trim)
-            <= self.margin * REFERENCE_SHARE * rel_mse(image, reference.image, trim)
+            <= MARGIN * REFERENCE_SHARE * rel_mse(image, reference.image, trim)
             for image in self.images
             for trim in (0.0, TRIM)
         )
@@ -311,7 +313,7 @@ def _rendered(job: Job, depth: int):
     integrator = mi.load_dict(parameters)
     key = json.dumps([scene_digest(job.scene), job.resolution, parameters, PASS_SPP, SAMPLER])
     halves = Halves(SUMS / f"reference_{job.scene}_{job.resolution}_{depth}.npz", key)
-    aim = Aim(scene, depth, job.spp, MARGIN_BY_PATH if by_path else MARGIN_BY_BDPT)
+    aim = Aim(scene, depth, job.spp, by_path)
     started, seed = time.perf_counter(), FIRST_SEED + 2 * halves.rounds
     reached = halves.rounds > 0 and aim.reached(halves.reference({}))
     while halves.rounds == 0 or not (reached or time.perf_counter() - started > job.seconds):

@@ -20,6 +20,7 @@ import csv
 import datetime
 import hashlib
 import json
+import math
 import os
 import platform
 import time
@@ -40,7 +41,7 @@ import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
 
-CALIBRATIONS = 2  # alternating renders from which the samples for equal time follow
+CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up
 
 
@@ -210,10 +211,14 @@ class Bench:
                 ]
                 write_json(kept, float(np.median([ours / theirs for ours, theirs in pairs])))
             self._spp[cell.method] = json.loads(kept.read_text())
-        return self._possible(cell.sampler, max(round(cell.budget * self._spp[cell.method]), 1))
+        wanted = cell.budget * self._spp[cell.method]
+        if cell.sampler == "independent":
+            return max(round(wanted), 1)
+        # Mitsuba's stratified samplers take a tenth longer per sample for numbers far from a power of two.
+        return self._possible(cell.sampler, 2 ** max(round(math.log2(wanted)), 0))
 
     def _possible(self, sampler: str, spp: int) -> int:
-        """The samples that a sampler makes of so many: stratified ones round up."""
+        """The samples that a sampler makes of so many: stratified ones may round up."""
         fork = self.scene(sampler).sensors()[0].sampler().fork()
         fork.set_sample_count(spp)
         return int(fork.sample_count())

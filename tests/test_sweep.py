@@ -70,7 +70,7 @@ def job(max_depth, **more):
 
 def test_a_reference_comes_back_with_its_error_and_provenance(folder):
     """Expected: the stored image is the rendered one within half precision (2^-11 relative), its own error
-    is at most 0.6 % of that of `bdpt` with 4 samples per pixel (of three renders), the means for bias checks
+    is at most 0.9 % of that of `bdpt` with 4 samples per pixel (of three renders), the means for bias checks
     are those of at least 8 renders, and the provenance says what made it.
     """
     made, reached = reference.make(job(2))
@@ -81,7 +81,7 @@ def test_a_reference_comes_back_with_its_error_and_provenance(folder):
     scene = reference.load_scene("cornell_box", resolution=8)
     ours = mi.load_dict({"type": "bdpt", "max_depth": 2})
     image = np.array(mi.render(scene, integrator=ours, spp=4, seed=0))[..., :3]
-    assert 0 < made.error <= 0.006 * metrics.rel_mse(image, made.image)
+    assert 0 < made.error <= 0.009 * metrics.rel_mse(image, made.image)
     assert kept.means.columns.freedom >= 7
     np.testing.assert_allclose(kept.means.columns.mean, metrics.tile_columns(kept.image), rtol=2e-3)
     np.testing.assert_allclose(kept.means.whole.error, made.means.whole.error, rtol=1e-6)
@@ -197,8 +197,8 @@ class Clock(sweep.Bench):
 def test_equal_time_by_a_clock(folder, monkeypatch):
     """Rationale: seconds are what everything is divided by. Expected: `path` is four times as fast and gets
     four times the samples at every budget, by a ratio that is measured at the largest one; no measured
-    render is the first with its number of samples, which compiles; stratified samplers round up (4 * 2 to
-    8 = 2 x 4, 4 * 3 to 12).
+    render is the first with its number of samples, which compiles; stratified samplers get the nearest power
+    of two (of 8, 12 and 28: 8, 16 and 32).
     """
     reference.make(job(3))
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
@@ -212,7 +212,7 @@ def test_equal_time_by_a_clock(folder, monkeypatch):
     spp = {(r["method"], r["budget"]): r["spp"] for r in table}
     assert [spp["ours", b] for b in (2, 3, 7)] == [2, 3, 7]
     assert [spp["path", b] for b in (2, 3, 7)] == [8, 12, 28]
-    assert all(4 * b <= spp["strata", b] <= 4 * b + 4 for b in (2, 3, 7))
+    assert [spp["strata", b] for b in (2, 3, 7)] == [8, 16, 32]
     assert all(r["seconds"] < 0.1 for r in table)
     assert len(list((output / "ratios").glob("*.json"))) == 2
 
