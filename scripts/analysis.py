@@ -43,6 +43,14 @@ class Refused(ValueError):
     """A figure that the data cannot give; the text says why."""
 
 
+class NotJudged(Refused):
+    """A figure for which the reference is too noisy; ``share`` of the error measured that it carries."""
+
+    def __init__(self, text: str, share: float):
+        super().__init__(text)
+        self.share = share
+
+
 class Biased(Refused):
     """An efficiency over an integrator that fails the bias check; the text says what it lacks."""
 
@@ -76,7 +84,7 @@ def check_judged(rows, error: str) -> None:
     if measured == 0 and own > 0:
         raise Refused("every value is exactly that of the reference, which has an error of its own")
     if measured > 0 and not reference_good_enough(own, measured):
-        raise Refused(reference_refusal(own, measured))
+        raise NotJudged(reference_refusal(own, measured), own / measured)
 
 
 def pair_ratios(ours, theirs, error="rel_mse_trimmed") -> list[float]:
@@ -222,6 +230,8 @@ def missing(check: BiasCheck) -> str:
     """What an integrator lacks that fails the bias check, in words."""
     share = check.missing
     low, high = sorted((abs(100 * share.low), abs(100 * share.high)))
+    if low > 99.95:
+        return "all energy is missing"
     if share.low <= 0 <= share.high:
         where = (
             "the whole image"

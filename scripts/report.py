@@ -29,6 +29,7 @@ from analysis import (
     NONE,
     RIVALS,
     Biased,
+    NotJudged,
     Refused,
     Results,
     Spread,
@@ -85,6 +86,8 @@ def said(figure, form=ranged) -> str:
     """A figure in words, or why there is none."""
     try:
         return form(figure())
+    except NotJudged as why:
+        return f"not judged: reference {100 * why.share:.2g} %"
     except Refused as why:
         return str(why)
 
@@ -183,15 +186,7 @@ def _maker(kept) -> str:
 
 def references_table(made: dict) -> str:
     """What each scene is compared with."""
-    head = [
-        "scene",
-        "max_depth",
-        "by",
-        "samples per pixel",
-        "own relMSE, raw",
-        "trimmed",
-        "epsilon of relMSE",
-    ]
+    head = ["scene", "max_depth", "by", "samples per pixel", "own relMSE", "epsilon of relMSE"]
     lines = []
     for scene, kept in made.items():
         lines.append(
@@ -367,10 +362,10 @@ Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
 without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. An integrator that
 fails the bias check has its missing energy reported instead. A figure is refused where the reference's
-own error is above 1 % of the error measured. Samples for equal time follow from the seconds at the
-largest budget; seconds are those measured, so other budgets are compared as if errors fell with 1 / time.
-Where seeds were added until an interval was narrow enough, it is slightly too narrow (it holds the median
-in 90 % of cases, not 95 %).
+own error is above 1 % of the error measured (its share is said). Samples for equal time follow from the
+seconds at the largest budget; seconds are those measured, so other budgets are compared as if errors fell
+with 1 / time. Where seeds were added until an interval was narrow enough, it is slightly too narrow (it
+holds the median in 90 % of cases, not 95 %).
 """
     ]
     if goals:

@@ -387,3 +387,48 @@ def test_scale_does_not_change_the_image(name):
         means.append([tile_means(image, 4)[:, 1] for image in images])
     for label, other in zip(("1e-3", "1e3"), means[1:], strict=True):
         assert_agree(compare_images(means[0], other, f"{name} x {label}"), at_least=8)
+
+
+@pytest.mark.parametrize("radius", [1.0, 0.05, 0.01])
+def test_small_lamps_far_away_are_not_behind_themselves(radius):
+    """Rationale: Mitsuba finds the outline of a small sphere far away with an error of many roundings, so a
+    visibility ray that ends close to a point near the outline meets the lamp before. Expected: what `path`
+    sees on a floor 6.5 below the lamp; for the large lamp also the closed form pi L (R / d)^2 cos. (Mitsuba's
+    own density on narrow cones is off: 0.08 % too bright at 0.05, 1.6 % at 0.01, in `path` and here.)
+    Tolerance: 0.05 %; the mean of 2^22 samples has a standard error below 0.01 %, and the loss was 0.4 % for
+    a radius of 0.05.
+    """
+    T = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 2,
+                "to_world": T().look_at([4, 3, 0], [4, 0, 0], [1, 0, 0]),
+                "film": film | {"component_format": "float32"},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().translate([4, 0, 0]).rotate([1, 0, 0], -90),
+                "bsdf": {"type": "diffuse", "reflectance": 0.5},
+            },
+            "lamp": {
+                "type": "sphere",
+                "center": [0, 6.5, 2.7],
+                "radius": radius,
+                "emitter": {"type": "area", "radiance": 1 / radius**2},
+            },
+        }
+    )
+    means = {}
+    for parameters in ({"type": "bdpt", "light_paths": 0}, {"type": "path"}):
+        integrator = mi.load_dict(parameters | {"max_depth": 2})
+        images = [np.array(mi.render(scene, integrator=integrator, spp=1 << 12, seed=s)) for s in range(4)]
+        means[parameters["type"]] = np.mean(images)
+    assert abs(means["bdpt"] / means["path"] - 1) < 5e-4
+    if radius == 1:
+        d2 = 4**2 + 6.5**2 + 2.7**2
+        expected = 0.5 * 6.5 / d2**1.5  # at the middle of a view of 0.1 x 0.1
+        assert abs(means["bdpt"] / expected - 1) < 5e-4

@@ -23,6 +23,9 @@ OFFSET_ULPS = 32
 # 8 * 2^-24 * t^2 / radius (with 4, one visibility ray in a thousand is blocked by its own target).
 QUADRIC_ULPS = 8
 
+# Points of a sphere closer to its outline than this cosine are one in ten thousand, seen from afar.
+LEAST_COSINE = 0.1
+
 
 @dataclass
 class Anchor:
@@ -121,8 +124,12 @@ def spawn(anchor: Anchor, d, like) -> mi.Ray3f:
 def end_point(a: Anchor, b: Anchor):
     """Where a visibility ray from ``a`` to ``b`` ends: just before ``b``'s surface."""
     end = b.towards(a.p - b.p)
-    early = dr.minimum((QUADRIC_ULPS * 2.0**-24) * dr.norm(end - a.p) * b.curvature, 0.01)
-    return end + (a.p - end) * early
+    back = a.p - end
+    dist = dr.norm(back)
+    # The error of t grows towards the outline, as 1 / cos.
+    cos = dr.maximum(dr.abs(dr.dot(b.n, back)) / dist, LEAST_COSINE)
+    early = dr.minimum((QUADRIC_ULPS * 2.0**-24) * dist * b.curvature / cos, 0.01)
+    return end + back * early
 
 
 def segment_to(a: Anchor, end, like) -> mi.Ray3f:
