@@ -134,7 +134,8 @@ def efficiencies(results: Results, rivals, path: Path):
                 except Refused as why:
                     if offset == 0:
                         text = "fails the bias check" if isinstance(why, Biased) else "not judged"
-                        axis.text(1, place, text, fontsize=7, va="center", ha="center", color="0.4")
+                        plate = {"facecolor": "white", "edgecolor": "none", "pad": 1}
+                        axis.text(1, place, text, fontsize=7, va="center", ha="center", bbox=plate)
                     continue
                 axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
                 axis.plot(
