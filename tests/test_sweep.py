@@ -198,7 +198,7 @@ def test_equal_time_by_a_clock(folder, monkeypatch):
     """Rationale: seconds are what everything is divided by. Expected: `path` is four times as fast and gets
     four times the samples at every budget, by a ratio that is measured at the largest one; no measured
     render is the first with its number of samples, which compiles; stratified samplers get the nearest power
-    of two (of 8, 12 and 28: 8, 16 and 32).
+    of two (of 8, 12 and 28: 8, 16 and 32, of which multijitter makes 5 x 7).
     """
     reference.make(job(3))
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
@@ -212,7 +212,7 @@ def test_equal_time_by_a_clock(folder, monkeypatch):
     spp = {(r["method"], r["budget"]): r["spp"] for r in table}
     assert [spp["ours", b] for b in (2, 3, 7)] == [2, 3, 7]
     assert [spp["path", b] for b in (2, 3, 7)] == [8, 12, 28]
-    assert [spp["strata", b] for b in (2, 3, 7)] == [8, 16, 32]
+    assert [spp["strata", b] for b in (2, 3, 7)] == [8, 16, 35]
     assert all(r["seconds"] < 0.1 for r in table)
     assert len(list((output / "ratios").glob("*.json"))) == 2
 
@@ -223,6 +223,10 @@ def test_ctrl_c_ends_a_sweep(folder, monkeypatch):
     """
 
     class Interrupted(mi.SamplingIntegrator):
+        def __init__(self, props):
+            super().__init__(props)
+            self.max_depth = props["max_depth"]
+
         def render(self, *args, **kwargs):
             raise KeyboardInterrupt
 
