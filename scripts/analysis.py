@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from metrics import (
@@ -26,7 +27,6 @@ from metrics import (
 
 # Errors of a row, and the reference's own.
 OWN = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_trimmed"}
-
 
 # Names of integrators that the report looks for, as presets/benchmark.toml has them.
 RIVALS = ("path", "path multijitter")
@@ -78,19 +78,33 @@ def select(rows, **wanted) -> list[dict]:
     return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
 
 
+def judged(own: float, measured: float) -> bool:
+    """Whether the reference is good enough for an error; an image without any needs one without."""
+    return reference_good_enough(own, measured) if measured > 0 else own == 0
+
+
 def check_judged(rows, error: str) -> None:
     """Raise `Refused` if the reference is too noisy for the median of the errors."""
     measured, own = (float(np.median([row[key] for row in rows])) for key in (error, OWN[error]))
-    if measured == 0 and own > 0:
+    if judged(own, measured):
+        return
+    if measured == 0:
         raise Refused("every value is exactly that of the reference, which has an error of its own")
-    if measured > 0 and not reference_good_enough(own, measured):
-        raise NotJudged(reference_refusal(own, measured), own / measured)
+    raise NotJudged(reference_refusal(own, measured), own / measured)
+
+
+def paired(ours, theirs) -> list[tuple[dict, dict]]:
+    """The renders of each seed that both have; raises `Refused` for fewer than two."""
+    by_seed = {row["seed"]: row for row in theirs}
+    pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
+    if len(pairs) < 2:
+        raise Refused("fewer than two pairs of seeds")
+    return pairs
 
 
 def pair_ratios(ours, theirs, error="rel_mse_trimmed") -> list[float]:
-    """Ratio of efficiencies, ours over theirs, of each seed that both have."""
-    by_seed = {row["seed"]: row for row in theirs}
-    pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
+    """Ratio of efficiencies, ours over theirs, of each pair of `paired`."""
+    pairs = paired(ours, theirs)
     return [equal_time_speedup(*(Measurement(row["seconds"], row[error]) for row in pair)) for pair in pairs]
 
 
@@ -102,10 +116,7 @@ def efficiency(ours, theirs, error="rel_mse_trimmed") -> Spread:
         if any(row[error] == 0 for row in rows):
             raise Refused(f"{rows[0]['method']} is exact here")
         check_judged(rows, error)
-    ratios = pair_ratios(ours, theirs, error)
-    if len(ratios) < 2:
-        raise Refused("fewer than two pairs of seeds")
-    return spread(ratios)
+    return spread(pair_ratios(ours, theirs, error))
 
 
 def widths(rows, methods) -> dict[str, float]:
@@ -118,16 +129,14 @@ def widths(rows, methods) -> dict[str, float]:
 
 def cost(ours, theirs) -> Spread:
     """Spread of the ratio of seconds per sample per pixel, pairs of seeds."""
-    by_seed = {row["seed"]: row["seconds"] / row["spp"] for row in theirs}
-    ratios = [row["seconds"] / row["spp"] / by_seed[row["seed"]] for row in ours if row["seed"] in by_seed]
-    if len(ratios) < 2:
-        raise Refused("fewer than two pairs of seeds")
-    return spread(ratios)
+    return spread([a["seconds"] / a["spp"] / (b["seconds"] / b["spp"]) for a, b in paired(ours, theirs)])
 
 
 def convergence(rows, error="rel_mse") -> Estimate:
     """Slope of log(error) over log(samples), all renders of one method in one scene; budgets whose error
     the reference cannot judge are left out."""
+    if not rows:
+        raise Refused("not rendered")
     runs = {}
     for budget in sorted({row["budget"] for row in rows}):
         at = select(rows, budget=budget)
@@ -137,8 +146,6 @@ def convergence(rows, error="rel_mse") -> Estimate:
             except Refused:
                 continue
             runs[float(np.median([row["spp"] for row in at]))] = [row[error] for row in at]
-    if not rows:
-        raise Refused("not rendered")
     if len(runs) < 2:
         raise Refused("fewer than two budgets with errors that the reference can judge")
     return slope(list(runs), list(runs.values()))
@@ -168,26 +175,36 @@ class Results:
     references: dict
     probes: dict
 
-    @property
+    @cached_property
     def scenes(self) -> list[str]:
         """Scenes, in the order of the rows."""
         return list(dict.fromkeys(row["scene"] for row in self.rows))
 
-    @property
+    @cached_property
     def methods(self) -> list[str]:
         """Integrators, first the one that the others are compared with."""
         return list(dict.fromkeys([self.rows[0]["first"], *(row["method"] for row in self.rows)]))
 
-    @property
+    @cached_property
+    def _of(self) -> dict:
+        """Rows by scene and integrator."""
+        found = {}
+        for row in self.rows:
+            found.setdefault((row["scene"], row["method"]), []).append(row)
+        return found
+
+    @cached_property
     def deciding(self) -> int:
         """The budget that decides: `DECIDING`, or the largest that every scene has."""
-        budgets = [{row["budget"] for row in select(self.rows, scene=scene)} for scene in self.scenes]
-        common = set.intersection(*budgets)
+        budgets = {scene: set() for scene in self.scenes}
+        for row in self.rows:
+            budgets[row["scene"]].add(row["budget"])
+        common = set.intersection(*budgets.values())
         return DECIDING if DECIDING in common or not common else max(common)
 
     def of(self, scene: str, method: str, budget: int | None = None) -> list[dict]:
         """Rows of an integrator in a scene."""
-        rows = select(self.rows, scene=scene, method=method)
+        rows = self._of.get((scene, method), [])
         return rows if budget is None else select(rows, budget=budget)
 
     def bias(self, scene: str, method: str) -> BiasCheck:

@@ -20,6 +20,7 @@ from analysis import (  # noqa: E402
     Refused,
     Results,
     check_judged,
+    select,
 )
 from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
 
@@ -35,12 +36,13 @@ STYLES = {
 }
 PLAIN = ("#000000", ".", "-")
 RAYS = {
-    "camera": ("#0072B2", ""),
-    "light": ("#E69F00", "//"),
-    "shadow_s1": ("#009E73", ".."),
-    "shadow_t1": ("#D55E00", "xx"),
-    "shadow_inner": ("#CC79A7", "\\\\"),
+    "camera": ("camera", "#0072B2", ""),
+    "light": ("light", "#E69F00", "//"),
+    "shadow_s1": ("visibility, s = 1", "#009E73", ".."),
+    "shadow_t1": ("visibility, t = 1", "#D55E00", "xx"),
+    "shadow_inner": ("visibility, s ≥ 2, t ≥ 2", "#CC79A7", "\\\\"),
 }
+ERRORS = {"rel_mse_trimmed": ("trimmed", "#0072B2", "o"), "rel_mse": ("raw", "#D55E00", "s")}
 COLUMNS = 4
 
 
@@ -85,7 +87,7 @@ def convergence(results: Results, against: str, path: Path):
 def _curve(axis, rows, against, method):
     points = []
     for budget in sorted({row["budget"] for row in rows}):
-        at = [row for row in rows if row["budget"] == budget]
+        at = select(rows, budget=budget)
         errors = [row["rel_mse"] for row in at]
         if min(errors) > 0:
             points.append([np.median([row[against] for row in at]), *np.quantile(errors, (0, 0.5, 1))])
@@ -111,7 +113,7 @@ def _ideal(axis, rows, against):
     if not budgets or min(row["rel_mse"] for row in rows) == 0:
         return
     medians = [
-        [np.median([row[key] for row in rows if row["budget"] == b]) for key in (against, "rel_mse")]
+        [np.median([row[key] for row in select(rows, budget=b)]) for key in (against, "rel_mse")]
         for b in (budgets[0], budgets[-1])
     ]
     (x0, y0), (x1, _) = medians
@@ -124,29 +126,8 @@ def efficiencies(results: Results, rivals, path: Path):
     fails the bias check has none."""
     figure, axes = plt.subplots(1, len(rivals), figsize=(11, 0.28 * len(results.scenes) + 1.2), sharey=True)
     for rival, axis in zip(rivals, np.atleast_1d(axes), strict=True):
-        for offset, (error, marker, colour) in enumerate(
-            (("rel_mse_trimmed", "o", "#0072B2"), ("rel_mse", "s", "#D55E00"))
-        ):
-            for place, scene in enumerate(results.scenes):
-                y = place + 0.3 * offset - 0.15
-                try:
-                    ratio = results.fair_efficiency(scene, rival, error)
-                except Refused as why:
-                    if offset == 0:
-                        text = "fails the bias check" if isinstance(why, Biased) else "not judged"
-                        plate = {"facecolor": "white", "edgecolor": "none", "pad": 1}
-                        axis.text(1, place, text, fontsize=7, va="center", ha="center", bbox=plate)
-                    continue
-                axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
-                axis.plot(
-                    ratio.median,
-                    y,
-                    marker=marker,
-                    color=colour,
-                    markersize=4,
-                    linestyle="none",
-                    label={"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}[error],
-                )
+        for place, scene in enumerate(results.scenes):
+            _ratios(axis, results, scene, rival, place)
         axis.axvline(1, color="black", linewidth=0.8)
         axis.set(xscale="log", title=f"efficiency over {rival}, {results.deciding} spp")
         axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}x"))
@@ -155,17 +136,33 @@ def efficiencies(results: Results, rivals, path: Path):
         axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)
         axis.set_ylim(len(results.scenes) - 0.5, -0.5)
         axis.grid(axis="x", linewidth=0.3)
-        unique = dict(reversed(list(zip(*axis.get_legend_handles_labels()[::-1], strict=True))))
+        handles, labels = axis.get_legend_handles_labels()
+        unique = dict(zip(labels, handles, strict=True))
         axis.legend(unique.values(), unique.keys(), fontsize=8, loc="lower right")
     figure.tight_layout()
     _save(figure, path)
+
+
+def _ratios(axis, results, scene, rival, place):
+    """One scene's efficiencies over one rival around the height ``place``, or the word for their absence."""
+    for (error, (label, colour, marker)), y in zip(ERRORS.items(), (place - 0.15, place + 0.15), strict=True):
+        try:
+            ratio = results.fair_efficiency(scene, rival, error)
+        except Refused as why:
+            if error == "rel_mse_trimmed":
+                text = "fails the bias check" if isinstance(why, Biased) else "not judged"
+                plate = {"facecolor": "white", "edgecolor": "none", "pad": 1}
+                axis.text(1, place, text, fontsize=7, va="center", ha="center", bbox=plate)
+            continue
+        axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
+        axis.plot(ratio.median, y, marker=marker, color=colour, markersize=4, linestyle="none", label=label)
 
 
 def rays(results: Results, path: Path):
     """Rays per sample of the first integrator by kind, a bar per scene."""
     figure, axis = plt.subplots(figsize=(9, 0.28 * len(results.scenes) + 1.4))
     left = np.zeros(len(results.scenes))
-    for kind, (colour, hatch) in RAYS.items():
+    for kind, (label, colour, hatch) in RAYS.items():
         widths = np.array([_rays_per_sample(results, scene, kind) for scene in results.scenes])
         axis.barh(
             range(len(results.scenes)),
@@ -175,9 +172,7 @@ def rays(results: Results, path: Path):
             hatch=hatch,
             edgecolor="white",
             linewidth=0.3,
-            label=kind.replace("shadow_s1", "visibility, s = 1")
-            .replace("shadow_t1", "visibility, t = 1")
-            .replace("shadow_inner", "visibility, s ≥ 2, t ≥ 2"),
+            label=label,
         )
         left += widths
     axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)

@@ -20,10 +20,8 @@ import argparse
 import datetime
 import hashlib
 import json
-import os
 import platform
 import re
-import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -139,13 +137,8 @@ def load_reference(name: str, resolution: int, max_depth: int) -> Reference:
     remedy = f"python scripts/reference.py {name} --resolution {resolution} --max-depth {max_depth}"
     if not path.is_file():
         raise ValueError(f"no reference for scene={name!r} at {resolution} and depth {max_depth}; {remedy}")
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = file.channels()
-        image, difference = (
-            np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1).astype(np.float64)
-            for layer in ("", "difference.")
-        )
-        provenance = json.loads(file.header()["provenance"])
+    (image, difference), header = read_exr(path, "", "difference.")
+    provenance = json.loads(header["provenance"])
     if provenance["scene_sha256"] != scene_digest(name):
         raise ValueError(
             f"the reference {path.name} was made of another {name}.xml, mesh or texture; {remedy}"
@@ -211,7 +204,7 @@ class Halves:
             if str(kept["key"]) == key:
                 self.rounds, self.sums = int(kept["rounds"]), list(kept["sums"])
                 self.columns = list(kept["columns"])
-                self.sources = set(kept["sources"].tolist()) if "sources" in kept else {"unknown"}
+                self.sources = set(kept["sources"].tolist())
         self.sources.add(source_digest())
 
     def add(self, images):
@@ -220,10 +213,9 @@ class Halves:
         self.columns += [tile_columns(image) for image in images]
         self.rounds += 1
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=self.path.parent, suffix=".npz", delete=False) as file:
-            kept = {"sums": np.array(self.sums), "columns": np.array(self.columns)}
+        kept = {"sums": np.array(self.sums), "columns": np.array(self.columns)}
+        with render.replacing(self.path) as temporary, temporary.open("wb") as file:
             np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
-        os.replace(file.name, self.path)
 
     def mean(self):
         """Image, and half the difference of the halves: one sample of the image's own error."""
@@ -356,7 +348,7 @@ def write(path: Path, reference: Reference):
 
 
 def write_exr(path: Path, layers: dict, header: dict, dtype=np.float16):
-    """An EXR of layers {prefix: (height, width, 3)}, written aside and renamed."""
+    """An EXR of layers {prefix: (height, width, 3)}, written by `render.replacing`."""
     channels = {
         f"{layer}{c}": np.ascontiguousarray(pixels[..., i]).astype(dtype)
         for layer, pixels in layers.items()
@@ -364,13 +356,16 @@ def write_exr(path: Path, layers: dict, header: dict, dtype=np.float16):
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.exr")
-    try:
-        with OpenEXR.File(header, channels) as file:
-            file.write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with render.replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
+
+
+def read_exr(path: Path, *layers: str):
+    """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_exr`, and its header."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels, header = file.channels(), dict(file.header())
+        images = [np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1) for layer in layers]
+    return [image.astype(np.float64) for image in images], header
 
 
 def main() -> int:

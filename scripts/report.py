@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import re
 import tomllib
 from pathlib import Path
@@ -40,6 +39,7 @@ from analysis import (
     spread,
 )
 from metrics import rel_mse_epsilon
+from mitsuba_bdpt import render
 
 
 def load(folder: Path) -> tuple[Results, dict]:
@@ -51,7 +51,8 @@ def load(folder: Path) -> tuple[Results, dict]:
         key = row["scene"], row["resolution"], row["max_depth"]
         if row["scene"] not in made:
             made[row["scene"]] = reference.load_reference(*key)
-        if row["reference_sha256"] != reference.digest(reference.reference_path(*key)):
+            sha256 = reference.digest(reference.reference_path(*key))
+        if row["reference_sha256"] != sha256:
             raise ValueError(
                 f"{folder}: the errors in {row['scene']} were taken against another reference; run "
                 "scripts/sweep.py again, which takes them anew"
@@ -334,10 +335,9 @@ def replace_part(text: str, name: str, part: str) -> str:
 
 
 def write_text(path: Path, text: str):
-    """Written aside, then renamed."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+    """Written by `render.replacing`."""
+    with render.replacing(path) as temporary:
+        temporary.write_text(text)
 
 
 def machine(results: Results) -> str:

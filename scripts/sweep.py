@@ -31,7 +31,6 @@ import analysis
 import metrics
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
-import OpenEXR
 import probes
 import reference
 from preset import Preset, Subject, read_preset
@@ -70,6 +69,11 @@ class Cell:
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
 
 
+def software() -> dict:
+    """Versions of what renders, the plugin's source among them."""
+    return render.versions() | {"source": reference.source_digest()}
+
+
 def machine() -> str:
     """Processor and number of cores."""
     names = [line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name")]
@@ -92,7 +96,7 @@ class Cells:
             "scene_sha256": reference.scene_digest(subject.name),
             "resolution": preset.resolution,
             "max_depth": subject.max_depth,
-            "versions": (*render.versions().items(), ("source", reference.source_digest())),
+            "versions": tuple(software().items()),
             "machine": machine(),
         }
         first = self.methods[0]
@@ -205,7 +209,8 @@ class Bench:
             one = [c for c in self.cells.of(largest, 0) if c.method == cell.method][0]
             kept = self.output / "ratios" / f"{one.key}.json"
             if not kept.exists():
-                self.compile_seconds(first, largest), self.compile_seconds(cell, largest)
+                for one_of_both in (first, cell):
+                    self.compile_seconds(one_of_both, largest)
                 pairs = [
                     [self.timed(c, largest, seed)[1] for c in (first, cell)] for seed in range(CALIBRATIONS)
                 ]
@@ -279,22 +284,16 @@ def errors(image, ref: reference.Reference, ref_sha256: str, flip: bool) -> dict
         "energy_in_black": metrics.energy_in_black(image, ref.image),
         "reference_rel_mse": own[0],
         "reference_rel_mse_trimmed": own[1],
-        "judged": _judged(own[0], raw),
-        "judged_trimmed": _judged(own[1], trimmed),
+        "judged": analysis.judged(own[0], raw),
+        "judged_trimmed": analysis.judged(own[1], trimmed),
     }
-
-
-def _judged(own: float, measured: float) -> bool:
-    """Whether the reference is good enough; an image without any error needs one without."""
-    return metrics.reference_good_enough(own, measured) if measured > 0 else own == 0
 
 
 def write_json(path: Path, value) -> None:
     """Write at once: a process that is killed leaves the whole file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(value, indent=1) + "\n")
-    os.replace(temporary, path)
+    with render.replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1) + "\n")
 
 
 class Sweep:
@@ -323,10 +322,7 @@ class Sweep:
         kept = json.loads(file.read_text()) if file.exists() else {}
         for name, rounds in self.preset.probes.items():
             self.progress.update(task, description=name)
-            key = {
-                "rounds": rounds,
-                "versions": render.versions() | {"source": reference.source_digest(), "machine": machine()},
-            }
+            key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
             try:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
                     kept[name] = key | {"values": probes.PROBES[name](rounds)}
@@ -390,9 +386,8 @@ def read_rows(output: Path, cells) -> list[dict]:
         where = cell.scene, cell.resolution, cell.max_depth
         path = reference.reference_path(*where)
         if not path.exists() or row["reference_sha256"] != reference.digest(path):
-            with OpenEXR.File(str(image_file(output, cell)), separate_channels=True) as image:
-                pixels = np.stack([image.channels()[c].pixels for c in "RGB"], axis=-1)
-            row |= errors(pixels.astype(np.float64), *judge_of(*where), cell.seed == FIRST_SEED)
+            (image,), _ = reference.read_exr(image_file(output, cell), "")
+            row |= errors(image, *judge_of(*where), cell.seed == FIRST_SEED)
             write_json(file, row)
         found.append(row)
     return found
@@ -417,17 +412,17 @@ def write_tables(table: list[dict], output: Path) -> None:
 
     columns = list(dict.fromkeys(key for row in table for key in row))
     table = [{key: row.get(key) for key in columns} for row in table]
-    temporary = output / f".rows.{os.getpid()}.tmp"
-    with temporary.open("w", newline="") as file:
+    with render.replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(table)
-    os.replace(temporary, output / "rows.csv")
     arrays = pa.Table.from_pylist(table)
     place = columns.index("tile_means")
     means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits were written
-    pyarrow.parquet.write_table(arrays.set_column(place, "tile_means", means), temporary, compression="zstd")
-    os.replace(temporary, output / "rows.parquet")
+    with render.replacing(output / "rows.parquet") as temporary:
+        pyarrow.parquet.write_table(
+            arrays.set_column(place, "tile_means", means), temporary, compression="zstd"
+        )
 
 
 def main() -> int:

@@ -1,8 +1,9 @@
 """The scenes: they load, their parameters act, and their lamps, walls and meshes are right."""
 
-import importlib.util
 from pathlib import Path
 
+import make_meshes
+import make_textures
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 
 import mitsuba as mi  # isort: skip
@@ -44,15 +45,6 @@ def lamps(scene):
     """The shapes that carry an area light, from the lowest to the highest."""
     shapes = [shape for shape in scene.shapes() if shape.is_emitter()]
     return sorted(shapes, key=lambda shape: float(shape.bbox().center()[1]))
-
-
-def script(name):
-    """The module scripts/`name`.py."""
-    path = ROOT / "scripts" / f"{name}.py"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -161,7 +153,7 @@ def test_furnaces_have_the_known_answer(name):
 
 def test_window_lets_the_sun_in():
     """From the bright patch on the floor a ray towards the sun leaves and meets it."""
-    module, scene = script("make_textures"), load("window_room")
+    module, scene = make_textures, load("window_room")
     row, column = np.add(module.SUN_TEXEL, 1)  # the corner that its four texels share
     theta, phi = np.pi * row / module.SKY_SIZE[0], 2.0 * np.pi * column / module.SKY_SIZE[1]
     sun = np.array((np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)))
@@ -210,7 +202,7 @@ def test_veach_bidir_lamp_lies_in_its_head():
 
 def test_meshes_are_remade_byte_for_byte(tmp_path):
     """scripts/make_meshes.py gives the committed files and no others."""
-    script("make_meshes").make_all(tmp_path)
+    make_meshes.make_all(tmp_path)
     made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     committed = {path.name: path.read_bytes() for path in (ROOT / "scenes" / "meshes").iterdir()}
     assert made == committed
@@ -221,7 +213,7 @@ def test_textures_are_remade_exactly(tmp_path):
 
     Pixels, not bytes: the compression belongs to the EXR library.
     """
-    script("make_textures").make_all(tmp_path)
+    make_textures.make_all(tmp_path)
     made, committed = (
         {path.name: np.array(mi.Bitmap(str(path))) for path in folder.iterdir()}
         for folder in (tmp_path, ROOT / "scenes" / "textures")
@@ -235,7 +227,7 @@ def test_textures_are_remade_exactly(tmp_path):
 @pytest.mark.parametrize("name", ["pool_water", "ring", "headlight_mirror"])
 def test_normals_are_on_the_side_of_the_faces(name):
     """At every corner of every face, and as long as 1."""
-    vertices, normals, faces = script("make_meshes").MESHES[name]()
+    vertices, normals, faces = make_meshes.MESHES[name]()
     corners = vertices[faces]
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("fi,fci->fc", face_normals, normals[faces]) > 0.0).all()
@@ -244,7 +236,7 @@ def test_normals_are_on_the_side_of_the_faces(name):
 
 def test_pool_water_fills_the_pool():
     """It passes through the walls on all sides, and stays between bottom and edge."""
-    vertices, normals, _ = script("make_meshes").pool_water()
+    vertices, normals, _ = make_meshes.pool_water()
     assert (vertices.min(axis=0) < (-2.0, 0.0, -1.6)).all()
     assert (vertices.max(axis=0) > (2.0, 0.0, 0.8)).all()
     assert np.abs(vertices[:, 1]).max() < 0.1
@@ -259,7 +251,7 @@ def test_pool_water_fills_the_pool():
 
 def test_headlight_mirror_makes_rays_parallel():
     """What comes from the focus leaves along +y."""
-    vertices, normals, _ = script("make_meshes").headlight_mirror()
+    vertices, normals, _ = make_meshes.headlight_mirror()
     ray = vertices - (0.0, 1.0, 0.0)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     leaves = ray - 2.0 * np.einsum("vi,vi->v", ray, normals)[:, None] * normals
@@ -269,7 +261,7 @@ def test_headlight_mirror_makes_rays_parallel():
 @pytest.mark.parametrize("name", ["veach_bidir_egg", "cut_glass"])
 def test_glass_meshes_are_closed_and_face_outward(name):
     """Every edge has two faces that pass it in opposite directions; the signed volume is > 0."""
-    vertices, _, faces = script("make_meshes").MESHES[name]()
+    vertices, _, faces = make_meshes.MESHES[name]()
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forward = {tuple(edge) for edge in edges.tolist()}
     assert len(forward) == len(edges)
@@ -283,7 +275,7 @@ def test_egg_has_the_measured_shape():
     Tolerance 1.5 %: 64 sides instead of a circle take 0.16 % away, and the smooth curve bulges
     beyond the straight frustums by up to 1 %. Radii: 4 mm, but 14 mm at the flat foot.
     """
-    module = script("make_meshes")
+    module = make_meshes
     vertices, normals, faces = module.egg()
     height, radius = np.vstack([(module.EGG_BOTTOM, 0.0), module.EGG, (module.EGG_TOP, 0.0)]).T
     square = (radius[1:] ** 2 + radius[1:] * radius[:-1] + radius[:-1] ** 2) / 3.0  # mean of r^2

@@ -23,7 +23,8 @@ OFFSET_ULPS = 32
 # 8 * 2^-24 * t^2 / radius (with 4, one visibility ray in a thousand is blocked by its own target).
 QUADRIC_ULPS = 8
 
-# Points of a sphere closer to its outline than this cosine are one in ten thousand, seen from afar.
+# Seen from afar, one point of a sphere in a hundred is closer to its outline than this cosine. A ray may
+# still meet the sphere before such a point: measured, 1e-5 of the light of a radius of 0.05 at distance 7.
 LEAST_COSINE = 0.1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import os
@@ -278,14 +279,22 @@ def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
     return bright.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
 
 
-def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
-    """Write to a temporary name first: whoever looks at `path` never sees half a file."""
+@contextlib.contextmanager
+def replacing(path: Path):
+    """Name of a file beside `path` that takes its place at the end: whoever looks at `path` never sees half a
+    file, and an error leaves what was there."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        bitmap.write(str(temporary), file_format)
+        yield temporary
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
+    """Write an image by `replacing`."""
+    with replacing(path) as temporary:
+        bitmap.write(str(temporary), file_format)
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int]) -> str:
