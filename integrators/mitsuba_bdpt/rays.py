@@ -125,6 +125,9 @@ def spawn(anchor: Anchor, d, like) -> mi.Ray3f:
 def end_point(a: Anchor, b: Anchor):
     """Where a visibility ray from ``a`` to ``b`` ends: just before ``b``'s surface."""
     end = b.towards(a.p - b.p)
+    # Known while the kernel is recorded: a scene without spheres and cylinders does none of what follows.
+    if b.curvature.state == dr.VarState.Literal and b.curvature[0] == 0:
+        return end
     back = a.p - end
     dist = dr.norm(back)
     # The error of t grows towards the outline, as 1 / cos.
