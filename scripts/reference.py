@@ -55,6 +55,7 @@ NOT_BY_PATH = {
     "lamp_behind_glass",
     "pool",
     "ring_caustic",
+    "smallvcm_cornell_lamp",
     "smallvcm_cornell_point",
     "smallvcm_cornell_sun",
     "uplight_room",
