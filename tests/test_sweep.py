@@ -114,6 +114,52 @@ def test_halves_estimate_the_error_of_their_mean(folder):
     assert reference.Halves(folder / "sums.npz", "another").rounds == 0
 
 
+def test_windows_of_halves_have_more_samples(folder):
+    """Expected: each pixel is the mean of all renders it is in, weighted by their samples; sums kept before
+    there were windows count as whole images. The tile means are those of whole images alone.
+    """
+    halves = reference.Halves(folder / "sums.npz", "key")
+    for value in (1.0, 3.0):
+        halves.add([np.full((4, 4, 3), value)] * 2)
+    kept = dict(np.load(folder / "sums.npz"))
+    del kept["counts"]
+    np.savez(folder / "sums.npz", **kept)
+    halves = reference.Halves(folder / "sums.npz", "key")
+    halves.add([np.full((2, 1, 3), 5.0), np.full((2, 1, 3), 9.0)], (slice(1, 3), slice(0, 1)), 4)
+    image, difference = halves.mean()
+    expected, half = np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3))
+    expected[1:3, 0:1], half[1:3, 0:1] = (2 * 2 + 4 * 7) / 6, (4 * 5 - 4 * 9) / 6 / 2
+    np.testing.assert_allclose(image, expected)
+    np.testing.assert_allclose(difference, half)
+    assert halves.rounds == 3 and len(halves.columns) == 4
+    assert halves.counts.min() == 2 and halves.counts.max() == 6
+
+
+def test_windows_cover_the_glass_and_show_the_same():
+    """Expected: all pixels of `glass_caustics` whose camera ray meets glass or a mirror lie in the windows,
+    which fill less than a fifth of the image; a window shows that part of the whole image: depths, which
+    range over 2, agree to 0.02 on average (random positions at the outlines).
+    """
+    job = reference.Job("glass_caustics", 64)
+    scene = reference.load_scene("glass_caustics", resolution=64)
+    windows = [reference.Window(job, share) for share in reference.FOCUS["glass_caustics"]]
+    inside = np.zeros((64, 64), bool)
+    for window in windows:
+        inside[window.slices] = True
+    assert inside.mean() < 0.2
+    y, x = np.mgrid[:64, :64]
+    at = mi.Point2f((x.ravel() + 0.5).tolist(), (y.ravel() + 0.5).tolist()) / 64
+    ray, _ = scene.sensors()[0].sample_ray(0, 0.5, at, 0.5)
+    si = scene.ray_intersect(ray)
+    delta = np.array(mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)).reshape(64, 64)
+    assert delta.sum() > 200 and not (delta & ~inside).any()
+    depth, window = mi.load_dict({"type": "depth"}), windows[0]
+    whole = np.array(depth.render(scene, spp=256))[window.slices]
+    part = np.array(depth.render(window.scene, spp=256))
+    assert part.shape == whole.shape and part.std() > 0.1
+    assert np.abs(part - whole).mean() < 0.02
+
+
 def test_references_go_on_where_they_stopped(folder):
     """Expected: without time there is one round and it is not good enough; a second run adds to it; a third
     has nothing to do.
