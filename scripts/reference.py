@@ -58,6 +58,7 @@ NOT_BY_PATH = {
     "smallvcm_cornell_lamp",
     "smallvcm_cornell_point",
     "smallvcm_cornell_sun",
+    "thin_lens",
     "uplight_room",
     "veach_bidir",
 }
