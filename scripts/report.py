@@ -46,13 +46,13 @@ def load(folder: Path) -> tuple[Results, dict]:
     """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if the errors
     were taken against other references."""
     rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
-    made = {}
+    made, digests = {}, {}
     for row in rows:
         key = row["scene"], row["resolution"], row["max_depth"]
         if row["scene"] not in made:
             made[row["scene"]] = reference.load_reference(*key)
-            sha256 = reference.digest(reference.reference_path(*key))
-        if row["reference_sha256"] != sha256:
+            digests[row["scene"]] = reference.digest(reference.reference_path(*key))
+        if row["reference_sha256"] != digests[row["scene"]]:
             raise ValueError(
                 f"{folder}: the errors in {row['scene']} were taken against another reference; run "
                 "scripts/sweep.py again, which takes them anew"

@@ -153,16 +153,16 @@ def test_furnaces_have_the_known_answer(name):
 
 def test_window_lets_the_sun_in():
     """From the bright patch on the floor a ray towards the sun leaves and meets it."""
-    module, scene = make_textures, load("window_room")
-    row, column = np.add(module.SUN_TEXEL, 1)  # the corner that its four texels share
-    theta, phi = np.pi * row / module.SKY_SIZE[0], 2.0 * np.pi * column / module.SKY_SIZE[1]
+    scene = load("window_room")
+    row, column = np.add(make_textures.SUN_TEXEL, 1)  # the corner that its four texels share
+    theta, phi = np.pi * row / make_textures.SKY_SIZE[0], 2.0 * np.pi * column / make_textures.SKY_SIZE[1]
     sun = np.array((np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)))
     pane = np.array((-2.0, 1.3, -0.3))  # a point in the window
     floor = pane - 0.999 * pane[1] / sun[1] * sun
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(*floor.tolist()), mi.Vector3f(*sun.tolist())))
     assert not si.is_valid()[0]
     seen = np.array(scene.environment().eval(si)).ravel()
-    np.testing.assert_allclose(seen, module.SUN, rtol=1e-2)
+    np.testing.assert_allclose(seen, make_textures.SUN, rtol=1e-2)
 
 
 @pytest.mark.parametrize("name, lost", [("smallvcm_cornell_point", 0.029), ("smallvcm_cornell_sun", 0.215)])
@@ -275,15 +275,15 @@ def test_egg_has_the_measured_shape():
     Tolerance 1.5 %: 64 sides instead of a circle take 0.16 % away, and the smooth curve bulges
     beyond the straight frustums by up to 1 %. Radii: 4 mm, but 14 mm at the flat foot.
     """
-    module = make_meshes
-    vertices, normals, faces = module.egg()
-    height, radius = np.vstack([(module.EGG_BOTTOM, 0.0), module.EGG, (module.EGG_TOP, 0.0)]).T
+    vertices, normals, faces = make_meshes.egg()
+    profile = [(make_meshes.EGG_BOTTOM, 0.0), make_meshes.EGG, (make_meshes.EGG_TOP, 0.0)]
+    height, radius = np.vstack(profile).T
     square = (radius[1:] ** 2 + radius[1:] * radius[:-1] + radius[:-1] ** 2) / 3.0  # mean of r^2
     frustums = np.pi * np.sum(np.diff(height) * square)
     assert signed_volume(vertices, faces) == pytest.approx(frustums, rel=0.015)
 
-    y, r, _, _ = module.egg_profile(rows=400)
-    error = np.abs(np.interp(module.EGG[:, 0], y[::-1], r[::-1]) - module.EGG[:, 1])
+    y, r, _, _ = make_meshes.egg_profile(rows=400)
+    error = np.abs(np.interp(make_meshes.EGG[:, 0], y[::-1], r[::-1]) - make_meshes.EGG[:, 1])
     assert error[1:].max() < 0.004
     assert error[0] < 0.014
     assert vertices[:, 1].min() > 1.9  # above the table's top
