@@ -24,6 +24,7 @@ import platform
 import re
 import time
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import mitsuba_bdpt  # chooses LLVM before Dr.Jit is imported
@@ -67,7 +68,8 @@ BY_BDPT = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all
 
 # Windows (left, top, right, bottom; shares of the image) with `FOCUS_TIMES` the samples: the glass and the
 # mirror ball, where s = 0 alone finds the light that other glass has focused. Chosen by what a scene shows,
-# not by the noise found, which would bias the image.
+# not by the noise found, which would bias the image. (The balls had 98 % of the image's squared error. A
+# window has fewer light subpaths than as many samples of the whole image, so that t = 1 gains less from it.)
 FOCUS = {"glass_caustics": ((0.17, 0.57, 0.49, 0.89), (0.54, 0.59, 0.79, 0.84))}
 FOCUS_TIMES = 16
 
@@ -212,7 +214,9 @@ class Halves:
         self.sources, self.counts = set(), None
         if path.is_file():
             kept = np.load(path)
-            if str(kept["key"]) == key:
+            if str(kept["key"]) != key:
+                print(f"{path}: of another scene, integrator or number of samples; begun anew")
+            else:
                 self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
                 self.columns = list(kept["columns"])
                 whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
@@ -222,7 +226,10 @@ class Halves:
 
     def add(self, images, window=None, times: float = 1.0):
         """Add an image to each half, and keep the sums. ``window`` (slices of rows and columns): the images
-        are of that part alone; ``times``: they have so many times the samples of a whole one."""
+        are of that part alone; ``times``: they have so many times the samples of a whole one. Raises
+        ``ValueError`` for values that are not finite, and leaves the sums as they are."""
+        if not all(np.isfinite(image).all() for image in images):
+            raise ValueError(f"{self.path.name}: round {self.rounds} has values that are not finite")
         if self.sums is None:
             self.sums, self.counts = np.zeros((2, *images[0].shape)), np.zeros((*images[0].shape[:2], 1))
         self.sums[:, *(window or ())] += times * np.stack(images)
@@ -285,19 +292,36 @@ class Job:
     spp: int = 64
     seconds: float = 600.0
 
+    @cached_property
+    def scene_sha256(self) -> str:
+        """`scene_digest`, taken before the scene is rendered."""
+        return scene_digest(self.scene)
+
 
 def make(job: Job) -> tuple[Reference, bool]:
-    """Render until the reference is good enough or the time is over, and store it; also whether it is."""
+    """Render until the reference is good enough or the time is over, and store it; also whether it is good
+    enough. One that the time has cut short does not replace a better one."""
     depth = job.max_depth or default_depth(job.scene)
     reference, reached = (_known if job.scene in KNOWN else _rendered)(job, depth)
+    stored = None if reached else _stored(job, depth)
+    if stored is not None and stored.error < reference.error:
+        print(f"{job.scene}: the stored reference is better than what the time was enough for, and stays")
+        return stored, False
     write(reference_path(job.scene, job.resolution, depth), reference)
     return reference, reached
+
+
+def _stored(job: Job, depth: int) -> Reference | None:
+    try:
+        return load_reference(job.scene, job.resolution, depth)
+    except ValueError:  # none, or of another scene
+        return None
 
 
 def _provenance(job: Job, depth: int, **more) -> dict:
     return {
         "scene": job.scene,
-        "scene_sha256": scene_digest(job.scene),
+        "scene_sha256": job.scene_sha256,
         "resolution": job.resolution,
         "max_depth": depth,
         "date": datetime.date.today().isoformat(),
@@ -317,11 +341,11 @@ def _known(job: Job, depth: int):
 
 def _rendered(job: Job, depth: int):
     """As `_known`, by an integrator; False if the time was over first."""
-    scene = load_scene(job.scene, resolution=job.resolution, sampler=SAMPLER)
     by_path = job.scene not in NOT_BY_PATH
     parameters = dict(BY_PATH if by_path else BY_BDPT, max_depth=depth)
     integrator = mi.load_dict(parameters)
-    key = json.dumps([scene_digest(job.scene), job.resolution, parameters, PASS_SPP, SAMPLER])
+    key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, SAMPLER])
+    scene = load_scene(job.scene, resolution=job.resolution, sampler=SAMPLER)
     halves = Halves(SUMS / f"reference_{job.scene}_{job.resolution}_{depth}.npz", key)
     aim = Aim(scene, depth, job.spp, by_path)
     windows = [Window(job, share) for share in FOCUS.get(job.scene, ())]
@@ -340,7 +364,7 @@ def _rendered(job: Job, depth: int):
         integrator=parameters,
         sampler=SAMPLER,
         spp=round(2 * float(halves.counts.min()) * PASS_SPP),
-        spp_in_windows=round(2 * float(halves.counts.max()) * PASS_SPP),
+        **({"spp_in_windows": round(2 * float(halves.counts.max()) * PASS_SPP)} if windows else {}),
         first_seed=FIRST_SEED,
         sources=sorted(halves.sources),
         judges_spp=job.spp,
@@ -361,6 +385,8 @@ class Window:
 
     def __init__(self, job: Job, share):
         self.scene = load_scene(job.scene, resolution=job.resolution, sampler=SAMPLER)
+        if not self.scene.sensors()[0].film().rfilter().is_box_filter():
+            raise ValueError(f"scene={job.scene!r}: windows need rfilter 'box', or their borders differ")
         size = np.array(self.scene.sensors()[0].film().size())
         low, high = np.floor(share[:2] * size).astype(int), np.ceil(share[2:] * size).astype(int)
         self.slices = (slice(low[1], high[1]), slice(low[0], high[0]))

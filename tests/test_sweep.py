@@ -173,6 +173,31 @@ def test_references_go_on_where_they_stopped(folder):
     assert reached and third.provenance["spp"] == second.provenance["spp"]
 
 
+def test_a_better_reference_stays(folder):
+    """Rationale: the sums behind the stored references are not in the repository. Expected: with the sums
+    gone, what a short run gives does not replace the stored one; with enough time a new one does.
+    """
+    stored, _ = reference.make(job(2))
+    for sums in reference.SUMS.glob("*.npz"):
+        sums.unlink()
+    kept, reached = reference.make(job(2, seconds=0))
+    assert not reached and kept.provenance["spp"] == stored.provenance["spp"]
+    assert reference.load_reference("cornell_box", 8, 2).provenance["spp"] == stored.provenance["spp"]
+    assert reference.make(job(2))[1]
+
+
+def test_sums_stay_finite_and_say_what_they_are_of(folder, capsys):
+    """Expected: a value that is not finite is refused before it is added; sums of something else are not
+    used, and it is said."""
+    halves = reference.Halves(folder / "sums.npz", "key")
+    halves.add([np.ones((4, 4, 3))] * 2)
+    with pytest.raises(ValueError, match=r"sums.npz: round 1 has values that are not finite"):
+        halves.add([np.ones((4, 4, 3)), np.full((4, 4, 3), np.inf)])
+    assert reference.Halves(folder / "sums.npz", "key").rounds == 1 and not capsys.readouterr().out
+    assert reference.Halves(folder / "sums.npz", "another").rounds == 0
+    assert "sums.npz: of another scene, integrator or number of" in capsys.readouterr().out
+
+
 def test_references_that_half_precision_cannot_hold_are_refused(folder):
     too_bright = reference.Reference(np.full((4, 4, 3), 1e5), np.zeros((4, 4, 3)), None, {})
     with pytest.raises(ValueError, match="radiance 100000 does not fit into half precision"):
