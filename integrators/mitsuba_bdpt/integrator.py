@@ -371,8 +371,8 @@ class Render:
 
 def _check_strategy_memory(depth: int, film):
     w, h = (int(x) for x in film.crop_size())
-    # Six channels in single precision (with a copy per thread, taken as one more) and double sums.
-    needed = strategy_count(depth) * w * h * 6 * (4 + 4 + 16)
+    # Six channels in double precision: those of a pass, of all passes and, while they are added, of both.
+    needed = strategy_count(depth) * w * h * 6 * (8 + 16)
     if needed > STRATEGY_MEMORY:
         raise ValueError(
             f"bdpt: strategy_images at {w}x{h} with max_depth={depth} needs about "
