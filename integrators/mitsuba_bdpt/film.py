@@ -26,11 +26,12 @@ class Block:
     ``size`` (width, height); ``channels`` an even number, so that Dr.Jit adds a pixel's as a packet;
     ``mode`` how neighbouring lanes are added: ``Local`` where they mostly meet in a pixel, else ``Direct``
     (measured for 2^20 samples of 4 channels on two cores: 3 and 9 ms if 64 lanes meet, 41 and 26 ms if
-    they do not); ``kind`` of the sums: ``Float64`` where any number of samples may meet in a pixel.
+    they do not); ``packet`` the type of a pixel's sums, in double precision where any number of samples may
+    meet in a pixel.
     """
 
-    def __init__(self, size, offset, channels: int, rfilter, mode, kind):
-        self.channels, self._rfilter, self._mode, self._kind = channels, rfilter, mode, kind
+    def __init__(self, size, offset, channels: int, rfilter, mode, packet):
+        self.channels, self._rfilter, self._mode, self._packet = channels, rfilter, mode, packet
         self._length = size[0] * size[1] * channels
         self._size = dr.opaque(mi.Point2i, size)
         self._offset = dr.opaque(mi.Point2i, offset)
@@ -38,7 +39,7 @@ class Block:
 
     def clear(self):
         """Set all sums to zero."""
-        self.data = dr.zeros(self._kind, self._length)
+        self.data = dr.zeros(dr.value_t(self._packet), self._length)
         dr.make_opaque(self.data)
 
     def put(self, position, values, active, row=0):
@@ -64,9 +65,7 @@ class Block:
     def _add(self, pixel, values, active):
         inside = active & dr.all((pixel >= 0) & (pixel < self._size))
         index = mi.UInt32(pixel.y * self._size.x + pixel.x)
-        packet = mi.ArrayXd if self._kind is mi.Float64 else mi.ArrayXf
-        packet = packet([self._kind(v) for v in values])
-        dr.scatter_reduce(dr.ReduceOp.Add, self.data, packet, index, inside, mode=self._mode)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.data, self._packet(values), index, inside, mode=self._mode)
 
 
 class Replicates:
@@ -119,18 +118,19 @@ class Accumulator:
         self.replicates = Replicates() if variance else None
         film.prepare(layer_names(depth, variance))
         self.channels = 5 if self.alpha else 4
-        self.camera = self._block(self.channels + self.channels % 2, dr.ReduceMode.Local, mi.Float)
-        # In single precision the 2^22 splats of a small lamp on its one pixel lose 0.3 % of its light.
-        self.light = self._block(4, dr.ReduceMode.Direct, mi.Float64)
+        self.camera = self._block(self.channels + self.channels % 2, dr.ReduceMode.Local, mi.ArrayXf)
+        # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
+        self.light = self._block(4, dr.ReduceMode.Direct, mi.ArrayXd)
         # One strip of rows per strategy, far enough apart for the filter.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         rows = strategy_count(depth) * self._stride
-        self.strategies = self._block(6, dr.ReduceMode.Direct, mi.Float64, rows) if depth else None
+        self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if depth else None
         self._done = (None, ())
         self._share = [self._covered(n) for n in self.size]
 
-    def _block(self, channels: int, mode, kind, height: int | None = None):
-        return Block([self.size[0], height or self.size[1]], self.offset, channels, self.rfilter, mode, kind)
+    def _block(self, channels: int, mode, packet, height: int | None = None):
+        size = [self.size[0], height or self.size[1]]
+        return Block(size, self.offset, channels, self.rfilter, mode, packet)
 
     def put_camera(self, position, rgb, alpha, active):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
@@ -160,7 +160,7 @@ class Accumulator:
         return self._done[1]
 
     def close_pass(self, spp: int):
-        """Move the sums of a pass with ``spp`` samples per pixel into double precision."""
+        """Add the sums of a pass with ``spp`` samples per pixel to those of all, in double precision."""
         blocks = self._blocks()
         sums = [mi.Float64(b.data) for b in blocks]
         before, passes = self._done
