@@ -322,6 +322,15 @@ class Sample:
         error = values.std(0, ddof=1) / np.sqrt(len(values))
         return Sample(values.mean(0), error, len(values) - 1.0, (values != 0).mean(0))
 
+    def joined(self, other: Sample) -> Sample:
+        """What `of` gives for the renders of both."""
+        a, b = self.freedom + 1, other.freedom + 1
+        mean = (a * self.mean + b * other.mean) / (a + b)
+        squares = sum((n - 1) * n * s.error**2 for n, s in ((a, self), (b, other)))
+        squares = squares + a * b / (a + b) * (self.mean - other.mean) ** 2
+        error = np.sqrt(squares / ((a + b) * (a + b - 1)))
+        return Sample(mean, error, a + b - 1, (a * self.nonzero + b * other.nonzero) / (a + b))
+
     @staticmethod
     def known(mean, error=0.0) -> Sample:
         """Values (m,) whose standard errors are known rather than estimated."""
@@ -422,6 +431,10 @@ class Means:
                 "more."
             )
         return Means(Sample.of(columns), Sample.of(columns[:, -3:].mean(1, keepdims=True)))
+
+    def joined(self, other: Means) -> Means:
+        """What `of` gives for the renders of both."""
+        return Means(self.columns.joined(other.columns), self.whole.joined(other.whole))
 
     @staticmethod
     def known(image, tiles=TILES) -> Means:

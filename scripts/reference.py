@@ -11,7 +11,8 @@ that `bdpt` is judged by another integrator, else by `bdpt` with everything swit
 which few samples find the light have more of them; furnaces are known exactly. Files lie in references/:
 EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R ...), and
 the provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept in
-renders/, so that a further run improves a reference instead of starting anew.
+renders/, so that a further run improves a reference instead of starting anew; where they are gone, it goes
+on from the stored image, whose rounding to half precision is far below its own error.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import argparse
 import datetime
 import hashlib
 import json
+import math
 import platform
 import re
 import time
@@ -211,7 +213,7 @@ class Halves:
 
     def __init__(self, path: Path, key: str):
         self.path, self.key, self.rounds, self.sums, self.columns = path, key, 0, None, []
-        self.sources, self.counts = set(), None
+        self.sources, self.counts, self.earlier = set(), None, None
         if path.is_file():
             kept = np.load(path)
             if str(kept["key"]) != key:
@@ -222,7 +224,29 @@ class Halves:
                 whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
                 self.counts = kept["counts"] if "counts" in kept else whole
                 self.sources = set(kept["sources"].tolist())
+                self.earlier = _means(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
         self.sources.add(source_digest())
+
+    def go_on_from(self, stored: Reference, windows: list):
+        """Take a stored reference for the renders before the first; ``windows`` are slices of rows and
+        columns. Its seeds are not used again."""
+        spp = stored.provenance["spp"]
+        whole, most = spp / (2 * PASS_SPP), stored.provenance.get("spp_in_windows", spp) / (2 * PASS_SPP)
+        self.counts = np.full((*stored.image.shape[:2], 1), whole)
+        for window in windows:
+            self.counts[window] = most
+        self.sums = np.stack([stored.image + stored.difference, stored.image - stored.difference])
+        self.sums *= self.counts
+        self.rounds = math.ceil((1 + len(windows)) * most)  # no less than were rendered
+        self.sources |= set(stored.provenance["sources"])
+        self.earlier = stored.means
+
+    def means(self) -> Means | None:
+        """Of all renders of the whole image; None if there are too few."""
+        if len(self.columns) < FEWEST_RUNS:
+            return self.earlier
+        made = Means.of(self.columns)
+        return self.earlier.joined(made) if self.earlier else made
 
     def add(self, images, window=None, times: float = 1.0):
         """Add an image to each half, and keep the sums. ``window`` (slices of rows and columns): the images
@@ -239,6 +263,7 @@ class Halves:
         self.rounds += 1
         self.path.parent.mkdir(parents=True, exist_ok=True)
         kept = {"sums": self.sums, "counts": self.counts, "columns": np.array(self.columns)}
+        kept |= {"earlier": json.dumps(_kept(self.earlier))} if self.earlier else {}
         with render.replacing(self.path) as temporary, temporary.open("wb") as file:
             np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
 
@@ -250,8 +275,7 @@ class Halves:
     def reference(self, provenance: dict) -> Reference:
         """What there is after at least one round."""
         image, difference = self.mean()
-        means = Means.of(self.columns) if len(self.columns) >= FEWEST_RUNS else None
-        return Reference(image, difference, means, provenance)
+        return Reference(image, difference, self.means(), provenance)
 
 
 def _pixels(image):
@@ -318,6 +342,10 @@ def _stored(job: Job, depth: int) -> Reference | None:
         return None
 
 
+def _same(stored: Reference, **wanted) -> bool:
+    return all(stored.provenance.get(key) == value for key, value in wanted.items())
+
+
 def _provenance(job: Job, depth: int, **more) -> dict:
     return {
         "scene": job.scene,
@@ -349,6 +377,9 @@ def _rendered(job: Job, depth: int):
     halves = Halves(SUMS / f"reference_{job.scene}_{job.resolution}_{depth}.npz", key)
     aim = Aim(scene, depth, job.spp, by_path)
     windows = [Window(job, share) for share in FOCUS.get(job.scene, ())]
+    stored = _stored(job, depth)
+    if halves.rounds == 0 and stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):
+        halves.go_on_from(stored, [window.slices for window in windows])
     started = time.perf_counter()
     reached = halves.rounds > 0 and aim.reached(halves.reference({}))
     while halves.rounds == 0 or not (reached or time.perf_counter() - started > job.seconds):
@@ -364,7 +395,7 @@ def _rendered(job: Job, depth: int):
         integrator=parameters,
         sampler=SAMPLER,
         spp=round(2 * float(halves.counts.min()) * PASS_SPP),
-        **({"spp_in_windows": round(2 * float(halves.counts.max()) * PASS_SPP)} if windows else {}),
+        spp_in_windows=round(2 * float(halves.counts.max()) * PASS_SPP),
         first_seed=FIRST_SEED,
         sources=sorted(halves.sources),
         judges_spp=job.spp,

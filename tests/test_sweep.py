@@ -135,6 +135,38 @@ def test_windows_of_halves_have_more_samples(folder):
     assert halves.counts.min() == 2 and halves.counts.max() == 6
 
 
+def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
+    """Expected: the same image, error and tile means as by the run that kept its sums, up to half precision
+    (2^-11 of a value); seeds that were used do not come again; after another round all have one more.
+    """
+    rng = np.random.default_rng(3)
+    halves, window = reference.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
+    for _ in range(metrics.FEWEST_RUNS):
+        halves.add(rng.uniform(1, 2, (2, 16, 16, 3)))
+    halves.add(rng.uniform(1, 2, (2, 4, 4, 3)), window, 4)
+    spp = {
+        name: round(2 * reference.PASS_SPP * count) for name, count in (("spp", 8), ("spp_in_windows", 12))
+    }
+    reference.write(folder / "a.exr", halves.reference(spp | {"sources": ["x"]}))
+    (image, difference), header = reference.read_exr(folder / "a.exr", "", "difference.")
+    kept = json.loads(header["provenance"])
+    stored = reference.Reference(image, difference, reference._means(kept["means"]), kept)
+    again = reference.Halves(folder / "other.npz", "key")
+    again.go_on_from(stored, [window])
+    np.testing.assert_allclose(again.counts, halves.counts)
+    assert again.rounds >= halves.rounds and "x" in again.sources
+    more = rng.uniform(1, 2, (metrics.FEWEST_RUNS, 2, 16, 16, 3))
+    for images in more:
+        halves.add(images)
+        again.add(images)
+    again = reference.Halves(folder / "other.npz", "key")
+    np.testing.assert_allclose(again.sums, halves.sums, rtol=2**-10)
+    for name in ("mean", "error", "nonzero", "freedom"):
+        for part in ("columns", "whole"):
+            ours, theirs = (getattr(getattr(h.means(), part), name) for h in (again, halves))
+            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
 def test_windows_cover_the_glass_and_show_the_same():
     """Expected: all pixels of `glass_caustics` whose camera ray meets glass or a mirror lie in the windows,
     which fill less than a fifth of the image; a window shows that part of the whole image: depths, which
