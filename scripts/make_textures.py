@@ -1,7 +1,7 @@
 """Makes the textures of the scenes: `python scripts/make_textures.py [folder]`.
 
 Environment maps as Mitsuba reads them: rows from the zenith (+y) to the nadir, columns from -z by
-way of +x, +z and -x back to -z. Half floats in EXR.
+way of +x, +z and -x back to -z. Slides from the top. Half floats in EXR.
 """
 
 import sys
@@ -32,15 +32,39 @@ def sky_with_sun():
     return image
 
 
-TEXTURES = {"sky_with_sun": sky_with_sun}
+# The slide of projector_through_glass, in 64ths of its width. What is turned or mirrored can be told apart:
+# four colours, a letter F, and a border. Transmittances are linear RGB.
+SLIDE_SIZE = 64
+UPPER_LEFT, UPPER_RIGHT = np.array((0.75, 0.12, 0.08)), np.array((0.85, 0.55, 0.08))
+LOWER_LEFT, LOWER_RIGHT = np.array((0.08, 0.35, 0.75)), np.array((0.12, 0.55, 0.2))
+LETTER, BORDER = np.array((0.95, 0.95, 0.9)), 0.03
+STROKES = ((12, 52, 22, 29), (12, 19, 22, 46), (28, 35, 22, 41))  # top, bottom, left, right
+BORDER_WIDTH = 3
+
+
+def slide():
+    """Four coloured quarters with a pale F across them, in a dark border."""
+    half = SLIDE_SIZE // 2
+    image = np.empty((SLIDE_SIZE, SLIDE_SIZE, 3))
+    image[:half, :half], image[:half, half:] = UPPER_LEFT, UPPER_RIGHT
+    image[half:, :half], image[half:, half:] = LOWER_LEFT, LOWER_RIGHT
+    for top, bottom, left, right in STROKES:
+        image[top:bottom, left:right] = LETTER
+    inside = np.zeros((SLIDE_SIZE, SLIDE_SIZE), dtype=bool)
+    inside[BORDER_WIDTH:-BORDER_WIDTH, BORDER_WIDTH:-BORDER_WIDTH] = True
+    image[~inside] = BORDER
+    return image
+
+
+TEXTURES = {"sky_with_sun": sky_with_sun, "slide": slide}
 
 
 def make_all(folder=FOLDER):
     """Writes every texture of TEXTURES into `folder`."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for name, make in TEXTURES.items():
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         with OpenEXR.File(header, {"RGB": make().astype(np.float16)}) as file:
             file.write(str(folder / f"{name}.exr"))
 

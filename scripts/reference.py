@@ -57,6 +57,7 @@ NOT_BY_PATH = {
     "headlight",
     "lamp_behind_glass",
     "pool",
+    "projector_through_glass",
     "ring_caustic",
     "smallvcm_cornell_lamp",
     "smallvcm_cornell_point",

@@ -2,6 +2,7 @@
 
     python scripts/sweep.py presets/small.toml -o results/small
     python scripts/sweep.py presets/small.toml -o results/small     # again: goes on where it was stopped
+    python scripts/sweep.py presets/benchmark.toml --scenes pool    # one scene anew, other rows as they are
 
 Presets (see scripts/preset.py) say what is rendered. For each scene, budget and seed all integrators follow
 one another, so that a noisy machine is noisy for all. Every finished render is a file of its own in
@@ -24,7 +25,7 @@ import math
 import os
 import platform
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import analysis
@@ -405,6 +406,27 @@ def rows(preset: Preset, output: Path) -> list[dict]:
     return [row | {"first": preset.methods[0].name} for row in found]
 
 
+def chosen(preset: Preset, names) -> Preset:
+    """The part of a preset about the scenes ``names``, without probes; raises ``ValueError`` for others."""
+    known = [subject.name for subject in preset.subjects]
+    for name in names:
+        if name not in known:
+            raise ValueError(f"--scenes {name}: not in the preset, which has {', '.join(known)}")
+    subjects = tuple(subject for subject in preset.subjects if subject.name in names)
+    return replace(preset, subjects=subjects, probes={})
+
+
+def beside(table: list[dict], preset: Preset, output: Path) -> list[dict]:
+    """``table`` and the rows of other scenes of the ``preset`` that OUTPUT/rows.parquet has, as they are."""
+    import pyarrow.parquet
+
+    file, done = output / "rows.parquet", {row["scene"] for row in table}
+    others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
+    order = [subject.name for subject in preset.subjects]
+    found = table + [row for row in others if row["scene"] not in done]
+    return sorted(found, key=lambda row: order.index(row["scene"]))
+
+
 def write_tables(table: list[dict], output: Path) -> None:
     """rows.csv and rows.parquet, the same columns in both."""
     import pyarrow as pa
@@ -432,15 +454,19 @@ def main() -> int:
     )
     parser.add_argument("preset", type=Path)
     parser.add_argument("-o", "--output", type=Path, help="default: results/NAME_OF_PRESET")
+    parser.add_argument("--scenes", nargs="+", help="these of the preset alone; other rows stay as they are")
     args = parser.parse_args()
     output = args.output or Path("results") / args.preset.stem
     mi.set_variant("llvm_ad_rgb")
-    preset = read_preset(args.preset)
+    whole = read_preset(args.preset)
+    preset = chosen(whole, args.scenes) if args.scenes else whole
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as progress:
         sweep = Sweep(preset, output, progress)
         sweep.run()
     table = rows(preset, output)
+    if args.scenes:
+        table = beside(table, whole, output)
     if table:
         write_tables(table, output)
     print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))

@@ -71,17 +71,20 @@ class Paths:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1, t = 0 has 0."""
+    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1."""
 
     endpoints: float = 1.0
     splat: float = 1.0
     inner: float = 1.0
+    arrival: float = 1.0
 
     def of(self, s: int, k: int) -> float:
         """kappa of the strategy (s, k + 1 - s)."""
         t = k + 1 - s
         if s == 0:
             return 1.0
+        if t == 0:
+            return self.arrival
         if s == 1 and t == 1:
             return self.endpoints
         if s == 1:
@@ -90,7 +93,7 @@ class Coefficients:
 
 
 def log_densities(paths: Paths) -> np.ndarray:
-    """log p_s for s = 0 ... k, shape (n, k + 1); -inf where the strategy cannot make the path."""
+    """log p_s for s = 0 ... k + 1, shape (n, k + 2); -inf where the strategy cannot make the path."""
     k, n = paths.k, len(paths.kind)
     log = {
         name: np.log(np.asarray(getattr(paths, name), dtype=np.float64))
@@ -113,12 +116,10 @@ def log_densities(paths: Paths) -> np.ndarray:
     # (discrete) probability both ways, so that any number serves; here 1.
     light = np.zeros((n, k + 1))
     light[:, 0] = log["first"]
-    if k >= 2:
-        # The emission density of x_1: over directions, or already over an area perpendicular to
-        # the edge.
-        spread = np.where(paths.infinite, 0, log["dist2"][:, 0])
-        light[:, 1] = log["second"] + log["cos_camera"][:, 0] - spread
-    for i in range(2, k):
+    # The emission density of x_1: over directions, or already over an area perpendicular to the edge.
+    spread = np.where(paths.infinite, 0, log["dist2"][:, 0])
+    light[:, 1] = log["second"] + log["cos_camera"][:, 0] - spread
+    for i in range(2, k + 1):
         pdf = np.where(paths.delta[:, i - 1], 0, log["to_camera"][:, i - 1])
         light[:, i] = pdf + log["cos_camera"][:, i - 1] - log["dist2"][:, i - 1]
 
@@ -137,8 +138,8 @@ def log_densities(paths: Paths) -> np.ndarray:
     # Next-event estimation makes x_0 with a density of its own.
     direct = log["direct"] + np.where(is_area, log["cos_light"][:, 0] - log["dist2"][:, 0], 0)
 
-    p = np.empty((n, k + 1))
-    for s in range(k + 1):
+    p = np.empty((n, k + 2))
+    for s in range(k + 2):
         t = k + 1 - s
         start = direct[:, None] if s == 1 and t >= 2 else light[:, : min(s, 1)]
         p[:, s] = start.sum(1) + light[:, 1:s].sum(1) + camera[:, s:].sum(1)
@@ -150,6 +151,8 @@ def log_densities(paths: Paths) -> np.ndarray:
         else:  # the connecting edge joins x_{s-1} and x_s
             possible &= ~paths.delta[:, s - 1] if s >= 2 else True
             possible &= ~paths.delta[:, s] if t >= 2 else True
+        if t == 0:
+            possible &= paths.lens
         p[~possible, s] = -np.inf
     return p
 
@@ -157,11 +160,11 @@ def log_densities(paths: Paths) -> np.ndarray:
 def weights(paths: Paths, coefficients: Coefficients, heuristic: str):
     """Weights of all strategies of each path.
 
-    Returns ``(w, used, tied)``: weights (n, k + 1), zero where a strategy is not in use; the mask
+    Returns ``(w, used, tied)``: weights (n, k + 2), zero where a strategy is not in use; the mask
     of strategies in use (kappa p > 0); and the mask (n,) of paths whose two best strategies are
     within 1e-4 of each other.
     """
-    kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 1)])
+    kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
     with np.errstate(divide="ignore"):
         size = log_densities(paths) + np.log(kappa)
     used = np.isfinite(size)

@@ -458,7 +458,7 @@ def test_normal_mapped_glass_from_both_sides():
 
     scene = pane_scene(16)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "skip": "none", "strategy_images": True})
-    first = 3 + 6 * 5  # after RGB and the strategies of k = 1 (2) and k = 2 (3)
+    first = 3 + 6 * 7  # after RGB and the strategies of k = 1 (3) and k = 2 (4)
     sides = {"camera": [], "light": []}
     for seed in range(32):
         image = mi.render(scene, integrator=integrator, seed=seed).numpy()

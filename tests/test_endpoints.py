@@ -1,10 +1,8 @@
-"""Every kind of emitter and sensor by itself, every pair of them, and everything between.
+"""Emitters and sensors by themselves, and everything between them; every pair of them: `test_coverage`.
 
 The reference for images is Mitsuba's `path`; where it is wrong or blind, a closed form. Statistic of
 image comparisons: Welch's t-test of tile means over seeds with Sidak's correction (`agree`).
 """
-
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -13,14 +11,29 @@ import pytest
 from mitsuba_bdpt import sensors
 from mitsuba_bdpt.emitters import Emitters
 from mitsuba_bdpt.kernel import Shared
+from mitsuba_bdpt.rays import Quadrics
+from scene_parts import (
+    EGG,
+    EMITTERS,
+    T,
+    emitter_part,
+    grey,
+    orthographic,
+    perspective,
+    register_plugins,
+    room,
+    texture,
+    thinlens,
+)
 from scipy import stats
 
 SIGNIFICANCE = 1e-4
 ROUNDING = 2e-4  # `path` and we offset rays differently; relative
 
-T = mi.ScalarTransform4f
 
-EGG = Path(__file__).parents[1] / "scenes" / "meshes" / "veach_bidir_egg.ply"
+def like_of_rgb():
+    """Time and wavelengths of the RGB variant."""
+    return Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
 
 
 def integrator(kind="bdpt", **parameters):
@@ -88,153 +101,6 @@ def layer(images, bdpt, name):
     return images[..., base + first : base + first + 3]
 
 
-def film(size=16, rfilter="box", **keys):
-    return {
-        "type": "hdrfilm",
-        "width": size,
-        "height": size,
-        "pixel_format": "rgb",
-        "component_format": "float32",
-        "rfilter": {"type": rfilter},
-    } | keys
-
-
-def perspective(origin=(0, 2, 5), target=(0, 0.3, 0), fov=40, keys=None, **film_keys):
-    return {
-        "type": "perspective",
-        "fov": fov,
-        "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
-        "sampler": {"type": "independent"},
-        "film": film(**film_keys),
-    } | (keys or {})
-
-
-def thinlens(aperture=0.15, focus=4.5, **keys):
-    return perspective(**keys) | {
-        "type": "thinlens",
-        "aperture_radius": aperture,
-        "focus_distance": focus,
-    }
-
-
-SENSORS = {"perspective": perspective, "thinlens": thinlens}
-
-
-def grey(value):
-    return {
-        "type": "twosided",
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [value] * 3}},
-    }
-
-
-def sky_bitmap():
-    """A sky that is uneven in every direction, brighter in one place."""
-    rng = np.random.default_rng(3)
-    data = rng.random((8, 16, 3), dtype=np.float32) * 0.5 + 0.2
-    data[2, 3] = 6.0
-    return mi.Bitmap(data)
-
-
-def texture():
-    data = np.random.default_rng(4).random((6, 6, 3), dtype=np.float32) + 0.1
-    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
-
-
-EMITTERS = {
-    "rectangle": lambda: {
-        "type": "rectangle",
-        "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.4),
-        "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": 6.0},
-    },
-    "disk": lambda: {
-        "type": "disk",
-        "to_world": T().translate([0.5, 2.5, 0]).rotate([1, 0, 0], 100).scale(0.4),
-        "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": 8.0},
-    },
-    "sphere": lambda: {
-        "type": "sphere",
-        "center": [-1, 1.6, 0.5],
-        "radius": 0.3,
-        "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": 5.0},
-    },
-    "cylinder": lambda: {
-        "type": "cylinder",
-        "p0": [-1.2, 1.5, 0],
-        "p1": [1, 2, 0.4],
-        "radius": 0.15,
-        "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": 4.0},
-    },
-    "cube": lambda: {
-        "type": "cube",
-        "to_world": T().translate([1, 1.6, 0.4]).rotate([0.70710678, 0.70710678, 0], 30).scale(0.25),
-        "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": 5.0},
-    },
-    "textured": lambda: {
-        "type": "rectangle",
-        "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.5),
-        "bsdf": grey(0.1),
-        "emitter": {"type": "area", "radiance": texture()},
-    },
-    "point": lambda: {"type": "point", "position": [0.7, 2.2, 1], "intensity": 5.0},
-    "spot": lambda: {
-        "type": "spot",
-        "intensity": 12.0,
-        "cutoff_angle": 35,
-        "beam_width": 20,
-        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1]),
-    },
-    "textured spot": lambda: {
-        "type": "spot",
-        "intensity": 12.0,
-        "cutoff_angle": 35,
-        "texture": texture(),
-        "to_world": T().look_at([1, 3, 1.5], [0, 0, 0], [0, 0, 1]),
-    },
-    "directional": lambda: {"type": "directional", "direction": [-1, -2, -0.7], "irradiance": 3.0},
-    "constant": lambda: {"type": "constant", "radiance": 0.7},
-    "envmap": lambda: {"type": "envmap", "bitmap": sky_bitmap(), "scale": 0.8},
-    "rotated envmap": lambda: {
-        "type": "envmap",
-        "bitmap": sky_bitmap(),
-        "to_world": T().rotate([0.26726124, 0.53452248, 0.80178373], 70),
-    },
-}
-
-
-def room(sensor=None, **more):
-    """A floor, a back wall, a ball and a box. Shapes of unequal BSDFs, so that Mitsuba merges none."""
-    return {
-        "type": "scene",
-        "sensor": sensor or perspective(),
-        "floor": {
-            "type": "rectangle",
-            "bsdf": grey(0.6),
-            "to_world": T().rotate([1, 0, 0], -90).scale(2),
-        },
-        "back": {
-            "type": "rectangle",
-            "bsdf": grey(0.55),
-            "to_world": T().translate([0, 1, -2]).scale(2),
-        },
-        "ball": {
-            "type": "sphere",
-            "center": [-0.6, 0.5, 0.4],
-            "radius": 0.5,
-            "bsdf": {"type": "roughplastic", "alpha": 0.3},
-        },
-        "box": {
-            "type": "cube",
-            "bsdf": grey(0.5),
-            "to_world": T().translate([0.8, 0.4, -0.3]).rotate([0, 1, 0], 25).scale(0.4),
-        },
-    } | more
-
-
 # -- emitters ---------------------------------------------------------------------------------
 
 
@@ -244,7 +110,7 @@ def emission(name, count, **others):
     emitters = Emitters(scene)
     rng = np.random.default_rng(11)
     u = [mi.Float(rng.random(count, dtype=np.float32)) for _ in range(4)]
-    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    like = like_of_rgb()
     e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
     return scene, emitters, e, rng
 
@@ -270,47 +136,16 @@ def test_emitted_power(name):
     assert abs(weight.mean() - POWER[name]) < 4 * error + 1e-4 * POWER[name]
 
 
-@pytest.mark.parametrize("name", EMITTERS)
-def test_emission_density_integrates_to_one(name):
-    """Rationale: the stated density of an emission must be the one it is sampled with. The mean over
-    samples of 1 / (density) over a region is that region's measure; here the region is everything:
-    positions and directions. Expected: area x pi / cos... for a surface A x 2 pi, for a point light
-    4 pi, a spot its cone, an environment 4 pi x the disk, a directional light the disk. Tolerance: five
-    standard errors plus 1e-3; cosines below 0.02 are left out on both sides, for 1/cos has no variance.
-    """
-    scene, emitters, e, _ = emission(name, 100_000)
-    n = 100_000
-    first, second, cos = (
-        np.broadcast_to(np.array(x, dtype=np.float64), n) for x in (e.pdf_first, e.pdf_second, e.cos)
-    )
-    disk = np.pi * float(emitters.radius[0]) ** 2
-    keep = cos > 0.02
-    values = np.where(keep, 1 / np.maximum(first * second, 1e-30), 0)
-    if name in ("constant", "envmap", "rotated envmap"):
-        measure = 4 * np.pi * disk
-    elif name == "directional":
-        measure = disk
-    elif name == "point":
-        measure = 4 * np.pi
-    elif "spot" in name:
-        measure = 2 * np.pi * (1 - np.cos(np.deg2rad(35)))
-    else:
-        shape = next(x for x in scene.emitters()).get_shape()
-        measure = float(shape.surface_area()[0]) * 2 * np.pi * (1 - 0.02)
-    error = values.std() / np.sqrt(n)
-    assert error < 0.05 * measure
-    assert abs(values.mean() - measure) < 5 * error + 1e-3 * measure
+HITTABLE = [k for k in EMITTERS if emitter_part(k).hit and emitter_part(k).traced]
 
 
-@pytest.mark.parametrize(
-    "name", [k for k in EMITTERS if k not in ("point", "spot", "textured spot", "directional")]
-)
+@pytest.mark.parametrize("name", [k for k in HITTABLE if k != "timed_sunsky"])
 def test_emission_agrees_with_hits(name):
     """Rationale: light that is emitted towards the scene must be what a ray in the other direction
     sees, weight x density = radiance x cosine, and the densities must be those that a hit computes.
     Expected: for each emission, tracing back to y_0 from its first hit finds the same radiance and the
     same two density factors, and the density of next-event estimation there equals that of
-    `sample_direct`'s kind. Tolerance: 2e-3 relative for all but 1 % (edges of textures and pixels of
+    `sample_direct`'s kind. Tolerance: 2e-3 relative for all but 2 % (edges of textures and pixels of
     an environment, where the traced point falls on the other side).
     """
     scene, emitters, e, _ = emission(name, 20_000)
@@ -330,16 +165,16 @@ def test_emission_agrees_with_hits(name):
         return np.mean(np.abs(a - b) > 2e-3 * np.abs(b) + 1e-6)
 
     assert hit.sum() > 500
-    assert off(radiance.x, expected.x) < 0.01
-    assert off(first, e.pdf_first) < 0.01
-    assert off(second, e.pdf_second) < 0.01
+    assert off(radiance.x, expected.x) < 0.02
+    assert off(first, e.pdf_first) < 0.02
+    assert off(second, e.pdf_second) < 0.02
     # connection_density: in the measure of pdf_first, times the squared length of the edge.
     density = emitters.connection_density(e, si, mi.Bool(hit))
-    finite = 1 if "envmap" in name or name == "constant" else dr.squared_norm(si.p - e.si.p)
-    assert off(connect * finite, density) < 0.01
+    finite = 1 if emitter_part(name).infinite else dr.squared_norm(si.p - e.si.p)
+    assert off(connect * finite, density) < 0.02
 
 
-@pytest.mark.parametrize("name", EMITTERS)
+@pytest.mark.parametrize("name", [k for k in EMITTERS if emitter_part(k).direct and k != "timed_sunsky"])
 def test_direct_sample_agrees_with_hits(name):
     """Rationale: next-event estimation and a hit of the same point must name the same density and the
     same radiance. Expected: weight x density = radiance at the point, density = the one that
@@ -348,6 +183,7 @@ def test_direct_sample_agrees_with_hits(name):
     """
     n = 20_000
     rng = np.random.default_rng(12)
+    register_plugins()
     scene = mi.load_dict(room() | {"lamp": EMITTERS[name]()})
     emitters = Emitters(scene)
     si = dr.zeros(mi.SurfaceInteraction3f, n)
@@ -376,7 +212,7 @@ def test_direct_sample_agrees_with_hits(name):
     lit = mi.Bool(np.array(dr.max(radiance)) > 0)
     seen &= np.array(lit)
     assert seen.sum() > 500
-    assert off((direct.weight * direct.pdf_w).x, radiance.x) < 0.01
+    assert off((direct.weight * direct.pdf_w).x, radiance.x) < 0.02
     # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rays.Quadrics).
     few = 0.05 if name == "cylinder" else 0.01
     assert off(direct.pdf_w, connect * to_angle) < few
@@ -429,7 +265,7 @@ def test_emitters_are_chosen_by_sampling_weight():
     e = emitters.sample_emission(
         mi.Point2f(u[0], u[1]),
         mi.Point2f(u[2], u[3]),
-        Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1)),
+        like_of_rgb(),
         mi.Bool(True),
     )
     names = [x.class_name() for x in scene.emitters()]
@@ -442,17 +278,7 @@ def test_emitters_are_chosen_by_sampling_weight():
     assert abs(power.mean() - expected) < 5 * power.std() / np.sqrt(100_000)
 
 
-# -- every emitter with every sensor ----------------------------------------------------------
-
-
-@pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("name", EMITTERS)
-def test_every_emitter_with_every_sensor(name, sensor):
-    """Rationale: each pair has its own combination of strategies, measures and special cases.
-    Expected: the image with all strategies (skip=none) equals `path`'s. Tolerance: the confidence
-    interval, below 2 %. Statistic: Welch over tiles of 4x4 pixels, 10 seeds a side.
-    """
-    same_image(mi.load_dict(room(SENSORS[sensor]()) | {"lamp": EMITTERS[name]()}), 0.03, max_depth=3)
+# -- emitters in a scene ----------------------------------------------------------------------
 
 
 def test_several_emitters_of_unequal_weight():
@@ -503,12 +329,24 @@ CAMERAS = {
         size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
     ),
     "sample_border": lambda: perspective(rfilter="gaussian", sample_border=True),
+    "orthographic": orthographic,
+    "orthographic, stretched, crop": lambda: orthographic(
+        1.5,
+        keys={"near_clip": 0.5, "far_clip": 12.0},
+        size=32,
+        height=24,
+        crop_offset_x=10,
+        crop_offset_y=3,
+        crop_width=16,
+        crop_height=16,
+    ),
+    "orthographic, sample_border": lambda: orthographic(rfilter="gaussian", sample_border=True),
 }
 
 
 def camera_of(sensor):
-    camera = sensors.Camera(sensor)
-    return camera, Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    camera = sensors.prepare(sensor, Quadrics(mi.load_dict({"type": "scene"})))
+    return camera, like_of_rgb()
 
 
 @pytest.mark.parametrize("name", CAMERAS)
@@ -523,12 +361,13 @@ def test_splats_land_where_rays_started(name):
     n = 5000
     rng = np.random.default_rng(6)
     u = rng.random((5, n), dtype=np.float32)
-    width, height = (int(x) for x in camera.region)
+    width, height = (int(x) for x in camera.region.size)
     index = mi.UInt32(rng.integers(0, width * height, n).astype(np.uint32))
     lens = mi.Point2f(u[2], u[3])
-    start = camera.start(camera.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
-    p = start.ray.o + start.ray.d * mi.Float(0.5 + 20 * u[4])
-    join = camera.join(p, lens)
+    start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
+    reach = dr.minimum(start.ray.maxt, 20)
+    p = start.ray.o + start.ray.d * (reach * mi.Float(0.02 + 0.96 * u[4]))
+    join = camera.join(p, lens, None)
     assert np.array(join.valid).mean() > 0.999  # float32 loses a few on the film's rim
     for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
         assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
@@ -544,10 +383,10 @@ def test_camera_rays_are_those_of_mitsuba(name):
     sensor = mi.load_dict(CAMERAS[name]())
     camera, like = camera_of(sensor)
     u = np.random.default_rng(8).random((4, 5000), dtype=np.float32)
-    width, height = (int(x) for x in camera.region)
+    width, height = (int(x) for x in camera.region.size)
     index = mi.UInt32((u[3] * width * height).astype(np.uint32))
     lens = mi.Point2f(u[1], u[2])
-    start = camera.start(camera.pixel(index), mi.Point2f(u[0], u[3]), lens, like)
+    start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[3]), lens, like)
     film = sensor.film()
     uv = (start.position - mi.Point2f(film.crop_offset())) / mi.Point2f(film.crop_size())
     ray, _ = sensor.sample_ray(0, 0.5, uv, lens)
@@ -556,7 +395,7 @@ def test_camera_rays_are_those_of_mitsuba(name):
     np.testing.assert_allclose(start.ray.maxt, ray.maxt, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", [k for k in CAMERAS if "orthographic" not in k])
 def test_importance_integrates_to_one(name):
     """Rationale: W_e as a density over directions. Expected: its integral over the hemisphere is 1 for
     a fixed lens point (uniform sampling of a cone around the axis). Tolerance: five standard errors, the
@@ -572,7 +411,7 @@ def test_importance_integrates_to_one(name):
     to_world = sensor.world_transform()
     d = to_world @ mi.Vector3f(local)
     lens = mi.Point2f(0.3, 0.6)
-    join = camera.join(camera._lens_point(lens) + 7 * d, lens)
+    join = camera.join(camera._lens_point(lens, None)[2] + 7 * d, lens, None)
     values = np.where(np.array(join.valid), np.array(join.importance), 0) * 2 * np.pi * (1 - cos)
     error = values.std() / np.sqrt(n)
     assert error < 0.01
@@ -798,6 +637,119 @@ def test_instances(tmp_path):
         },
     }
     same_image(mi.load_dict(scene), 0.04, max_depth=4)
+
+
+def attributed_lamp(scale=1.0):
+    """A quad that emits what an attribute of its vertices says."""
+    properties = mi.Properties()
+    radiance = {"type": "mesh_attribute", "name": "vertex_glow"}
+    properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
+    properties["bsdf"] = mi.load_dict(grey(0))
+    mesh = mi.Mesh("lamp", 4, 2, has_vertex_texcoords=True, props=properties)
+    keys = mi.traverse(mesh)
+    corners = np.float32([[-0.6, 2, -0.6], [0.6, 2, -0.6], [0.6, 2, 0.6], [-0.6, 2, 0.6]])
+    keys["vertex_positions"] = corners.ravel().tolist()
+    keys["vertex_texcoords"] = [0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 1.0]
+    keys["faces"] = [0, 1, 2, 0, 2, 3]
+    keys.update()
+    glow = scale * np.array([9.0, 1.0, 1.0, 1.0, 9.0, 1.0, 1.0, 1.0, 9.0, 20.0, 20.0, 20.0])
+    mesh.add_attribute("vertex_glow", 3, glow.tolist())
+    return mesh
+
+
+def grid_lamp():
+    """A ball by signed distances, of which Mitsuba samples no point."""
+    at = np.stack(np.meshgrid(*[np.linspace(-1, 1, 9)] * 3, indexing="ij"), axis=-1)
+    distance = np.linalg.norm(at, axis=-1, keepdims=True) - 0.8
+    return {
+        "type": "sdfgrid",
+        "grid": mi.TensorXf(distance.astype(np.float32)),
+        "to_world": T().translate([-0.5, 1.2, -0.5]),
+        "bsdf": grey(0),
+        "emitter": {"type": "area", "radiance": 3.0},
+    }
+
+
+@pytest.mark.parametrize("lamp", [attributed_lamp, grid_lamp])
+def test_lamps_that_do_not_tell_their_points(lamp):
+    """Rationale: an attribute of a mesh needs the number of a face, which a sampled point lacks (`path` loses
+    all but a hundredth of the light); a grid of distances samples no point. Such lamps can only be hit.
+    Expected: beside a lamp that takes part in everything the image is the sum of what s = 0 finds alone, and
+    of the image of the other lamp alone; explain says what is skipped. Tolerance: the confidence interval,
+    below 6 %. Statistic: Welch over tiles, 10 seeds a side.
+    """
+    odd, other = {"lamp": lamp()}, {"other": EMITTERS["point"]()}
+    everything = integrator(skip="none", max_depth=3, strategy_images=True)
+    alone = render(mi.load_dict(room() | odd), everything, range(100, 110), 512)
+    hits = sum(layer(alone, everything, f"unweighted.s0t{t}") for t in (2, 3, 4))
+    assert hits.mean() > 0.01
+    dark = room() | {"lamp": {k: v for k, v in grid_lamp().items() if k != "emitter"}}
+    if lamp is attributed_lamp:
+        dark = room() | {"lamp": attributed_lamp(0.0)}
+    rest = render(mi.load_dict(dark | other), integrator(skip="none", max_depth=3), range(200, 210), 128)
+    for skip in ("none", "auto"):
+        both = render(mi.load_dict(room() | odd | other), integrator(skip=skip, max_depth=3), range(10), 512)
+        agree(tiles(both), tiles(hits + rest), 0.06)
+    text = integrator().explain(mi.load_dict(room() | odd | other))
+    assert "light subpaths of emitter" in text and "it can only be hit" in text
+
+
+def own_area_class():
+    """A user's emitter that repeats `area` on a rectangle of half size 0.6 in the plane y = 2, from above."""
+
+    class OwnArea(mi.Emitter):
+        def __init__(self, properties):
+            super().__init__(properties)
+            self.m_flags = mi.EmitterFlags.Surface
+
+        def eval(self, si, active=True):
+            return mi.Spectrum(dr.select(active & (mi.Frame3f.cos_theta(si.wi) > 0), 5.0, 0.0))
+
+        def sample_direction(self, it, sample, active=True):
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p = mi.Point3f(1.2 * sample.x - 0.6, 2, 1.2 * sample.y - 0.6)
+            ds.n, ds.time, ds.delta = mi.Normal3f(0, -1, 0), it.time, mi.Bool(False)
+            ds.d = ds.p - it.p
+            ds.dist = dr.norm(ds.d)
+            ds.d /= ds.dist
+            ds.emitter = mi.EmitterPtr(self)
+            ds.pdf = self.pdf_direction(it, ds, active)
+            return ds, mi.Spectrum(dr.select(active & (ds.pdf > 0), 5.0 / ds.pdf, 0.0))
+
+        def pdf_direction(self, it, ds, active=True):
+            cos = dr.dot(ds.d, -ds.n)
+            return dr.select(active & (cos > 0), dr.square(ds.dist) / (1.44 * cos), 0)
+
+        def sample_wavelengths(self, si, sample, active=True):
+            return mi.Color0f(), mi.Spectrum(5.0)
+
+    return OwnArea
+
+
+@pytest.mark.parametrize("height", [0.5, 2.0], ids=["near", "far"])
+def test_a_lamp_of_the_users_on_a_surface(height):
+    """Rationale: densities of s = 0 and s = 1 must be in the same measure, whatever other emitters there are
+    (a density per solid angle taken for one per area was 4 % off, by an amount that depends on the scene's
+    unit). Expected: a user's class that repeats `area` gives the image of `area` by `path`, with the floor
+    near and far. Tolerance: the confidence interval, below 3 %. Statistic: Welch over tiles.
+    """
+    mi.register_emitter("own_area", lambda properties: own_area_class()(properties))
+    lamp = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.6),
+        "bsdf": grey(0),
+    }
+    floor = T().translate([0, 2 - height, 0]).rotate([1, 0, 0], -90).scale(2)
+    base = {
+        "type": "scene",
+        "sensor": perspective(origin=(0, 2 - height / 2, 5), target=(0, 2 - height, 0), fov=30),
+        "floor": {"type": "rectangle", "to_world": floor, "bsdf": grey(0.6)},
+    }
+    theirs = mi.load_dict(base | {"lamp": lamp | {"emitter": {"type": "area", "radiance": 5.0}}})
+    ours = mi.load_dict(base | {"lamp": lamp | {"emitter": {"type": "own_area"}}})
+    a = render(ours, integrator(skip="none", max_depth=3), range(10), 512)
+    b = render(theirs, integrator("path", max_depth=3), range(100, 110), 2048)
+    agree(tiles(a), tiles(b), 0.03)
 
 
 # -- film -------------------------------------------------------------------------------------

@@ -15,8 +15,13 @@ ORDER = (
     ("connect",),
     ("subpath",),
     ("parameters",),
+    ("colour", "features"),
     ("plan", "emitters", "sensors", "points", "strategies"),
+    ("cameras", "other_sensors"),
+    ("emitter_tables", "sensor_records"),
+    ("emitter_kinds",),
     ("bsdf", "rays", "mis", "sobol"),
+    ("objects",),
     ("llvm", "_version"),
 )
 

@@ -26,18 +26,18 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
-from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensors
+from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensor_records, sensors
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coefficients, Paths
 
 # n c: all classes, kappa different from every count, and classes left out.
 COEFFICIENTS = {
-    "n1c1": Coefficients(1, 1, 1),
-    "quarter": Coefficients(0.25, 0.0625, 1),
-    "odd": Coefficients(3.7, 0.013, 42.0),
-    "n1c0": Coefficients(1, 1, 0),
-    "n1c0-half": Coefficients(0.5, 0.3, 0),
-    "n0c1": Coefficients(0, 0, 0.7),
-    "n0c0": Coefficients(0, 0, 0),
+    "n1c1": Coefficients(1, 1, 1, 1),
+    "quarter": Coefficients(0.25, 0.0625, 1, 0.25),
+    "odd": Coefficients(3.7, 0.013, 42.0, 0.21),
+    "n1c0": Coefficients(1, 1, 0, 1),
+    "n1c0-half": Coefficients(0.5, 0.3, 0, 0),
+    "n0c1": Coefficients(0, 0, 0.7, 0),
+    "n0c0": Coefficients(0, 0, 0, 0),
 }
 
 
@@ -84,7 +84,7 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
 
 
 def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
-    """Weights of all strategies by ``mis.py``, shape (n, k + 1); meaningful where in use."""
+    """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use."""
     k, h, f = paths.k, mis.Heuristic(name), mi.Float
     ratio = paths.first.astype(np.float64) * paths.second / paths.direct
     ratio /= np.where(
@@ -112,6 +112,8 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     )
     area, position = mi.Bool(paths.kind == AREA), mi.Bool(paths.kind == POSITION)
     infinite, unhittable = mi.Bool(paths.infinite), mi.Bool(paths.delta_emitter)
+    lens_pdf = f(paths.lens_pdf.astype(np.float32))
+    arrival = f(np.where(paths.lens, kappa.arrival, 0))
 
     def fold(partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, is_delta):
         # At a delta vertex the densities are unset: zeros must not get through.
@@ -128,14 +130,17 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     partial = mis.Partial(h.start(inverse), dr.select(unhittable, 0, h.start(cl[0] * inverse)))
     complete = dr.select(area, direct * cl[0], dr.select(position, direct * d2[0], direct))
     light = [None]
-    for e in range(1, k):
+    for e in range(1, k + 1):
+        before = partial
+        if e == k:
+            break
         if e == 1:
             partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
         partial = mis.arrive(h, partial, 1 if e == 1 else d2[e - 1], cc[e - 1])
         light.append(partial)
         partial = fold(partial, 1.0 if e == 1 else kappa.inner, to_camera[e], to_light[e], cl[e], delta[e])
     # Camera subpath: camera[e] at z_e = x_{k-e}.
-    partial = mis.Partial(h.start(dr.rcp(sensor)), f(0))
+    partial = mis.Partial(h.start(dr.rcp(sensor)), h.scale(h.start(cc[k - 1] / (lens_pdf * sensor)), arrival))
     camera = [None]
     for e in range(1, k + 1):
         x = k - e
@@ -158,7 +163,14 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     def of_camera(e):
         return kappa.splat if e == 1 else kappa.inner
 
-    result = [f(0)] * (k + 1)
+    result = [f(0)] * (k + 2)
+    if kappa.arrival > 0:  # t = 0 (connect.arrive)
+        if k == 1:
+            before = mis.Partial(h.scale(before.d_vcm, first), before.d_vc)
+        arrived = mis.arrive(h, before, d2[k - 1], cc[k - 1])
+        newest = kappa.endpoints if k == 1 else kappa.splat
+        light_side = mis.alternatives(h, arrived, newest, sensor, lens_pdf)
+        result[k + 1] = h.weight(kappa.arrival, light_side, f(0))
     # s = 0 (connect.hit_emitter)
     connected = dr.select(area, direct * cl[0] / d2[0], direct)
     newest = kappa.endpoints * first if k == 1 else connected
@@ -168,7 +180,8 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
         geometry = dr.select(infinite, 1, cl[0] / d2[0])
         light_side = h.start(dr.select(unhittable, 0, sensor * geometry / first))
         if kappa.endpoints > 0:
-            result[1] = h.weight(kappa.endpoints, light_side, f(0))
+            camera_side = h.scale(h.start(second * cc[0] / (d2[0] * lens_pdf)), arrival)
+            result[1] = h.weight(kappa.endpoints, light_side, camera_side)
         return columns(result, len(paths.kind))
     # s = 1 (connect.next_event)
     light_side = h.start(dr.select(unhittable, 0, to_light[1] / direct))
@@ -188,7 +201,9 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
         light_side = mis.alternatives(
             h, light[k - 1], of_light(k - 1), to_light[k - 1], sensor * cl[k - 1] / d2[k - 1]
         )
-        result[k] = h.weight(kappa.splat, light_side, f(0))
+        to_sensor = to_camera[k - 1] * cc[k - 1] / (d2[k - 1] * lens_pdf)
+        camera_side = h.scale(h.start(to_sensor), arrival)
+        result[k] = h.weight(kappa.splat, light_side, camera_side)
     return columns(result, len(paths.kind))
 
 
@@ -484,6 +499,7 @@ class Lights:
             pdf_second=self.second,
             infinite=self.infinite,
             delta=self.delta,
+            beam=mi.Bool(False),
             index=mi.UInt32(0),
             si=w.interaction(0, from_light=True),
         )
@@ -492,6 +508,14 @@ class Lights:
         return dr.select(
             self.area, self.direct * self.cos, dr.select(self.at, self.direct * self.dist2, self.direct)
         )
+
+    at_infinity = True
+
+    def covers(self, p, d):
+        return mi.Bool(True)
+
+    def direction_density(self, emission, d, active):
+        return self.second
 
     def radiance_towards(self, emission, d, active):
         return mi.Spectrum(1)
@@ -528,44 +552,60 @@ class Lights:
 
 
 class Sensor:
-    """Stand-in for `sensors.Camera`."""
+    """Stand-in for a sensor of `sensors.prepare`."""
 
-    border = 0
+    parallel = needs_film_sample = False
 
     def __init__(self, world):
         self.world, self.lens, self.delta = world, world.lens, not world.lens
-        self.density = world.f(world.paths.sensor_pdf)
-
-    def pixel(self, index):
-        return mi.Point2i(0)
+        self.needs_aperture_sample = self.lens
+        self.density, self.lens_pdf = world.f(world.paths.sensor_pdf), world.f(world.paths.lens_pdf)
+        self.cos = world.f(world.paths.cos_camera[:, -1])
+        self.dist2 = world.f(world.paths.dist2[:, -1])
 
     def start(self, pixel, u_film, u_lens, like):
         w = self.world
         ray = mi.Ray3f(w.point(w.k), w.towards(w.k, w.k - 1), mi.Float(0), mi.Color0f())
-        return sensors.CameraStart(
+        return sensor_records.CameraStart(
             ray=ray,
             p=w.point(w.k),
             pdf_w=self.density,
+            weight=mi.Float(1),
+            arrival=self.cos / (self.lens_pdf * self.density),
             position=mi.Point2f(0.5),
             counted=mi.Point2f(0.5),
         )
 
-    def join(self, p, u_lens):
+    def join(self, p, u_lens, u_film):
         w = self.world
-        return sensors.CameraJoin(
+        return sensor_records.CameraJoin(
+            p=w.point(w.k),
             anchor=rays.free_anchor(w.point(w.k)),
             d=w.towards(w.k - 1, w.k),
-            dist2=w.f(w.paths.dist2[:, -1]),
+            dist2=self.dist2,
             importance=self.density,
+            pdf_w=self.density,
+            arrival=self.cos / (self.dist2 * self.lens_pdf),
             position=mi.Point2f(0.5),
             reach=mi.Float(dr.inf),
             valid=mi.Bool(True),
         )
 
-    def join_direction(self, d, u_lens):
-        join = self.join(None, u_lens)
+    def join_direction(self, d, u_lens, u_film):
+        join = self.join(None, u_lens, u_film)
         join.dist2 = mi.Float(1)
         return join
+
+    def arrive(self, walk, vertex, distant):
+        return sensor_records.Arrival(
+            dist2=self.dist2,
+            cos=self.cos,
+            pdf_area=self.lens_pdf,
+            pdf_w=self.density,
+            importance=mi.Float(1),
+            position=mi.Point2f(0.5),
+            active=mi.Bool(self.lens),
+        )
 
 
 class Flat:
@@ -583,6 +623,10 @@ class Nothing:
     """Accepts any call: film, and points (every number is a half)."""
 
     alpha = False
+    features = None
+
+    def colour(self, value, _):
+        return mi.Color3f(value)
 
     def put_camera(self, *_):
         pass
@@ -619,6 +663,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         direct=True,
         splat=kappa.splat > 0,
         endpoints=kappa.endpoints > 0,
+        arrival=kappa.arrival > 0 and world.lens,
         light=True,
         connections="all" if kappa.inner > 0 else "none",
         served=1,
@@ -640,17 +685,19 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         rr_depth=u32(10**6),
         last_stored=u32(k - 2 if k > 2 else 0),
         last_inner=u32(k),
-        last_light=u32(k - 1),
+        last_splat=u32(k - 1),
+        last_arrival=u32(k),
+        last_light=u32(k if plan.arrival else k - 1),
         count_light=f(1),
         coefficient_splat=f(kappa.splat),
         coefficient_endpoints=f(kappa.endpoints),
         coefficient_inner=f(kappa.inner),
+        coefficient_arrival=f(kappa.arrival),
         points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
         quadrics=Flat(),
-        to_rgb=lambda value, wavelengths: mi.Color3f(value),
     )
-    result = [f(0)] * (k + 1)
+    result = [f(0)] * (k + 2)
     stored = []
 
     def record(function, edges_of):
@@ -680,6 +727,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         (connect.next_event, lambda z, *_: (1, edges(z) + 1)),
         (connect.join_endpoints, lambda *_: (1, 1)),
         (connect.splat, lambda y, *_: (edges(y) + 1, edges(y) + 1)),
+        (connect.arrive, lambda e, y, walk: (edges(walk) + 1, edges(walk))),
         (connect.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),
     ):
         monkeypatch.setattr(connect, function.__name__, record(function, edges_of))
@@ -689,10 +737,10 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     monkeypatch.setattr(connect, "sees_emitter", lambda kernel_, z: z.active)
     monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))
 
-    shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     counters = kernel.Counters(*(u32(0) for _ in kernel.Counters.__dataclass_fields__))
     scene.begin(from_light=True)
-    monkeypatch.setattr(dr, "while_loop", python_loop(k - 1))
+    monkeypatch.setattr(dr, "while_loop", python_loop(k if plan.arrival else k - 1))
     path, counters = kernel._light_subpath(k_, Nothing(), k_.points.stream(), shared, None, counters)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
@@ -811,7 +859,7 @@ def test_densities_of_emission_are_those_of_hits(name):
     scene, n = real_scene(name), 4096
     assert scene.shapes()  # as a render does first: it decides of which Python class they are
     lights = emitters.Emitters(scene)
-    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(n)
 
     def pair():
@@ -865,17 +913,17 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
             **more,
         }
     )
-    camera = sensors.Camera(sensor)
-    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1))
+    camera = sensors.prepare(sensor, rays.Quadrics(mi.load_dict({"type": "scene"})))
+    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(4096)
     u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]
     width, height = (int(x) for x in sensor.film().crop_size())
     index = mi.UInt32(u[2].x * (width * height - 1))
-    start = camera.start(camera.pixel(index), u[0], u[1], like)
-    join = camera.join(start.p + start.ray.d * (0.5 + 5 * u[2].y), u[1])
+    start = camera.start(camera.region.pixel(index), u[0], u[1], like)
+    join = camera.join(start.p + start.ray.d * (0.5 + 5 * u[2].y), u[1], None)
     everything = mi.Bool(np.ones(4096, dtype=bool))
     inside = np.array(join.valid)
     assert inside.mean() > 0.999  # rounding may move a ray over the film's edge
-    assert relative_gap(join.importance, start.pdf_w, everything).max() < 1e-4
+    assert relative_gap(join.pdf_w, start.pdf_w, everything).max() < 1e-4
     assert dr.max(dr.norm(join.d + start.ray.d)) < 1e-4
     assert np.abs(np.array(join.position) - np.array(start.position)).max() < 0.01

@@ -6,6 +6,7 @@ exact pixel values for light that is seen directly. Where noise decides, the sta
 
 import json
 import os
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -111,7 +112,7 @@ def image(bdpt, scene, **keywords):
         ({"strategy_images": "yes"}, "strategy_images='yes'"),
         ({"max_deph": 3}, "max_deph=3 is not a parameter; did you mean max_depth.*rr_depth"),
         ({"samples_per_pass": 3}, "samples_per_pass=3.*use spp_per_pass"),
-        ({"aovs": "dd:depth"}, "aovs is not supported yet"),
+        ({"decisions": "[]"}, "decisions is not supported yet"),
         ({"light_paths": "1/"}, "light_paths='1/'.*1/16"),
         ({"light_paths": "nan"}, "light_paths='nan'"),
     ],
@@ -627,12 +628,51 @@ def test_explain():
     assert "lost: " in integrator(light_paths=0).explain(glass)
 
 
+BEAM = {"type": "rectangle", "emitter": {"type": "directionalarea", "radiance": 1.0}}
+GLASS_LAMP = {"type": "point"}
+METER = {"type": "rectangle"}
+
+
+@pytest.mark.parametrize(
+    "lamp, area, parameters, expected",
+    [
+        (GLASS_LAMP, False, {}, ["no two neighbours can be joined"]),
+        (GLASS_LAMP, False, {"light_paths": 0}, ["needs t=1", "needs inner", "no two neighbours"]),
+        (GLASS_LAMP, False, {"connections": "none"}, ["needs inner", "no two neighbours"]),
+        (GLASS_LAMP, True, {}, []),
+        (GLASS_LAMP, True, {"stored_vertices": 4}, ["longer than 4 edges"]),
+        (GLASS_LAMP, True, {"light_paths": 0}, ["needs t=1", "needs inner", "no two", "needs t=0"]),
+        (BEAM, False, {}, []),
+        (BEAM, False, {"light_paths": 0}, ["directionalarea.*needs t=1", "directionalarea.*needs inner"]),
+        (BEAM, False, {"connections": "none"}, ["directionalarea.*needs inner"]),
+        (BEAM, True, {"light_paths": 0}, ["needs t=1", "needs inner", "directionalarea, sensor .needs t=0"]),
+    ],
+)
+def test_explain_says_what_is_lost(lamp, area, parameters, expected):
+    """Expected: a line for each sort of path that no strategy in use can make, and no other. A glass ball
+    stands beside a lamp; the directional area, which no camera ray finds, has no glass."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    eye = (
+        {"meter": METER | {"sensor": {"type": "irradiancemeter", "film": film}}}
+        if area
+        else {"eye": sensor()}
+    )
+    ball = {"type": "sphere", "bsdf": {"type": "dielectric"} if lamp is GLASS_LAMP else diffuse()}
+    wall = {"type": "sphere", "radius": 3, "bsdf": diffuse()}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, "ball": ball, "wall": wall, **eye})
+    text = integrator(max_depth=32, **parameters).explain(scene)
+    lost = [line for line in text.splitlines() if line.startswith("lost: ")]
+    assert len(lost) == len(expected), text
+    for line, pattern in zip(lost, expected, strict=True):
+        assert re.search(pattern, line), text
+
+
 # -- strategy images --------------------------------------------------------------------------
 
 
 def test_strategy_images_name_every_strategy():
-    """Expected: weighted and unweighted RGB layers for each (s, t) with t >= 1 up to max_depth, in the
-    film and in aov_names(); weighted ones add up to the image (1e-4).
+    """Expected: weighted and unweighted RGB layers for each (s, t) up to max_depth, k + 2 of each length
+    k, in the film and in aov_names(); weighted ones add up to the image (1e-4).
     """
     bdpt = integrator(max_depth=3, strategy_images=True, skip="none")
     names = bdpt.aov_names()
@@ -640,7 +680,7 @@ def test_strategy_images_name_every_strategy():
         f"{kind}.s{s}t{k + 1 - s}.{c}"
         for kind in ("weighted", "unweighted")
         for k in (1, 2, 3)
-        for s in range(k + 1)
+        for s in range(k + 2)
         for c in "RGB"
     }
     assert set(names) == expected and len(names) == len(expected)
@@ -683,38 +723,70 @@ def test_scenes_that_are_refused():
         bdpt.render(empty)
 
 
-@pytest.mark.parametrize(
-    "emitter, kind",
-    [
-        ({"type": "projector", "irradiance": 1.0}, "Projector"),
-        ({"type": "sunsky"}, "SunskyEmitter"),
-        (
-            {"type": "rectangle", "emitter": {"type": "directionalarea", "radiance": 1.0}},
-            "DirectionalArea",
-        ),
-    ],
-    ids=["projector", "sunsky", "directionalarea"],
-)
-def test_unsupported_emitters_are_refused(emitter, kind):
-    """Expected: the kind and the supported ones are named. (Run on its own scene: a living
-    directionalarea breaks calls to other emitters in Mitsuba, so it is deleted at once.)
-    """
-    import gc
-
-    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "lamp": emitter})
-    with pytest.raises(NotImplementedError, match=f"{kind} is not supported.*area, point, spot"):
-        integrator().render(scene)
-    del scene
-    gc.collect()
+def curve(folder):
+    """A file of one B-spline curve."""
+    file = folder / "curve.txt"
+    file.write_text("".join(f"{x} 0 0 0.1\n" for x in range(5)))
+    return {"type": "bsplinecurve", "filename": str(file)}
 
 
-@pytest.mark.parametrize("kind", ["orthographic", "radiancemeter", "distant"])
-def test_unsupported_sensors_are_refused(kind):
-    """Expected: the kind and the supported ones are named."""
-    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    scene = mi.load_dict({"type": "scene", "sensor": {"type": kind, "film": film}, "lamp": {"type": "point"}})
-    with pytest.raises(NotImplementedError, match="not supported.*perspective and thinlens"):
-        integrator().render(scene)
+def meter_on(shape, **film):
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}} | film
+    return shape | {"sensor": {"type": "irradiancemeter", "film": film}}
+
+
+AREA_LIGHT = {"type": "area", "radiance": 1.0}
+CHECKS = {"type": "area", "radiance": {"type": "checkerboard"}}
+GAUSSIAN = {"rfilter": {"type": "gaussian"}, "sample_border": True}
+STRETCHED = mi.ScalarTransform4f().scale([1, 2, 1])
+REFUSED_PARTS = {
+    "curve lamp": (
+        lambda folder: {"lamp": curve(folder) | {"emitter": AREA_LIGHT}},
+        "emitter '.*' is on a curve .*use a cylinder or a mesh",
+    ),
+    "texture beside curve": (
+        lambda folder: {"lamp": {"type": "cylinder", "emitter": CHECKS}, "curve": curve(folder)},
+        "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
+    ),
+    "projector": (
+        lambda _: {"lamp": {"type": "projector", "to_world": STRETCHED}},
+        "to_world of projector 'lamp' distorts angles .*1, 2, 1.*set fov instead",
+    ),
+    "sunsky": (
+        lambda _: {"lamp": {"type": "sunsky", "to_world": STRETCHED}},
+        "to_world of sunsky 'lamp' is not a rotation .*leave out scaling",
+    ),
+    "batch border": (
+        lambda _: {
+            "eye": {"type": "batch", "film": {"type": "hdrfilm"} | GAUSSIAN, "a": {"type": "perspective"}}
+        },
+        "film of batch sensor 'eye' has sample_border.*set it to false",
+    ),
+    "meter border": (
+        lambda _: {"meter": meter_on({"type": "disk"}, **GAUSSIAN)},
+        "irradiance meter '.*' has sample_border.*set it to false",
+    ),
+    "meter on a grid": (
+        lambda _: {
+            "meter": meter_on({"type": "sdfgrid", "grid": mi.TensorXf(np.arange(-3, 5).reshape(2, 2, 2, 1))})
+        },
+        "irradiance meter '.*' is on a SDFGrid.*put it on another shape",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED_PARTS)
+def test_endpoints_that_are_refused(name, tmp_path):
+    """Expected: one sentence that names the object, what is wrong and what to do, before anything is
+    rendered."""
+    make, message = REFUSED_PARTS[name]
+    made = make(tmp_path)
+    scene = {"type": "scene", **made}
+    if name not in ("batch border", "meter border", "meter on a grid"):
+        scene["eye"] = sensor()
+    scene = mi.load_dict(scene)
+    with pytest.raises((NotImplementedError, ValueError), match=message):
+        integrator().render(scene, spp=1)
 
 
 def test_derivatives_are_refused():

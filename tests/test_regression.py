@@ -1,9 +1,10 @@
-"""Mitsuba's own render-regression scenes, by Mitsuba's rule with our own variance.
+"""Mitsuba's own render-regression scenes in its three colour modes, by Mitsuba's rule with our own variance.
 
 The data belong to the Mitsuba project and stay out of this one: they are read from
 ``../shared/regression``, or from the folder that ``MITSUBA_DATA`` names (that of ``tests/scenes``).
 """
 
+import itertools
 import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -16,14 +17,17 @@ from scipy import stats
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("MITSUBA_DATA") or ROOT.parent / "shared" / "regression")
 
-# Those with a perspective sensor and no projector.
 SCENES = [
     "bsdf_spheres/test_pointlight_path",
     "bsdf_spheres/test_arealight_path",
     "bsdf_spheres/test_constant_path",
     "floating_sphere/test_directional_direct",
+    "orthographic_sensor/test_orthographic_path",
+    "projector/test_projector_constant_direct",
+    "projector/test_projector_textured_direct",
     "spot_light/test_spot_direct",
 ]
+COLOURS = ["rgb", "mono", "spectral"]  # each has references of its own
 SAMPLES = 2e6  # per scene, as in Mitsuba's test
 REFERENCE_SPP = 32_000
 # The references' conversion between colour spaces: white is (0.95075, 1, 1.08846) in them where it
@@ -55,10 +59,17 @@ def xyz(bitmap) -> np.ndarray:
     return np.array(converted, dtype=np.float64)
 
 
-def reference(path: Path):
+def xyz_of_render(image) -> np.ndarray:
+    """As `xyz`; in a monochromatic variant, where images have one channel, X = Y = Z."""
+    if mi.is_monochromatic:
+        return np.repeat(np.array(image, dtype=np.float64)[..., :1], 3, axis=2)
+    return xyz(mi.Bitmap(image[..., :3]))
+
+
+def reference(path: Path, colour: str):
     """Mean and variance of a sample of Mitsuba's ``path``."""
     kind = path.stem.rpartition("_")[0]  # test_spot_direct -> test_spot
-    stem = path.parent / "refs" / f"{kind}_ref_rgb"
+    stem = path.parent / "refs" / f"{kind}_ref_{colour}"
     return xyz(mi.Bitmap(f"{stem}.exr")), xyz(mi.Bitmap(f"{stem}_var.exr"))
 
 
@@ -68,10 +79,18 @@ def test_depths_are_found():
     assert set(depths.values()) == {2}
 
 
-@pytest.mark.parametrize("skip", ["none", "auto"])
-@pytest.mark.parametrize("name", SCENES)
-def test_image_is_mitsubas(name, skip):
-    """Our image equals the reference that Mitsuba ships.
+def cases():
+    """Every scene, colour mode and choice of skipping; by default one of the two choices for each image."""
+    product = itertools.product(enumerate(SCENES), enumerate(COLOURS), enumerate(("none", "auto")))
+    return [
+        pytest.param(name, colour, skip, marks=[] if (i + j + k) % 2 else [pytest.mark.slow])
+        for (i, name), (j, colour), (k, skip) in product
+    ]
+
+
+@pytest.mark.parametrize("name, colour, skip", cases())
+def test_image_is_mitsubas(name, colour, skip):
+    """Our image equals the reference that Mitsuba ships for the colour mode.
 
     Rationale: images made by others, on scenes with textures, masks, rough glass, meshes. Expected:
     at least 99.75 % of the values pass, and the image's mean is within 4.5 sigma (plus 5e-4 for the
@@ -82,16 +101,17 @@ def test_image_is_mitsubas(name, skip):
     2e6 samples in total; with 5e5 the rare splats of (1,1) from the sky, 6 % of a pixel each, are too
     few for Student's t. The floor of 1e-4 hides biases below 1 % in dark pixels; the mean does not.
     """
+    mi.set_variant(f"llvm_ad_{colour}")
     path = DATA / "tests" / "scenes" / f"{name}.xml"
     scene = mi.load_file(str(path))
-    ref, ref_variance = reference(path)
+    ref, ref_variance = reference(path, colour)
     pixels = ref.shape[0] * ref.shape[1]
     spp = int(np.ceil(SAMPLES / pixels / SEEDS))
     integrator = mi.load_dict({"type": "bdpt", "max_depth": max_depth(path), "skip": skip})
     images = []
     for seed in range(SEEDS):
         image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
-        images.append(xyz(mi.Bitmap(image[..., :3])))
+        images.append(xyz_of_render(image))
     images = np.stack(images)
     mean, variance = images.mean(0), images.var(0, ddof=1)
     error = np.sqrt(variance / SEEDS + np.maximum(ref_variance, 0) / REFERENCE_SPP + 1e-4 / (spp * SEEDS))
@@ -106,7 +126,7 @@ def test_image_is_mitsubas(name, skip):
     off = np.maximum(gap, 0) / sigma
     relative = own.mean(0) / ref.mean((0, 1)) - 1
     report = (
-        f"{name}, skip={skip}: {passed:.4%} of values pass, mean off by {off.round(2)} sigma, "
+        f"{name}, {colour}, skip={skip}: {passed:.4%} of values pass, mean off by {off.round(2)} sigma, "
         f"relative {relative.round(5)}"
     )
     assert passed >= 0.9975, report

@@ -140,6 +140,25 @@ def test_aovs_are_kept_beside_the_image(scene):
     assert np.array(mi.Bitmap("aov.png")).shape == (4, 6, 3)
 
 
+def test_a_spectral_film_is_shown_in_grey(scene):
+    """Expected: the EXR holds the bands (radiance 2 times the integral 50 of each response, exactly, for
+    they are equal) and the features by name, the PNG, whose units nobody knows, is white."""
+    band = '<spectrum name="{}" value="500:0, 550:1, 600:0"/>'
+    scene.write_text(
+        SCENE.replace("hdrfilm", "specfilm")
+        .replace("</film>", "".join(band.format(name) for name in ("one", "three", "two")) + "</film>")
+        .replace('<rgb name="radiance" value="$light"/>', '<spectrum name="radiance" value="400:2, 700:2"/>')
+    )
+    arguments = ["-m", "llvm_ad_spectral", "-Dintegrator=bdpt", "-P", "aovs=dd:depth", "-o", "a.exr"]
+    arguments += ["-P", "light_paths=0"]  # the sky seen by splats has noise
+    assert main(["render", str(scene), *arguments]) == 0
+    channels = OpenEXR.File("a.exr", separate_channels=True).channels()
+    assert set(channels) == {"one", "two", "three", "dd.T"}
+    for name in ("one", "two", "three"):
+        np.testing.assert_allclose(channels[name].pixels, 100, rtol=1e-3)
+    assert np.all(np.array(mi.Bitmap("a.png")) == 255)
+
+
 def test_another_integrator_keeps_depth_and_takes_properties(scene):
     arguments = ["--integrator", "cli_passes", "-P", "stop_after=2", "-P", "mode=one"]
     arguments += ["-P", "share=0.5", "-P", "fast=true", "--time", "30", "--seed", "3"]

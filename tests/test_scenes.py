@@ -6,6 +6,7 @@ import make_meshes
 import make_textures
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 
+import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np
 import pytest
@@ -28,7 +29,15 @@ LAMPS = {
     "ring_caustic": [(0.802, -0.422, 0.422)],
     "smallvcm_cornell_lamp": [(0, 0, -1)],
 }
-CLOSED_ROOMS = ["uplight_room", "lamp_behind_glass", "ajar_door", "pool", "furnace_point", "furnace_emission"]
+CLOSED_ROOMS = [
+    "uplight_room",
+    "lamp_behind_glass",
+    "projector_through_glass",
+    "ajar_door",
+    "pool",
+    "furnace_point",
+    "furnace_emission",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -132,10 +141,49 @@ def test_cornell_box_is_the_one_of_mitsuba():
     assert np.abs(images[0] - images[1]).mean() < 2e-3 * images[1].mean()
 
 
-def test_lamp_behind_glass_is_black_under_path():
-    """Every light path starts at a point inside glass, so `path` finds exactly nothing."""
-    image = np.array(mi.render(load("lamp_behind_glass", resolution=32), spp=16))
+@pytest.mark.parametrize("name", ["lamp_behind_glass", "projector_through_glass"])
+def test_delta_lamps_behind_glass_are_black_under_path(name):
+    """Every light path starts at a point and goes through glass, so `path` finds exactly nothing."""
+    image = np.array(mi.render(load(name, resolution=32), spp=16))
     assert (image == 0).all()
+
+
+def test_projector_shines_through_its_ball_only():
+    """Rays from the projector to the corners of its picture (field of view 15 degrees) meet glass first, so
+    that nothing but glass passes its light on."""
+    scene = load("projector_through_glass")
+    reach = np.tan(np.deg2rad(7.5))
+    corners = np.array([(x, y, -1.0) for x in (-reach, 0, reach) for y in (-reach, 0, reach)], np.float32)
+    ray = mi.Ray3f(mi.Point3f(0, 1, 1.2), dr.normalize(mi.Vector3f(corners.T)))
+    si = scene.ray_intersect(ray)
+    assert np.array(si.is_valid()).all()
+    assert all("Dielectric" in str(si.bsdf()[i]) for i in range(len(corners)))
+
+
+def test_projector_shows_its_slide_upside_down():
+    """The ball turns the picture: the slide's upper left (red), as the projector throws it, is on the lower
+    right of the wall as seen from the projector, and so on.
+
+    Statistic: at the middles of the quarters on the wall, the largest channel of t = 1 and all else, 64 spp.
+    Expected: blue or green above, red or orange below (the channels differ by 2 and more).
+    """
+    scene = load("projector_through_glass", integrator="bdpt", max_depth=4, resolution=64)
+    image = np.array(mi.render(scene, spp=64))
+    sensor = scene.sensors()[0]
+    above, below = [], []
+    for y, found in ((1.25, above), (0.75, below)):
+        for x in (-0.25, 0.25):
+            ds, _ = sensor.sample_direction(_point(x, y, -2.5), mi.Point2f(0.5))
+            column, row = (int(v) for v in (ds.uv.x[0], ds.uv.y[0]))
+            found.append(image[row - 1 : row + 2, column - 1 : column + 2].mean((0, 1)))
+    assert all(rgb[0] < 0.7 * rgb[1:].max() for rgb in above)
+    assert all(rgb[0] > 1.3 * rgb[2] for rgb in below)
+
+
+def _point(x, y, z):
+    it = dr.zeros(mi.Interaction3f)
+    it.p = mi.Point3f(x, y, z)
+    return it
 
 
 @pytest.mark.parametrize("name", ["furnace_point", "furnace_emission", "furnace_white"])

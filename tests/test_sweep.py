@@ -207,9 +207,12 @@ def test_references_go_on_where_they_stopped(folder):
 
 def test_a_better_reference_stays(folder):
     """Rationale: the sums behind the stored references are not in the repository. Expected: with the sums
-    gone, what a short run gives does not replace the stored one; with enough time a new one does.
+    gone, and made by something else than now, so that a run begins anew, what a short run gives does not
+    replace the stored one; with enough time a new one does.
     """
-    stored, _ = reference.make(job(2))
+    made, _ = reference.make(job(2))
+    stored = replace(made, provenance=made.provenance | {"sampler": "another"})
+    reference.write(reference.reference_path("cornell_box", 8, 2), stored)
     for sums in reference.SUMS.glob("*.npz"):
         sums.unlink()
     kept, reached = reference.make(job(2, seconds=0))
@@ -283,6 +286,31 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch
     monkeypatch.setattr(sweep, "measure", lambda b, c: rendered.append(c.key) or measure(b, c))
     assert sweep.main() == 0 and rendered == [table[3]["key"]]
     assert len(pyarrow.parquet.read_table(output / "rows.parquet")) == 8
+
+
+def test_one_scene_of_a_preset_anew(folder, monkeypatch):
+    """Expected: with --scenes the rows of other scenes stay as they are, in the preset's order, though their
+    cells are gone; a scene that the preset lacks is named before anything is rendered.
+    """
+    reference.make(job(3))
+    reference.make(reference.Job("furnace_emission", 8, 3))
+    text = PRESET.replace('["cornell_box"]', '["cornell_box", "furnace_emission"]')
+    path, output = preset_file(folder, text), folder / "out"
+    arguments = ["sweep.py", str(path), "-o", str(output)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert sweep.main() == 0
+    before = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+    for file in (output / "cells").iterdir():
+        file.unlink()
+    monkeypatch.setattr(sys, "argv", [*arguments, "--scenes", "furnace_emission"])
+    assert sweep.main() == 0
+    after = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+    assert [row["key"] for row in after] == [row["key"] for row in before]
+    kept = [row["scene"] == "cornell_box" for row in before]
+    assert [a == b for a, b in zip(after, before, strict=True)] == kept and not all(kept) and any(kept)
+    monkeypatch.setattr(sys, "argv", [*arguments, "--scenes", "pool"])
+    with pytest.raises(ValueError, match="--scenes pool: not in the preset, which has cornell_box, furn"):
+        sweep.main()
 
 
 class Clock(sweep.Bench):

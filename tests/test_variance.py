@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import integrator as module
 from mitsuba_bdpt.film import Replicates
-from mitsuba_bdpt.sensors import Camera
+from mitsuba_bdpt.rays import Quadrics
+from mitsuba_bdpt.sensors import prepare
 
 
 def scene(rfilter="box", width=12, sampler="independent"):
@@ -97,7 +98,8 @@ def test_schedule_of_replicates():
     """Expected: eight parts that differ by one sample at most, each counted from 0, the first pass
     of all with one sample for the scale of roulette; without `variance` one part.
     """
-    settings, camera = bdpt().settings, Camera(scene().sensors()[0])
+    target = scene()
+    settings, camera = bdpt().settings, prepare(target.sensors()[0], Quadrics(target))
     steps = module.schedule(camera, 19, settings)
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
     assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)

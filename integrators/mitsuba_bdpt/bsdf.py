@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .objects import children
+
 # Plugins whose sample() returns the density of the lobe that was picked, not that of pdf().
 # Plugins that are not Mitsuba's own are treated like them.
 _SAMPLED_PDF_IS_PDF = frozenset(
@@ -213,17 +215,7 @@ def needs_round_trip(bsdfs) -> bool:
 
 def nested(bsdfs):
     """``bsdfs`` and every BSDF inside them (two-sided, mask, blend, bump and normal maps)."""
-    found = []
-
-    class Collect(mi.TraversalCallback):
-        def put(self, name, value, flags, cpptype=None):
-            if isinstance(value, mi.BSDF):
-                visit(value)
-
-    def visit(bsdf):
-        found.append(bsdf)
-        bsdf.traverse(Collect())
-
-    for bsdf in bsdfs:
-        visit(bsdf)
+    found = list(bsdfs)
+    for bsdf in found:  # grows on the way
+        found += [value for value in children(bsdf).values() if isinstance(value, mi.BSDF)]
     return found

@@ -121,10 +121,13 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     active &= ~bsdf.is_zero(radiance)
     connect, first, second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
-    newest = dr.select(directly, kernel.coefficient_endpoints, NEXT_EVENT) * dr.select(
-        directly, first, connect
-    )
+    endpoints = kernel.coefficient_endpoints * first
+    if kernel.camera.parallel:  # (1,1) would need just this direction
+        endpoints = dr.select(z.hit, endpoints, 0)
+    newest = dr.select(directly, endpoints, NEXT_EVENT * connect)
     older = dr.select(kernel.within_store(z.edges), first * second, 0)
+    if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
+        older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
@@ -174,10 +177,13 @@ def join_endpoints(kernel, emission, stream, counters, active):
     Returns the `Contribution` and the film position.
     """
     h = kernel.heuristic
-    u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS)
-    finite = kernel.camera.join(emission.si.p, u_lens)
-    join = dr.select(emission.infinite, kernel.camera.join_direction(emission.d, u_lens), finite)
-    active &= join.valid
+    u = _sensor_points(kernel, stream)
+    join = kernel.camera.join(emission.si.p, *u)
+    if kernel.camera.parallel:
+        active &= ~emission.infinite  # measure zero
+    else:
+        join = dr.select(emission.infinite, kernel.camera.join_direction(emission.d, *u), join)
+    active &= join.valid & (emission.pdf_first > 0) & ~emission.beam
     if kernel.camera.delta:
         active &= ~emission.delta  # measure zero: `path` sees nothing either
     radiance = kernel.emitters.radiance_towards(emission, join.d, active)
@@ -186,9 +192,15 @@ def join_endpoints(kernel, emission, stream, counters, active):
     value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
     active &= ~bsdf.is_zero(value)
     # s = 0: the camera hits the same point.
-    ratio = join.importance * geometry / emission.pdf_first
+    ratio = join.pdf_w * geometry / emission.pdf_first
     light_side = h.start(dr.select(emission.delta, 0, ratio))
-    weight = h.weight(kernel.coefficient_endpoints, light_side, mi.Float(0))
+    camera_side = mi.Float(0)
+    if kernel.plan.arrival:
+        towards = kernel.emitters.direction_density(emission, join.d, active)
+        covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
+        towards = dr.select(covered, towards, 0)
+        camera_side = h.scale(h.start(towards * join.arrival), kernel.coefficient_arrival)
+    weight = h.weight(kernel.coefficient_endpoints, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
@@ -207,9 +219,8 @@ def splat(kernel, y: Vertex, stream, counters):
     Returns the `Contribution` and the film position.
     """
     h, scene = kernel.heuristic, kernel.scene
-    active = y.hit & bsdf.connectible(y.bsdf)
-    u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, y.edges)
-    join = kernel.camera.join(y.si.p, u_lens)
+    active = y.hit & bsdf.connectible(y.bsdf) & (y.edges <= kernel.last_splat)
+    join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.edges))
     active &= join.valid
     if kernel.plan.hide_emitters:
         active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)
@@ -222,8 +233,11 @@ def splat(kernel, y: Vertex, stream, counters):
     active &= ~bsdf.is_zero(value)
 
     newest = newest_coefficient(kernel, NEXT_EVENT, y.edges)
-    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.importance * to_area)
-    weight = h.weight(kernel.coefficient_splat, light_side, mi.Float(0))
+    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
+    camera_side = mi.Float(0)
+    if kernel.plan.arrival:
+        camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.coefficient_arrival)
+    weight = h.weight(kernel.coefficient_splat, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
@@ -238,6 +252,36 @@ def splat(kernel, y: Vertex, stream, counters):
         active &= ~rays.occluded(scene, ray, active)
     c.value, c.active = value / survival, active
     return c, join.position
+
+
+def arrive(kernel, emission, y: Vertex, walk):
+    """t = 0: the last edge of a light subpath hits the sensor.
+
+    ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
+    are those of the scene's surface behind. Returns the `Contribution` and the film position.
+    """
+    h = kernel.heuristic
+    directly = walk.edges == 1
+    z = kernel.camera.arrive(walk, y, emission.infinite & directly)
+    active = z.active & (walk.edges <= kernel.last_arrival)
+    if kernel.plan.hide_emitters:
+        active &= walk.seen
+    value = walk.throughput * (z.importance * dr.rcp(kernel.count_light))
+    active &= ~bsdf.is_zero(value)
+
+    # (1,1) makes y_0 by emission, not by next-event estimation from z_0, and cannot make that of a beam.
+    completing = dr.select(emission.beam, 0, emission.pdf_first)
+    before = mis.Partial(h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)), walk.partial.d_vc)
+    dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
+    partial = mis.arrive(h, before, dist2, z.cos)
+    newest = dr.select(directly, kernel.coefficient_endpoints, kernel.coefficient_splat)
+    light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
+    weight = h.weight(kernel.coefficient_arrival, light_side, mi.Float(0))
+    active &= _counts(kernel, weight)
+    if z.surroundings is not None and kernel.emitters.at_infinity:
+        asked = active & emission.infinite & directly
+        active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
+    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active), z.position
 
 
 def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
@@ -356,6 +400,14 @@ def _candidates(kernel, z: Vertex, path: LightPath):
     most `Kernel.last_inner` edges."""
     possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)
+
+
+def _sensor_points(kernel, stream, edges=0):
+    """The random points with which the light vertex ``edges`` is joined with the sensor."""
+    u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, edges)
+    if not kernel.camera.needs_film_sample:
+        return u_lens, None
+    return u_lens, kernel.points.draw_2d("light", stream, Purpose.FILM, edges)
 
 
 def _roulette(kernel, value, u, active, counters):

@@ -1,4 +1,4 @@
-"""Light endpoints: the only file that knows kinds of emitters.
+"""Light endpoints: how each kind of emitter is sampled.
 
 Mitsuba's emitters offer no density of ``sample_ray``, throw in ``pdf_position`` and are wrong in
 places (a rotated ``envmap`` emits from the wrong disk), so emission is sampled here, by formulas of
@@ -9,8 +9,9 @@ Densities of an emission are two factors, in this order:
 
 * ``pdf_first`` of y_0: area measure on a surface; 1 for a point light (times its selection);
   solid angle of the direction for an emitter at infinity (1 for a directional one).
-* ``pdf_second`` of y_1 given y_0: solid angle; for an emitter at infinity the area density on the
-  disk perpendicular to the direction that covers the scene, 1 / (pi R^2).
+* ``pdf_second`` of y_1 given y_0: solid angle (1 for the fixed direction of a directional area); for an
+  emitter at infinity the area density on the disk perpendicular to the direction that covers the scene,
+  1 / (pi R^2).
 
 Next-event estimation has its own density of y_0, which depends on the vertex that is lit (cones of
 spheres, d^2/cos, environments).
@@ -22,25 +23,29 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from . import rays
-
-AREA, POINT, SPOT, INFINITE, DIRECTIONAL = range(5)
-
-# Shapes whose textured radiance Mitsuba samples rightly. On a cylinder the points have other densities than
-# stated (0.4 to 1.6 times), on a mesh all faces with the same texture coordinates share one density but
-# only one face is sampled (a cube: a sixth).
-_TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
-
-_KINDS = {
-    "AreaLight": AREA,
-    "PointLight": POINT,
-    "SpotLight": SPOT,
-    "DirectionalEmitter": DIRECTIONAL,
-    "ConstantBackgroundEmitter": INFINITE,
-    "EnvironmentMapEmitter": INFINITE,
-}
+from .emitter_kinds import (
+    AREA,
+    DIRECTIONAL,
+    DIRECTIONAL_AREA,
+    INFINITE,
+    POSITIONS,
+    PROJECTOR,
+    UNKNOWN,
+    UNSAMPLED,
+    is_hittable,
+    is_lit_directly,
+    is_sampled_by_texture,
+    is_textured,
+    is_traced,
+    kind_of,
+    left_out,
+    needs_evaluation,
+    refuse_curves,
+)
+from .emitter_tables import Placement, Projectors, SmoothMeshes, bounds, inverse_table, placement
+from .objects import children, number
 
 
 @dataclass
@@ -50,8 +55,9 @@ class Emission:
     ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start
     of the ray, with position and geometric normal of y_0 (zero unless on a surface);
     ``cos`` geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the module;
-    ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``index`` of the emitter;
-    ``si`` the emitting point for Mitsuba's calls.
+    ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``beam`` mask: ``d`` is the only
+    direction that leaves y_0, so that nothing can be joined with y_0; ``index`` of the emitter; ``si`` the
+    emitting point for Mitsuba's calls.
     """
 
     weight: object
@@ -62,6 +68,7 @@ class Emission:
     pdf_second: object
     infinite: object
     delta: object
+    beam: object
     index: object
     si: object
 
@@ -89,64 +96,86 @@ class Direct:
 class Emitters:
     """The scene's emitters as tables that a kernel can index.
 
-    Built anew for each render, so that edits of the scene count. Raises ``NotImplementedError`` for
-    kinds that cannot take part yet.
+    Built anew for each render, so that edits of the scene count. Raises ``ValueError`` and
+    ``NotImplementedError`` for emitters of which Mitsuba's own calls contradict each other.
+
+    What the scene's ``count`` emitters of the ``kinds`` can do, decided from all of them: ``hittable``,
+    ``direct``, ``traced``, ``joinable``: camera subpaths can hit one, next-event estimation can choose one,
+    light subpaths can start from one, one of these points can be joined with a sensor; ``unhittable``: one
+    cannot be hit; ``finite_hittable``: one that can be hit and joined is not at infinity; ``on_shapes``: one
+    is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: one can be reached only
+    by the light subpaths that it starts; ``evaluated``: kernels that call one have to be recorded without
+    symbolic loops, calls and branches. ``left_out``: what single ones cannot take part in, and why.
+    ``center`` and ``radius`` of a sphere about all shapes; ``quadrics`` of the scene, for rays.
     """
 
     def __init__(self, scene):
         self.scene = scene
         self.quadrics = rays.Quadrics(scene)
         emitters = scene.emitters()
-        kinds = [_kind(e) for e in emitters]
+        kinds = [kind_of(e) for e in emitters]
         self.kinds = frozenset(kinds)
         self.count = len(kinds)
-        self.hittable = bool(self.kinds & {AREA, INFINITE})
-        self.delta = bool(self.kinds - {AREA, INFINITE})
+        hittable = [is_hittable(e, k) for e, k in zip(emitters, kinds, strict=True)]
+        self.hittable, self.unhittable = any(hittable), not all(hittable)
+        self.direct = any(is_lit_directly(k) for k in kinds)
+        self.traced = any(is_traced(k) for k in kinds)
+        self.joinable = any(is_traced(k) and is_lit_directly(k) for k in kinds)
+        self.finite_hittable = AREA in self.kinds
+        self.on_shapes = any(e.get_shape() is not None for e in emitters)
+        self.beams = DIRECTIONAL_AREA in self.kinds
+        self.at_infinity = bool(self.kinds & {INFINITE, DIRECTIONAL})
+        self.evaluated = any(needs_evaluation(e) for e in emitters)
+        self.left_out = [text for e, k in zip(emitters, kinds, strict=True) for text in left_out(e, k)]
         if not kinds:
             return
-        self._kind = mi.UInt32(kinds)
         self._pointers = scene.emitters_dr()
-        sampling_weight = self._pointers.sampling_weight()
-        pmf = sampling_weight / dr.sum(sampling_weight)
-        area = mi.Float(
-            [
-                dr.slice(e.get_shape().surface_area()) if k == AREA else 1.0
-                for e, k in zip(emitters, kinds, strict=True)
-            ]
-        )
-        placements = [_placement(e, k) for e, k in zip(emitters, kinds, strict=True)]
-        bounds = _bounds(scene)
-        sphere = bounds.bounding_sphere() if bounds.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
-        # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
-        radius = max(float(sphere.radius) * (1 + 1e-4), 1e-30)
-        self._pmf = pmf
-        self._inv_area = dr.rcp(area)
-        self._placements = _Placement.table(placements)
-        textured = [
-            k == AREA and mi.has_flag(e.flags(), mi.EmitterFlags.SpatiallyVarying)
-            for e, k in zip(emitters, kinds, strict=True)
-        ]
-        # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
-        by_texture = [
-            t and e.get_shape().shape_type() in _TEXTURE_SAMPLED
-            for e, t in zip(emitters, textured, strict=True)
-        ]
-        by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
-        self._any_by_texture, self._by_texture = any(by_texture), mi.Bool(by_texture)
-        self._any_by_shape, self._by_shape = any(by_shape), mi.Bool(by_shape)
-        for emitter, t in zip(emitters, textured, strict=True):
-            if t:
-                _check_coordinates(emitter)
-        if self._any_by_shape:
-            _refuse_curves(scene, emitters[by_shape.index(True)])
-        self._inverse = _inverse_table(self._pointers)
-        self._smooth_meshes = _SmoothMeshes.of(emitters)
+        sampling_weight = mi.Float([number(e.sampling_weight()) for e in emitters])
+        self._kind, self._pmf = mi.UInt32(kinds), sampling_weight / dr.sum(sampling_weight)
+        self._read_shapes(scene, emitters, kinds)
+        placements = [placement(e, k) for e, k in zip(emitters, kinds, strict=True)]
+        self._placements = Placement.table(placements)
         self._inward_spheres = any(p.radius > 0 for p in placements)
+        self._projectors = Projectors.of(emitters, kinds)
+        self._inverse = inverse_table(self._pointers)
+        box = bounds(scene)
+        sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
         self.center = mi.Point3f(sphere.center)
-        self.radius = mi.Float(radius)
+        # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
+        self.radius = mi.Float(max(float(sphere.radius) * (1 + 1e-4), 1e-30))
         dr.make_opaque(
             self._kind, self._pmf, self._inv_area, self._placements, self._inverse, self.center, self.radius
         )
+
+    def _read_shapes(self, scene, emitters, kinds):
+        """Areas of the emitting shapes, how their points are chosen, and their geometric normals."""
+        pairs = list(zip(emitters, kinds, strict=True))
+        sampled = [k in (AREA, DIRECTIONAL_AREA) for k in kinds]
+        areas = [
+            dr.slice(e.get_shape().surface_area()) if s else 1.0
+            for e, s in zip(emitters, sampled, strict=True)
+        ]
+        self._inv_area = dr.rcp(mi.Float(areas))
+        textured = [is_textured(e, k) for e, k in pairs]
+        self._ask_shapes = any(sampled) and not _all_answer(self._pointers)
+        # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
+        by_texture = [not self._ask_shapes and is_sampled_by_texture(e, k) for e, k in pairs]
+        by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
+        self._any_by_texture, self._by_texture = any(by_texture), mi.Bool(by_texture)
+        self._any_by_shape, self._by_shape = any(by_shape), mi.Bool(by_shape)
+        if self._any_by_shape:
+            refuse_curves(scene, emitters[by_shape.index(True)], "has a textured radiance on such a shape")
+        if self._ask_shapes:
+            refuse_curves(
+                scene, emitters[sampled.index(True)], "lives with a class that has no sample_position"
+            )
+        self._smooth_meshes = SmoothMeshes.of(
+            [e if s else None for e, s in zip(emitters, sampled, strict=True)]
+        )
+        # The radiance of a directional area is told by its texture alone.
+        self._beam_radiances = [
+            (i, children(e)["radiance"]) for i, (e, k) in enumerate(pairs) if k == DIRECTIONAL_AREA
+        ]
 
     # -- tables -----------------------------------------------------------------------------
 
@@ -178,9 +207,13 @@ class Emitters:
     def _disk_density(self):
         return dr.rcp(dr.pi * dr.square(self.radius))
 
-    def _direction_density(self, index, active):
-        """Solid-angle density of the emission from point and spot lights."""
-        return dr.gather(mi.Float, self._placements.density_w, index, active)
+    def _direction_density(self, index, d, active):
+        """Solid-angle density of the emission into the direction ``d`` from emitters at a point."""
+        density = dr.gather(mi.Float, self._placements.density_w, index, active)
+        if self._projectors is None:
+            return density
+        projector = self._is(index, active, PROJECTOR)
+        return dr.select(projector, self._projectors.density(index, d, projector), density)
 
     # -- emission ---------------------------------------------------------------------------
 
@@ -196,7 +229,8 @@ class Emitters:
         e = None
         for kinds, sampler in (
             ((AREA,), self._emit_area),
-            ((POINT, SPOT), self._emit_position),
+            ((DIRECTIONAL_AREA,), self._emit_beam),
+            (POSITIONS, self._emit_position),
             ((INFINITE, DIRECTIONAL), self._emit_infinite),
         ):
             if not self.kinds & set(kinds):
@@ -206,15 +240,28 @@ class Emitters:
             e = of_kind if e is None else dr.select(mask, of_kind, e)
         e.pdf_first *= pmf
         e.weight = dr.select(pmf > 0, e.weight / pmf, 0)
+        if self.kinds & {
+            UNKNOWN,
+            UNSAMPLED,
+        }:  # chosen with the probability of next-event estimation, and left
+            e.weight = dr.select(self._is(index, active, UNKNOWN, UNSAMPLED), 0, e.weight)
         return e
 
-    def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+    def _sample_surface(self, emitter, index, u_point, like, active):
+        """A point on the shape of an emitter, density included."""
         shape = emitter.get_shape()
+        if self._ask_shapes:
+            return shape.sample_position(like.time, u_point, active)
         # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
         ps, _ = emitter.sample_position(like.time, u_point, active)
         if self._any_by_shape:
             mask = self._is_by_shape(index, active)
             ps = dr.select(mask, shape.sample_position(like.time, u_point, mask), ps)
+        return ps
+
+    def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+        shape = emitter.get_shape()
+        ps = self._sample_surface(emitter, index, u_point, like, active)
         local = mi.warp.square_to_cosine_hemisphere(u_direction)
         si = mi.SurfaceInteraction3f(ps, like.wavelengths)
         si.t = mi.Float(0)
@@ -227,7 +274,7 @@ class Emitters:
         cos = dr.abs(dr.dot(n, d))
         radiance = emitter.eval(si, active)
         return Emission(
-            weight=dr.select(pdf_second > 0, radiance * (cos / (pdf_first * pdf_second)), 0),
+            weight=dr.select(pdf_first * pdf_second > 0, radiance * (cos / (pdf_first * pdf_second)), 0),
             d=d,
             anchor=rays.sampled_anchor(ps.p, n, ps.p, self.quadrics.ends(shape, active)),
             cos=cos,
@@ -235,6 +282,32 @@ class Emitters:
             pdf_second=pdf_second,
             infinite=mi.Bool(False),
             delta=mi.Bool(False),
+            beam=mi.Bool(False),
+            index=index,
+            si=si,
+        )
+
+    def _emit_beam(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+        ps = self._sample_surface(emitter, index, u_point, like, active)
+        n = self.geometric_normal(ps, index, u_point, active)
+        d = mi.Vector3f(ps.n)
+        si = mi.SurfaceInteraction3f(ps, like.wavelengths)
+        si.t, si.wi = mi.Float(0), mi.Vector3f(0, 0, 1)
+        radiance = dr.zeros(mi.Spectrum)
+        for place, texture in self._beam_radiances:
+            mask = active & (index == place)
+            radiance = dr.select(mask, mi.Spectrum(texture.eval(si, mask)), radiance)
+        curvature = self.quadrics.ends(emitter.get_shape(), active)
+        return Emission(
+            weight=dr.select(ps.pdf > 0, radiance / ps.pdf, 0),  # without cosine, as in Mitsuba
+            d=d,
+            anchor=rays.sampled_anchor(ps.p, n, ps.p, curvature),
+            cos=dr.abs(dr.dot(n, d)),
+            pdf_first=ps.pdf,
+            pdf_second=mi.Float(1),
+            infinite=mi.Bool(False),
+            delta=mi.Bool(True),
+            beam=mi.Bool(True),
             index=index,
             si=si,
         )
@@ -256,7 +329,10 @@ class Emitters:
         but its pdf_direction only up to the radius: wrong for points of the sphere itself.
         """
         # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
-        ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
+        turned = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
+        if UNKNOWN in self.kinds:
+            turned = dr.select(self._is(index, active, UNKNOWN), ds.n, turned)
+        ds.n = turned
         pdf = emitter.pdf_direction(it, ds, active)
         by_area = mi.Bool(False)
         if self._inward_spheres:
@@ -275,13 +351,16 @@ class Emitters:
         placed = self._placements.at(index, active)
         p = placed.position
         local = mi.warp.square_to_uniform_cone(u_direction, placed.cos_cutoff)
-        d = placed.x * local.x + placed.y * local.y + placed.z * local.z
+        d, pdf_second = placed.x * local.x + placed.y * local.y + placed.z * local.z, placed.density_w
+        if self._projectors is not None:
+            mask = self._is(index, active, PROJECTOR)
+            projected, density = self._projectors.sample(index, u_direction, mask)
+            d, pdf_second = dr.select(mask, projected, d), dr.select(mask, density, pdf_second)
         intensity = self._intensity(emitter, p, d, like, active)
-        pdf_second = placed.density_w
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.t, si.p, si.time, si.wavelengths = mi.Float(0), p, like.time, like.wavelengths
         return Emission(
-            weight=intensity / pdf_second,
+            weight=dr.select(pdf_second > 0, intensity / pdf_second, 0),
             d=d,
             anchor=rays.free_anchor(p),
             cos=mi.Float(1),
@@ -289,12 +368,13 @@ class Emitters:
             pdf_second=pdf_second,
             infinite=mi.Bool(False),
             delta=mi.Bool(True),
+            beam=mi.Bool(False),
             index=index,
             si=si,
         )
 
     def _intensity(self, emitter, p, d, like, active):
-        """Intensity of a point or spot light at ``p`` into direction ``d``, by its own calls."""
+        """Intensity of an emitter at the point ``p`` into direction ``d``, by its own calls."""
         far = 1 + dr.max(dr.abs(p))  # keeps the probe's relative rounding small away from 0
         it = dr.zeros(mi.Interaction3f)
         it.p, it.time, it.wavelengths = p + d * far, like.time, like.wavelengths
@@ -322,6 +402,7 @@ class Emitters:
             pdf_second=pdf_second,
             infinite=mi.Bool(True),
             delta=directional,
+            beam=mi.Bool(False),
             index=index,
             si=si,
         )
@@ -332,23 +413,42 @@ class Emitters:
         In the measure of ``pdf_first``, times the squared length of the edge (1 at infinity): on
         surfaces that is the solid-angle density at the hit times the geometric cosine at y_0.
         """
-        emitter = self._pointer(emission.index, active)
+        # From infinity the lit vertex does not matter: both densities of y_0 are the same.
+        density = mi.Float(emission.pdf_first)
         pmf = self._probability(emission.index, active)
-        ds = dr.zeros(mi.DirectionSample3f)
-        ds.p, ds.n, ds.uv, ds.time = (
-            emission.si.p,
-            emission.anchor.n,
-            emission.si.uv,
-            emission.si.time,
-        )
-        ds.d = -emission.d
-        ds.dist = dr.norm(emission.si.p - si.p)
-        ds.emitter = emitter
-        smooth = active & ~emission.delta
-        pdf = self._pdf_direction(emitter, emission.index, mi.Interaction3f(si), ds, smooth)
-        finite = dr.select(emission.infinite, pdf, pdf * emission.cos)
-        delta = dr.select(emission.infinite, 1, dr.square(ds.dist))
-        return pmf * dr.select(emission.delta, delta, finite)
+        dist = dr.norm(emission.si.p - si.p)
+        if self.kinds & set(POSITIONS):
+            here = self._is(emission.index, active, *POSITIONS)
+            density = dr.select(here, pmf * dr.square(dist), density)
+        if AREA in self.kinds:
+            here = self._is(emission.index, active, AREA)
+            emitter = self._pointer(emission.index, here)
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p, ds.n, ds.uv = emission.si.p, emission.anchor.n, emission.si.uv
+            ds.time, ds.d, ds.dist, ds.emitter = emission.si.time, -emission.d, dist, emitter
+            pdf = self._pdf_direction(emitter, emission.index, mi.Interaction3f(si), ds, here)
+            density = dr.select(here, pmf * pdf * emission.cos, density)
+        return dr.select(emission.beam, 0, density) if self.beams else density
+
+    def covers(self, p, d):
+        """Mask: light that travels along ``d`` from infinity passes ``p`` on its way from the disk where its
+        subpaths start. Points of a shape are all covered."""
+        offset = p - self.center
+        along = dr.dot(offset, d)
+        aside2 = dr.squared_norm(offset) - dr.square(along)
+        return (aside2 <= dr.square(self.radius)) & (along >= -self.radius)
+
+    def direction_density(self, emission: Emission, d, active):
+        """Density with which emission from y_0 takes the direction ``d``, in ``pdf_second``'s measure."""
+        density = self._disk_density()  # what is not at infinity is replaced
+        if AREA in self.kinds:
+            mask = self._is(emission.index, active, AREA)
+            cos = dr.dot(emission.si.sh_frame.n, d)
+            density = dr.select(mask, dr.maximum(cos, 0) * dr.inv_pi, density)
+        if self.kinds & set(POSITIONS):
+            mask = self._is(emission.index, active, *POSITIONS)
+            density = dr.select(mask, self._direction_density(emission.index, d, mask), density)
+        return density
 
     def radiance_towards(self, emission: Emission, d, active):
         """What y_0 sends into direction ``d``: radiance, intensity (point) or irradiance (delta
@@ -360,8 +460,8 @@ class Emitters:
             si = mi.SurfaceInteraction3f(emission.si)
             si.wi = si.to_local(d)
             value = dr.select(mask, emitter.eval(si, mask), value)
-        if self.kinds & {POINT, SPOT}:
-            mask = self._is(emission.index, active, POINT, SPOT)
+        if self.kinds & set(POSITIONS):
+            mask = self._is(emission.index, active, *POSITIONS)
             value = dr.select(mask, self._intensity(emitter, emission.si.p, d, emission.si, mask), value)
         if INFINITE in self.kinds:
             mask = self._is(emission.index, active, INFINITE)
@@ -389,27 +489,37 @@ class Emitters:
             ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
         area = self._is(index, active, AREA)
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
-        delta = self._is(index, active, POINT, SPOT, DIRECTIONAL)
+        delta = self._is(index, active, *POSITIONS, DIRECTIONAL)
         n = dr.select(area, self.geometric_normal(ds, index, u, area), 0)
+        if UNKNOWN in self.kinds:
+            unknown = self._is(index, active, UNKNOWN)
+            flags = emitter.flags()
+            infinite |= unknown & mi.has_flag(flags, mi.EmitterFlags.Infinite)
+            delta |= unknown & (mi.has_flag(flags, mi.EmitterFlags.Delta) | ds.delta)
+            n = dr.select(unknown & mi.has_flag(flags, mi.EmitterFlags.Surface), ds.n, n)
         cos_shading = dr.dot(ds.n, -ds.d)
         cos = dr.abs(dr.dot(n, ds.d))
         # Mitsuba divides by the shading normal's cosine; the measure is the geometric one.
         to_geometric = dr.select(area & (cos != dr.abs(cos_shading)), dr.abs(cos_shading) / cos, 1)
         pdf = dr.select(delta, 1, ds.pdf * to_geometric) * pmf
         weight = dr.select(ds.pdf > 0, weight / (to_geometric * pmf), 0)
+        if UNSAMPLED in self.kinds:  # what Mitsuba samples of it has no radiance or the wrong one
+            weight = dr.select(self._is(index, active, UNSAMPLED), 0, weight)
         ratio = mi.Float(0)
         if AREA in self.kinds:
             density = self._area_density(emitter, index, ds, n, area)
             emitted = pmf * density * dr.maximum(cos_shading, 0) * dr.inv_pi
             ratio = dr.select(area, emitted / (pdf * cos), ratio)
-        if self.kinds & {POINT, SPOT}:
-            here = self._is(index, active, POINT, SPOT)
-            emitted = self._direction_density(index, here) / dr.square(ds.dist)
+        if self.kinds & set(POSITIONS):
+            here = self._is(index, active, *POSITIONS)
+            emitted = self._direction_density(index, -ds.d, here) / dr.square(ds.dist)
             ratio = dr.select(here, emitted, ratio)
         ratio = dr.select(infinite, self._disk_density(), ratio)
+        if UNKNOWN in self.kinds:
+            ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
         curvature = mi.Float(0)
-        if AREA in self.kinds:
-            curvature = self.quadrics.ends(emitter.get_shape(), area)
+        if self.on_shapes:
+            curvature = self.quadrics.ends(emitter.get_shape(), active)
         anchor = rays.sampled_anchor(ds.p, n, si.p, curvature)
         return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio)
 
@@ -434,17 +544,25 @@ class Emitters:
         it = dr.zeros(mi.Interaction3f)
         it.p, it.time, it.wavelengths = previous, si.time, si.wavelengths
         ds = mi.DirectionSample3f(self.scene, si, it)
-        ds.n = mi.Normal3f(si.n)
+        ds.time = mi.Float(si.time)
+        if UNKNOWN in self.kinds:  # their own density has their own idea of a normal
+            ds.n = dr.select(self._is(index, active, UNKNOWN), ds.n, mi.Normal3f(si.n))
+        else:
+            ds.n = mi.Normal3f(si.n)
         pdf = pmf * self._pdf_direction(emitter, index, it, ds, active)
         connect, first, second = mi.Float(pdf), mi.Float(pdf), self._disk_density()
-        if AREA in self.kinds:
-            on_surface = si.is_valid()
-            density = self._area_density(emitter, index, si, si.n, active & on_surface)
+        on_surface = si.is_valid()
+        if self.kinds & {AREA, UNKNOWN}:
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
-            cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
             connect = dr.select(on_surface, pdf * to_area, connect)
+        if AREA in self.kinds:
+            density = self._area_density(emitter, index, si, si.n, active & on_surface)
+            cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
             first = dr.select(on_surface, pmf * density, first)
             second = dr.select(on_surface, cos_second, second)
+        if self.kinds & {UNKNOWN, UNSAMPLED}:
+            first = dr.select(self._is(index, active, UNKNOWN, UNSAMPLED), 0, first)
+            connect = dr.select(self._is(index, active, UNSAMPLED), 0, connect)
         return connect, first, second
 
     def _area_density(self, emitter, index, at, n, active):
@@ -467,6 +585,16 @@ class Emitters:
         return dr.gather(mi.Float, self._pmf, index, active)
 
 
+def _all_answer(pointers) -> bool:
+    """Whether `sample_position` can be called on ``pointers``: a call visits every living emitter, those of
+    other scenes too, and classes of the user's need not have it."""
+    try:
+        pointers.sample_position(mi.Float(0), mi.Point2f(0.5), mi.Bool(True))
+    except RuntimeError:
+        return False
+    return True
+
+
 def _sample_shape(emitter, si, u, active):
     """Next-event estimation by a uniform point of the emitter's shape, in Mitsuba's conventions: the
     density is over the cosine with the shading normal, the weight is radiance over density."""
@@ -482,200 +610,3 @@ def _sample_shape(emitter, si, u, active):
     there.wi = there.to_local(-ds.d)
     radiance = emitter.eval(there, active)
     return ds, dr.select(ds.pdf > 0, radiance / ds.pdf, 0)
-
-
-def _check_coordinates(emitter):
-    """Raise ``ValueError`` for a texture on a mesh that has no texture coordinates."""
-    shape = emitter.get_shape()
-    if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
-        raise ValueError(
-            f"bdpt: emitter '{emitter.id()}' has a textured radiance on a mesh without texture coordinates "
-            f"('{shape.id()}'); make the radiance uniform, or give the mesh coordinates"
-        )
-
-
-def _refuse_curves(scene, emitter):
-    """Raise ``NotImplementedError`` if a call on shapes would meet curves, which have no
-    ``sample_position``."""
-    for shape in scene.shapes():
-        if shape.shape_type() in (mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value):
-            raise NotImplementedError(
-                f"bdpt: emitter '{emitter.id()}' has a textured radiance on a "
-                f"{emitter.get_shape().class_name()}, which is not supported beside curves "
-                f"('{shape.id()}'); make the radiance uniform, put it on a rectangle, disk or sphere, "
-                "or use integrator type 'path'"
-            )
-
-
-def _kind(emitter) -> int:
-    name = emitter.class_name()
-    if name not in _KINDS:
-        raise NotImplementedError(
-            f"bdpt: emitter '{emitter.id()}' of class {name} is not supported yet; supported are area, "
-            "point, spot, directional, constant and envmap. Replace it, or use integrator type 'path'."
-        )
-    if name == "EnvironmentMapEmitter":
-        _check_rotation(emitter)
-    return _KINDS[name]
-
-
-def _check_rotation(emitter):
-    """Raise ``ValueError`` unless an environment map's ``to_world`` keeps lengths: with any other matrix
-    Mitsuba's own calls disagree with each other (next-event estimation four times the radiance)."""
-    matrix = np.array(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
-    if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3):
-        raise ValueError(
-            f"bdpt: to_world of envmap '{emitter.id()}' is not a rotation (the lengths of its columns are "
-            f"{', '.join(f'{x:.4g}' for x in np.linalg.norm(matrix, axis=0))}); leave out scaling, and give "
-            "rotate an axis of length 1"
-        )
-
-
-@dataclass
-class _Placement:
-    """Where an emitter is: axes ``x``, ``y``, ``z`` and ``position`` of point and spot lights, their
-    constant density of emission ``density_w`` (solid angle) within ``cos_cutoff``. Of a sphere that
-    emits inwards, ``position`` and the ``radius`` up to which it samples as from inside; 0 for all
-    others. Scalars for one emitter, Dr.Jit arrays for a table of them."""
-
-    x: object = (1, 0, 0)
-    y: object = (0, 1, 0)
-    z: object = (0, 0, 1)
-    position: object = (0, 0, 0)
-    density_w: object = 1.0
-    cos_cutoff: object = -1.0
-    radius: object = 0.0
-
-    @staticmethod
-    def table(rows):
-        """The rows as columns that `at` can look up."""
-
-        def column(name):
-            # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
-            values = np.array([getattr(row, name) for row in rows], dtype=np.float64).T.tolist()
-            if not isinstance(values[0], list):
-                return mi.Float(values)
-            return (mi.Point3f if name == "position" else mi.Vector3f)(*(mi.Float(v) for v in values))
-
-        return _Placement(**{name: column(name) for name in vars(_Placement())})
-
-    def at(self, index, active):
-        """The row ``index``."""
-        return _Placement(**{k: dr.gather(type(v), v, index, active) for k, v in vars(self).items()})
-
-
-def _placement(emitter, kind) -> _Placement:
-    if kind == POINT:
-        position = dr.slice(mi.Point3f(mi.traverse(emitter)["position"]))
-        return _Placement(position=position, density_w=1 / (4 * dr.pi))
-    if kind == SPOT:
-        params = mi.traverse(emitter)
-        to_world = params["to_world"]
-        x, y, z = (
-            dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
-            for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-        )
-        cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
-        return _Placement(
-            x=x,
-            y=y,
-            z=z,
-            position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))),
-            density_w=1 / (2 * dr.pi * (1 - cos_cutoff)),
-            cos_cutoff=cos_cutoff,
-        )
-    if kind == AREA and emitter.get_shape().shape_type() == mi.ShapeType.Sphere.value:
-        to_world = mi.traverse(emitter.get_shape())["to_world"]
-        p = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
-        ps = emitter.get_shape().sample_position(0, mi.Point2f(0.5))
-        inwards = dr.slice(dr.dot(ps.n, ps.p - p)) < 0
-        # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
-        radius = dr.slice(dr.norm(ps.p - p)) * (1 + 1500 * 2.0**-24) if inwards else 0.0
-        return _Placement(position=dr.slice(p), radius=radius)
-    return _Placement()
-
-
-class _SmoothMeshes:
-    """Geometric normals of emitting meshes that have vertex normals.
-
-    Repeats the choice of a face that ``Mesh.sample_position`` makes: by area, from ``sample.y``.
-    """
-
-    @staticmethod
-    def of(emitters):
-        """Tables for those of ``emitters`` that need them, or None."""
-        faces = [_curved_faces(e.get_shape()) for e in emitters]
-        return _SmoothMeshes(faces) if any(f is not None for f in faces) else None
-
-    def __init__(self, faces):
-        normals, cumulative, first, count = [], [], [], []
-        for cross in faces:
-            first.append(sum(len(c) for c in cumulative))
-            count.append(0 if cross is None else len(cross))
-            if cross is not None:
-                length = np.linalg.norm(cross, axis=1)
-                normals.append(cross / np.maximum(length, 1e-300)[:, None])
-                cumulative.append(np.cumsum(length) / length.sum())
-        self._normals = mi.Normal3f(*(mi.Float(v) for v in np.concatenate(normals).T.tolist()))
-        self._cumulative = mi.Float(np.concatenate(cumulative).tolist())
-        self._first, self._count = mi.UInt32(first), mi.UInt32(count)
-        self._steps = max(count).bit_length()
-        dr.make_opaque(self._normals, self._cumulative, self._first, self._count)
-
-    def normal(self, n, index, u, active):
-        """Normal of the face chosen by ``u``; ``n`` for emitters that are no such mesh."""
-        first = dr.gather(mi.UInt32, self._first, index, active)
-        count = dr.gather(mi.UInt32, self._count, index, active)
-        mesh = active & (count > 0)
-        low, high = first, dr.select(mesh, first + count - 1, first)
-        for _ in range(self._steps):
-            middle = (low + high) // 2
-            right = dr.gather(mi.Float, self._cumulative, middle, mesh) < u
-            low = dr.select(right & (middle < high), middle + 1, low)
-            high = dr.select(right, high, middle)
-        face = low
-        return dr.select(mesh, dr.gather(mi.Normal3f, self._normals, face, mesh), n)
-
-
-def _curved_faces(shape):
-    """Cross products of the edges of each face, shape (faces, 3), for a mesh whose vertex normals
-    differ from its faces' normals; None for all other shapes."""
-    if shape is None or not shape.is_mesh():
-        return None
-    params = mi.traverse(shape)
-    # Neither a rectangle (flat, without vertices) nor a mesh without normals at its vertices.
-    if "vertex_positions" not in params or not len(params["vertex_normals"]):
-        return None
-    faces = np.array(params["faces"]).reshape(-1, 3)
-    p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    n = np.array(params["vertex_normals"], dtype=np.float64).reshape(-1, 3)
-    a, b, c = p[faces].transpose(1, 0, 2)
-    cross = np.cross(b - a, c - a)
-    unit = cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-300)[:, None]
-    flat = np.abs(np.einsum("fvi,fi->fv", n[faces], unit)) > 1 - 1e-6
-    return None if flat.all() else cross
-
-
-def _bounds(scene):
-    """Bounding box of all shapes.
-
-    Not ``scene.bbox()`` alone: meshes that Mitsuba merges when it loads a scene keep the box of one
-    part.
-    """
-    bounds = mi.ScalarBoundingBox3f(scene.bbox())
-    for shape in scene.shapes():
-        params = mi.traverse(shape) if shape.is_mesh() else {}
-        if "vertex_positions" in params:
-            vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
-            bounds.expand(mi.ScalarPoint3f(vertices.min(axis=0).tolist()))
-            bounds.expand(mi.ScalarPoint3f(vertices.max(axis=0).tolist()))
-    return bounds
-
-
-def _inverse_table(pointers):
-    """Emitter index by the number that Dr.Jit gives to a pointer."""
-    ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()
-    table = [0] * (int(ids.max()) + 1)
-    for index, number in enumerate(ids):
-        table[int(number)] = index
-    return mi.UInt32(table)

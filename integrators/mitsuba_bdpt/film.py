@@ -1,6 +1,6 @@
 """Raw accumulators, and how they become the film.
 
-Camera samples go into one block with Mitsuba's filter weights W, splats (t = 1) into another. The
+Camera samples go into one block with Mitsuba's filter weights W, splats (t <= 1) into another. The
 weight that a splat must be divided by is analytic, W' = spp * integral of the filter over the region
 that camera samples cover; it enters the film as W * splat / W', so that `Film.develop` does the
 right thing for every filter, crop window and border. Putting both kinds into one block, as Mitsuba's
@@ -9,6 +9,7 @@ right thing for every filter, crop window and border. Putting both kinds into on
 
 from __future__ import annotations
 
+from functools import reduce
 from math import ceil, inf
 
 import drjit as dr
@@ -43,7 +44,9 @@ class Block:
         dr.make_opaque(self.data)
 
     def put(self, position, values, active, row=0):
-        """Add ``values`` (one per channel) at a continuous film position, ``row`` rows below."""
+        """Add ``values`` (one per channel, a last one of 0 may be left out) at a continuous film
+        position, ``row`` rows below."""
+        values = values + [mi.Float(0)] * (self.channels - len(values))
         down = mi.Point2i(0, mi.Int32(row))
         if self._rfilter.is_box_filter():
             self._add(mi.Point2i(dr.floor(position)) - self._offset + down, values, active)
@@ -102,13 +105,14 @@ class Replicates:
 class Accumulator:
     """Collects the samples of one render.
 
-    ``film`` Mitsuba's film; ``border`` how many pixels camera samples reach beyond the crop window;
-    ``depth`` the largest path length of the strategy images, 0 for none; ``variance`` whether the
-    layers of the variance are wanted, see `close_replicate`.
+    ``film`` Mitsuba's film; ``colour`` what it keeps of a spectrum, see `colour`; ``border`` how many
+    pixels camera samples reach beyond the crop window; ``depth`` the largest path length of the strategy
+    images, 0 for none; ``variance`` whether the layers of the variance are wanted, see
+    `close_replicate`; ``features`` the `FeatureLayers` that camera samples bring along, or ``None``.
     """
 
-    def __init__(self, film, border: int, depth: int, variance: bool = False):
-        self.film = film
+    def __init__(self, film, colour, border: int, depth: int, variance: bool = False, features=None):
+        self.film, self.colour, self.features = film, colour, features
         self.border = border
         self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         self.depth = depth
@@ -116,11 +120,14 @@ class Accumulator:
         self.offset = [int(x) for x in film.crop_offset()]
         self.rfilter = film.rfilter()
         self.replicates = Replicates() if variance else None
-        film.prepare(layer_names(depth, variance))
-        self.channels = 5 if self.alpha else 4
-        self.camera = self._block(self.channels + self.channels % 2, dr.ReduceMode.Local, mi.ArrayXf)
+        names = features.names if features else []
+        colour.prepare(layer_names(depth, variance, names, colour.names))
+        self._colours = len(colour.names)
+        self._weight = self._colours + self.alpha  # where W lies among the camera samples' sums
+        self._channels = self._weight + 1 + len(names)
+        self.camera = self._block(self._channels, dr.ReduceMode.Local, mi.ArrayXf)
         # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
-        self.light = self._block(4, dr.ReduceMode.Direct, mi.ArrayXd)
+        self.light = self._block(self._colours, dr.ReduceMode.Direct, mi.ArrayXd)
         # One strip of rows per strategy, far enough apart for the filter.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         rows = strategy_count(depth) * self._stride
@@ -130,17 +137,16 @@ class Accumulator:
 
     def _block(self, channels: int, mode, packet, height: int | None = None):
         size = [self.size[0], height or self.size[1]]
-        return Block(size, self.offset, channels, self.rfilter, mode, packet)
+        return Block(size, self.offset, channels + channels % 2, self.rfilter, mode, packet)
 
-    def put_camera(self, position, rgb, alpha, active):
+    def put_camera(self, position, colours, alpha, features, active):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
-        values = [rgb.x, rgb.y, rgb.z, *([alpha] if self.alpha else []), mi.Float(1)]
-        values += [mi.Float(0)] * (self.channels % 2)
+        values = [*colours, *([alpha] if self.alpha else []), mi.Float(1), *features]
         self.camera.put(position, values, active)
 
-    def put_light(self, position, rgb, active):
+    def put_light(self, position, colours, active):
         """Add a splat at a continuous film position."""
-        self.light.put(position, [rgb.x, rgb.y, rgb.z, mi.Float(0)], active)
+        self.light.put(position, [*colours], active)
 
     def put_strategy(self, position, weighted, unweighted, s, t, active):
         """Add to the technique images of the strategy (s, t)."""
@@ -178,30 +184,33 @@ class Accumulator:
 
     def error(self) -> float:
         """Estimated relMSE of the image, variance / (mean^2 + 0.01 mean(image)^2) averaged over pixels
-        and channels; infinite with fewer than two replicates."""
-        mean = self.replicates.mean
-        if mean is None:
+        and colours, each in its unit; infinite with fewer than two replicates."""
+        if self.replicates.mean is None:
             return inf
-        variance = self.replicates.variance(sum(self.passes))
+        unit = np.array(self.colour.unit)
+        mean = self.replicates.mean / unit
+        variance = self.replicates.variance(sum(self.passes)) / unit**2
         return float((variance / (mean**2 + 0.01 * mean.mean() ** 2 + 1e-300)).mean())
 
     def _image(self, camera, light, spp: int):
-        """Image (height, width, 3) of sums over ``spp`` samples per pixel."""
+        """Image (height, width, colours) of sums over ``spp`` samples per pixel."""
         w, h = self.size
         camera, light = camera.reshape(h, w, -1), light.reshape(h, w, -1)
-        weight = camera[..., self.channels - 1, None]
-        return camera[..., :3] / weight + light[..., :3] / self._splat_weight(spp)[..., None]
+        weight, n = camera[..., self._weight, None], self._colours
+        return camera[..., :n] / weight + light[..., :n] / self._splat_weight(spp)[..., None]
 
     def mean(self):
-        """Mean of the image so far (largest channel), for the scale of roulette: a ``Float64`` of
-        width 1, for which nobody has waited yet."""
+        """Mean of the image so far (largest colour, each in its unit), for the scale of roulette: a
+        ``Float64`` of width 1, for which nobody has waited yet."""
         blocks = zip(self._done[0][:2], (self.camera, self.light), strict=True)
-        camera, light = ([dr.sum(sums[i :: block.channels]) for i in range(3)] for sums, block in blocks)
-        weight = dr.sum(self._done[0][0][self.channels - 1 :: self.camera.channels])
+        camera, light = (
+            [dr.sum(sums[i :: block.channels]) for i in range(self._colours)] for sums, block in blocks
+        )
+        weight = dr.sum(self._done[0][0][self._weight :: self.camera.channels])
         splat_weight = float(self._splat_weight(sum(self.passes)).sum())
         weight, splat_weight = dr.maximum(weight, 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
-        channels = zip(camera, light, strict=True)
-        return dr.max(mi.Vector3d(*(c / weight + y / splat_weight for c, y in channels)))
+        colours = zip(camera, light, self.colour.unit, strict=True)
+        return reduce(dr.maximum, [(c / weight + y / splat_weight) / unit for c, y, unit in colours])
 
     def _splat_weight(self, spp: int):
         """W', shape (height, width)."""
@@ -228,16 +237,17 @@ class Accumulator:
         if not passes:
             return
         camera, light = (np.array(s).reshape(h, w, -1) for s in sums[:2])
-        camera = camera[..., : self.channels]
-        to_film = camera[..., -1:] / self._splat_weight(sum(passes))[..., None]
-        camera[..., :3] += light[..., :3] * to_film
-        layers = [camera]
+        n, last = self._colours, self._weight + 1
+        colours, weight, features = camera[..., : last - 1], camera[..., last - 1 : last], camera[..., last:]
+        to_film = weight / self._splat_weight(sum(passes))[..., None]
+        colours[..., :n] += light[..., :n] * to_film
+        layers = [features[..., : self._channels - last]]
         if self.replicates is not None:
-            layers.append(self.replicates.variance(sum(passes), camera[..., :3].shape) * camera[..., -1:])
+            layers.append(self.replicates.variance(sum(passes), (h, w, n)) * weight)
         if self.depth:
             tall = np.array(sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
             for index, (_, _, t) in enumerate(strategies(self.depth)):
-                layers.append(tall[index] * (to_film if t == 1 else 1))
-        values = np.concatenate(layers, axis=-1).astype(np.float32)
+                layers.append(tall[index] * (to_film if t <= 1 else 1))
+        values = np.concatenate(self.colour.stored(colours, weight, layers), axis=-1).astype(np.float32)
         block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
         self.film.put_block(block)

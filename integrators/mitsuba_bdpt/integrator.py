@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from dataclasses import asdict, dataclass, replace
@@ -10,12 +11,15 @@ import drjit as dr
 import mitsuba as mi
 
 from . import mis, points
+from .colour import Bands, film_colours
 from .emitters import Emitters
+from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import Batch, Counters, Kernel, trace
 from .parameters import integer, is_index, read_settings
 from .plan import UNLIMITED, Settings, plan, scene_bsdfs
-from .sensors import Camera
+from .sensor_records import Sensor
+from .sensors import prepare
 from .strategies import layer_names, strategy_count
 
 # Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
@@ -52,8 +56,8 @@ class PassReport:
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
 
-Every path of k edges can be made in k + 1 ways (s, t) with s light vertices and t >= 1 camera
-vertices (E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation", 1997, chapter 10).
+Every path of k edges can be made in k + 2 ways (s, t) with s light vertices and t camera vertices,
+s + t = k + 1 (E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation", 1997, chapter 10).
 All of them are combined by multiple importance sampling.
 
 .. pluginparameters::
@@ -85,7 +89,7 @@ All of them are combined by multiple importance sampling.
  * - points
    - |string|
    - ``sobol`` (default): Owen-scrambled Sobol' points for light and BSDF samples; ``sampler``: the
-     scene's sampler for them; ``independent``.
+     scene's sampler for the first of them; ``independent``.
  * - stored_vertices
    - |int|
    - Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. (Default: 64)
@@ -97,7 +101,13 @@ All of them are combined by multiple importance sampling.
    - |bool|
    - Adds the layers ``variance.R``, ``.G``, ``.B``: the variance of each pixel, splats included,
      estimated from 8 independent parts of the render; ``statistics["error"]`` is the relMSE that
-     follows. Needs at least 8 samples per pixel. (Default: false)
+     follows. Needs at least 8 samples per pixel. On a ``specfilm`` these layers are called after its
+     bands. (Default: false)
+ * - aovs
+   - |string|
+   - Adds feature layers, named by pairs ``name:kind`` as in Mitsuba's ``aov`` and equal to its layers:
+     ``albedo``, ``depth``, ``position``, ``uv``, ``geo_normal``, ``sh_normal``, ``dp_du``, ``dp_dv``,
+     ``duv_dx``, ``duv_dy``, ``prim_index``, ``shape_index``. (Default: none)
  * - spp_per_pass
    - |int|
    - Samples per pixel in one pass; 0 (default) chooses.
@@ -105,12 +115,15 @@ All of them are combined by multiple importance sampling.
    - |float|
    - Stop after the pass in which so many seconds were exceeded; -1 (default): never.
 
+Layers of the film come in this order: colours and alpha, features, variance, strategies.
+
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `PassReport` after each pass.
 
 Not supported, and refused in words: scalar and polarized variants, participating media,
-derivatives, films for spectra (``specfilm``), sensors other than ``perspective`` and ``thinlens``,
-emitters other than ``area``, ``point``, ``spot``, ``directional``, ``constant``, ``envmap``.
+derivatives, ``strategy_images`` on a ``specfilm``. Emitters and sensors of every kind take part; where
+one cannot have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and
+``explain`` says so.
 """
 
 
@@ -154,18 +167,29 @@ def check_scene(scene, sensor):
             )
 
 
+def check_film(sensor, settings: Settings):
+    """Raise ``NotImplementedError`` for layers that the film cannot have; returns its colours."""
+    colour = film_colours(sensor)
+    if settings.strategy_images and isinstance(colour, Bands):
+        raise NotImplementedError(
+            f"bdpt: strategy_images=True is not possible with film '{sensor.film().id()}' of class SpecFilm: "
+            "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
+        )
+    return colour
+
+
 def _most_samples(settings: Settings) -> int:
     """Samples in one launch."""
     return PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
 
 
-def pass_sizes(camera: Camera, spp: int, settings: Settings, first: bool = True) -> list[int]:
+def pass_sizes(camera: Sensor, spp: int, settings: Settings, first: bool = True) -> list[int]:
     """Samples per pixel of each pass, in order; their sum is ``spp``.
 
     The ``first`` pass of a render has one sample and gives roulette the scale of the image.
     """
     limit = _most_samples(settings)
-    width, height = (int(x) for x in camera.region)
+    width, height = (int(x) for x in camera.region.size)
     # One row of pixels fits into four launches' worth, see `batches`.
     most = min(MOST_SPP, max(4 * limit // width, 1))
     size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
@@ -190,7 +214,7 @@ class Step:
     last: bool
 
 
-def schedule(camera: Camera, spp: int, settings: Settings) -> list[Step]:
+def schedule(camera: Sensor, spp: int, settings: Settings) -> list[Step]:
     """All passes of a render of ``spp`` samples per pixel."""
     parts = [spp]
     if settings.variance:
@@ -204,10 +228,10 @@ def schedule(camera: Camera, spp: int, settings: Settings) -> list[Step]:
     return steps
 
 
-def batches(camera: Camera, first_sample: int, samples: int, settings: Settings):
+def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):
     """Cut a pass into bands of rows that one kernel launch can take."""
     limit = _most_samples(settings)
-    width, height = (int(x) for x in camera.region)
+    width, height = (int(x) for x in camera.region.size)
     rows = (
         height
         if settings.spp_per_pass == 0 and width * height * samples <= limit
@@ -219,29 +243,29 @@ def batches(camera: Camera, first_sample: int, samples: int, settings: Settings)
 
 
 class Render:
-    """One render: its scene, plan, accumulators and progress. Lives for one call."""
+    """One render of ``spp`` samples per pixel: its scene, plan, accumulators and progress. Lives for one
+    call."""
 
-    def __init__(self, scene, sensor, settings: Settings, seed):
+    def __init__(self, scene, sensor, settings: Settings, seed, spp: int):
         check_variant()
         check_scene(scene, sensor)
+        colour = check_film(sensor, settings)
         self.started = time.perf_counter()
-        self.scene, self.sensor, self.settings = scene, sensor, settings
+        self.scene, self.sensor, self.settings, self.spp = scene, sensor, settings, spp
         self.film = sensor.film()
-        if mi.has_flag(self.film.flags(), mi.FilmFlags.Special):
-            raise NotImplementedError(
-                f"bdpt: film '{self.film.id()}' of class {self.film.class_name()} is not supported; "
-                "use hdrfilm"
-            )
-        self.camera = Camera(sensor)
         self.emitters = Emitters(scene)
+        self.camera = prepare(sensor, self.emitters.quadrics)
         self.plan = plan(scene, self.emitters, self.camera, settings)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)
         dr.make_opaque(self.seed)
-        depth = settings.max_depth if settings.strategy_images else 0
+        depth = settings.strategy_depth
         _check_strategy_memory(depth, self.film)
-        self.accumulator = Accumulator(self.film, self.camera.border, depth, settings.variance)
+        features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
+        self.accumulator = Accumulator(
+            self.film, colour, self.camera.region.border, depth, settings.variance, features
+        )
         self.kernel = Kernel(
             scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
         )
@@ -249,13 +273,13 @@ class Render:
         self._counts = dict.fromkeys(Counters.names(), 0)
         self.compiled, self.cached, self.compile_seconds = 0, 0, 0.0
 
-    def run(self, spp: int, on_pass, cancelled=lambda: False):
-        """Trace ``spp`` samples per pixel, fewer under ``timeout``, when ``cancelled()`` after a pass or
-        when interrupted."""
+    def run(self, on_pass, cancelled=lambda: False):
+        """Trace the samples, fewer under ``timeout``, when ``cancelled()`` after a pass or when
+        interrupted."""
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         try:
-            for number, step in enumerate(self._steps(spp)):
+            for number, step in enumerate(self._steps()):
                 self._pass(step)
                 # The second pass is recorded while the first, a short one, runs.
                 if watched or number > 0:
@@ -263,7 +287,7 @@ class Render:
                 if step.last and self.settings.variance:
                     self.accumulator.close_replicate()
                 if on_pass is not None:
-                    on_pass(self.report(spp))
+                    on_pass(self.report())
                 if 0 <= timeout <= time.perf_counter() - self.started or cancelled():
                     break
         finally:
@@ -272,9 +296,9 @@ class Render:
             finally:
                 self.accumulator.finish()
 
-    def _steps(self, spp: int):
+    def _steps(self):
         """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
-        for step in schedule(self.camera, spp, self.settings):
+        for step in schedule(self.camera, self.spp, self.settings):
             done, end = step.done, step.done + step.size
             while done < end:
                 size = min(end - done, self._affordable(step.size))
@@ -294,7 +318,8 @@ class Render:
             if launch:
                 self._wait()
             drawn = self._points(step, batch)
-            counts = trace(self.kernel, self.accumulator, batch, drawn, step.of)
+            with _recorded(self.emitters):
+                counts = trace(self.kernel, self.accumulator, batch, drawn, step.of)
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 self.accumulator.evaluate(counts)
             self._running.append(counts)
@@ -316,11 +341,11 @@ class Render:
             sampler.set_sample_count(step.of)
             sampler.set_samples_per_wavefront(batch.samples)
             band = mi.sample_tea_32(seed, mi.UInt32(batch.first_pixel))[0]
-            sampler.seed(band, batch.pixels * batch.samples)
+            sampler.seed(band, points.Points.sequences(batch.pixels) * batch.samples)
             self._samplers[batch.first_pixel] = sampler
         else:
             sampler.advance()
-        drawn = points.Points("sampler", seed, sampler)
+        drawn = points.Points("sampler", seed, sampler, batch.samples)
         sampler.schedule_state()
         dr.eval()
         return drawn
@@ -337,13 +362,16 @@ class Render:
                 self.compiled += not entry["cache_hit"]
                 self.compile_seconds += (entry["codegen_time"] + entry["backend_time"]) / 1000
 
-    def report(self, spp: int) -> PassReport:
+    def report(self) -> PassReport:
         """Progress so far, for ``on_pass``."""
         seconds = time.perf_counter() - self.started
-        return PassReport(sum(self.accumulator.passes), spp, seconds, sum(self._rays().values()))
+        return PassReport(sum(self.accumulator.passes), self.spp, seconds, sum(self._rays().values()))
 
     def _rays(self):
-        return {name: self._counts[name] for name in RAYS}
+        rays = {name: self._counts[name] for name in RAYS}
+        if self.accumulator.features is not None:  # one per camera sample
+            rays["features"] = sum(self.accumulator.passes) * int(self.camera.region.size.prod())
+        return rays
 
     def statistics(self) -> dict:
         """The render in numbers; plain values only."""
@@ -367,6 +395,16 @@ class Render:
             **({"error": self.accumulator.error()} if self.settings.variance else {}),
             "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
         }
+
+
+@contextlib.contextmanager
+def _recorded(emitters: Emitters):
+    """How kernels are recorded: as a whole, or step by step where an emitter cannot be called otherwise."""
+    with contextlib.ExitStack() as stack:
+        if emitters.evaluated:
+            for flag in (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
+                stack.enter_context(dr.scoped_set_flag(flag, False))
+        yield
 
 
 def _check_strategy_memory(depth: int, film):
@@ -408,18 +446,18 @@ def _make_class():
             return self.settings.rr_depth
 
         def aov_names(self):
-            depth = self.settings.max_depth if self.settings.strategy_images else 0
-            return layer_names(depth, self.settings.variance)
+            settings = self.settings
+            return layer_names(settings.strategy_depth, settings.variance, feature_names(settings.aovs))
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             """Render ``scene``; see ``mi.Integrator.render`` for the arguments."""
             check_made_for(self, scene)
             sensor = _resolve(scene, sensor)
             spp = _samples(sensor, spp, self.settings)
-            render = Render(scene, sensor, self.settings, seed)
+            render = Render(scene, sensor, self.settings, seed, spp)
             try:
                 self._cancelled = False
-                render.run(spp, self.on_pass, lambda: self._cancelled)
+                render.run(self.on_pass, lambda: self._cancelled)
             finally:
                 self.statistics = render.statistics()
             _log(self.statistics)
@@ -438,7 +476,7 @@ def _make_class():
         def sample(self, *args, **kwargs):
             raise NotImplementedError(
                 "bdpt: cannot be nested in another integrator (aov, moment, stokes): light subpaths "
-                "reach pixels other than their own; render with bdpt itself"
+                "reach pixels other than their own; render with bdpt itself, which has a parameter aovs"
             )
 
         def render_forward(self, *args, **kwargs):
@@ -472,7 +510,9 @@ def explain(scene, sensor, settings: Settings) -> str:
     """Text about the strategies in use for ``scene`` and those that are skipped."""
     check_variant()
     check_scene(scene, sensor)
-    emitters, camera = Emitters(scene), Camera(sensor)
+    check_film(sensor, settings)
+    emitters = Emitters(scene)
+    camera = prepare(sensor, emitters.quadrics)
     p = plan(scene, emitters, camera, settings)
     used = [
         name
@@ -481,6 +521,7 @@ def explain(scene, sensor, settings: Settings) -> str:
             ("s=1 (next-event estimation)", p.direct),
             ("t=1 (light vertex seen by the sensor)", p.splat),
             ("(1,1) (emitter point seen by the sensor)", p.endpoints),
+            ("t=0 (light subpath hits the sensor)", p.arrival),
             (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
         )
         if on
@@ -492,34 +533,39 @@ def explain(scene, sensor, settings: Settings) -> str:
     ]
     lines += [f"used: {name}" for name in used]
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
-    if (p.splat or p.connections != "none") and settings.stored_vertices < settings.max_depth:
+    if (p.splat or p.arrival or p.connections != "none") and settings.stored_vertices < settings.max_depth:
         lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
-    lines += [f"lost: {text}" for text in lost_paths(scene, emitters, p, settings)]
+    lines += [f"lost: {text}" for text in lost_paths(scene, emitters, camera, p, settings)]
+    if emitters.evaluated:
+        lines.append("slow: timed_sunsky cannot be called while a kernel is recorded as a whole")
     return "\n".join(lines)
 
 
-def lost_paths(scene, emitters: Emitters, p, settings: Settings) -> list[str]:
+def lost_paths(scene, emitters: Emitters, camera: Sensor, p, settings: Settings) -> list[str]:
     """Paths that no strategy in use can make, one text each."""
-    deltas = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in scene_bsdfs(scene))
-    if not (deltas and emitters.delta):
-        return []
     lost = []
-    if not p.splat:
-        lost.append("delta emitter, delta surfaces, a surface that the sensor sees (needs t=1)")
-    if p.connections == "none":
-        lost.append(
-            "delta emitter, delta surfaces, two other surfaces or more, delta surfaces, sensor "
-            "(needs inner connections)"
-        )
-    lost.append(
-        "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
-        "neighbours can be joined)"
-    )
-    if p.light and settings.stored_vertices < settings.max_depth:
-        lost.append(
-            "delta emitter, delta surface, ... on paths longer than "
-            f"{settings.stored_vertices} edges (stored_vertices)"
-        )
+    deltas = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in scene_bsdfs(scene))
+    deltas = deltas and emitters.unhittable
+    starts = ["delta emitter, delta surfaces"] * deltas + ["directionalarea"] * emitters.beams
+    if not p.arrival:  # t = 0 finds all that follow
+        for start in starts:
+            if not p.splat:
+                lost.append(f"{start}, a surface that the sensor sees (needs t=1)")
+            if p.connections == "none":
+                lost.append(
+                    f"{start}, two other surfaces or more, delta surfaces or none, sensor "
+                    "(needs inner connections)"
+                )
+        if deltas:
+            lost.append(
+                "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
+                "neighbours can be joined)"
+            )
+        if not camera.delta and (deltas or emitters.beams):
+            lost.append(f"{' or '.join(starts)}, sensor (needs t=0)")
+    if starts and p.light and settings.stored_vertices < settings.max_depth:
+        longest = settings.stored_vertices
+        lost.append(f"{' or '.join(starts)}, ... on paths longer than {longest} edges (stored_vertices)")
     return lost
 
 
@@ -537,19 +583,30 @@ def _resolve(scene, sensor):
 
 
 def _samples(sensor, spp, settings) -> int:
-    spp = integer(spp, "spp", 0)  # 0: the sampler's sample_count
-    sampler = sensor.sampler()
-    if spp and settings.points == "sampler":
-        sampler = sampler.clone()
-        sampler.set_sample_count(spp)  # stratified samplers round it
-        spp = 0
-    spp = int(spp or sampler.sample_count())
+    """Samples per pixel of a render that was asked for ``spp``."""
+    spp = integer(spp, "spp", 0) or int(sensor.sampler().sample_count())
     if settings.variance and spp < REPLICATES:
         raise ValueError(
             f"bdpt: variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
             "samples per pixel, one for each independent part of the render"
         )
+    if settings.points == "sampler":
+        return _whole_sets(sensor.sampler().clone(), spp, REPLICATES if settings.variance else 1)
     return spp
+
+
+def _whole_sets(sampler, spp: int, parts: int) -> int:
+    """``spp``, rounded up so that each of ``parts`` (see `schedule`) is a number of samples that the
+    sampler makes: stratified ones do not make any."""
+
+    def made(count):
+        sampler.set_sample_count(count)
+        return int(sampler.sample_count())
+
+    most = -(-spp // parts)
+    if all(made(count) == count for count in {spp // parts, most}):
+        return spp
+    return parts * made(most)
 
 
 def _log(statistics: dict):

@@ -46,11 +46,13 @@ class Counters:
 
 @dataclass
 class Shared:
-    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves."""
+    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves; ``u_wavelength``
+    chose the wavelengths, ``weight`` is 1 / their density."""
 
     time: object
     wavelengths: object
     weight: object
+    u_wavelength: object
 
 
 @dataclass(frozen=True)
@@ -84,16 +86,19 @@ class Kernel:
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
         self._reach = u32(reach)
         self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)
-        self.last_light = u32(max(reach - 1 if plan.splat else reach - 2, 0))
+        self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
+        after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
+        self.last_light = u32(max(reach - after, 0))
         self.served = u32(plan.served)
         self.coefficient_splat = f32(count * plan.splat_coefficient if plan.splat else 0)
         self.coefficient_endpoints = f32(count if plan.endpoints else 0)
+        self.coefficient_arrival = f32(count if plan.arrival else 0)
         self.coefficient_inner = f32(inner)
         self.inverse_threshold = f32(dr.inf)
 
     def bound(self, points, count_light: float) -> Kernel:
         """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
-        camera subpath, which the estimates of t = 1 are divided by (weights keep the nominal one)."""
+        camera subpath, which the estimates of t <= 1 are divided by (weights keep the nominal one)."""
         other = copy(self)
         other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
         return other
@@ -108,15 +113,6 @@ class Kernel:
         rounded = dr.exp2(dr.round(dr.log2(0.1 * mean)))
         self.inverse_threshold = mi.Float(dr.select(mean > 0, dr.rcp(rounded), dr.inf))
         dr.eval(self.inverse_threshold)
-
-    def to_rgb(self, value, wavelengths):
-        """Linear sRGB of a spectrum."""
-        value = mi.unpolarized_spectrum(value)
-        if mi.is_spectral:
-            return mi.spectrum_to_srgb(value, wavelengths)
-        if mi.is_monochromatic:
-            return mi.Color3f(value.x)
-        return mi.Color3f(value)
 
 
 def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
@@ -185,7 +181,7 @@ class _Places:
 
     def pixel(self, slot):
         pixel, _ = self._split(slot)
-        return self._camera.pixel(pixel)
+        return self._camera.region.pixel(pixel)
 
 
 def _shared(kernel, stream) -> Shared:
@@ -195,10 +191,10 @@ def _shared(kernel, stream) -> Shared:
         u = points.draw_1d("light", stream, Purpose.TIME)
         time += u * sensor.shutter_open_time()
     if not mi.is_spectral:
-        return Shared(time, mi.Color0f(), mi.Spectrum(1))
+        return Shared(time, mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
-    return Shared(time, wavelengths, weight)
+    return Shared(time, wavelengths, weight, u)
 
 
 def _light_subpath(kernel, film, stream, shared, path, counters):
@@ -236,8 +232,11 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         complete=lambda si, first: emitters.connection_density(e, si, first),
     )
 
-    def visit(vertex, state):
+    def visit(vertex, state, walk):
         path, counters = state
+        if kernel.plan.arrival:
+            c, position = connect.arrive(kernel, e, vertex, walk)
+            _deposit_splat(kernel, film, c, position, shared, counters)
         if kernel.plan.splat:
             c, position = connect.splat(kernel, vertex, stream, counters)
             _deposit_splat(kernel, film, c, position, shared, counters)
@@ -257,35 +256,18 @@ def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
     stream = points.stream("camera", place.index(slot), slot)
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
     u_lens = mi.Point2f(0.5)
-    if kernel.camera.lens:
+    if kernel.camera.needs_aperture_sample:
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
     start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
-    active = active & (kernel.max_depth >= 1)
-    ray = start.ray
-    if plan.hide_emitters:
-        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.quadrics, ray, active, coherent=True)
-    else:
-        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    walk = Walk(
-        pi=pi,
-        ray=ray,
-        previous=start.p,
-        throughput=mi.Spectrum(1),
-        partial=mis.Partial(kernel.heuristic.start(dr.rcp(start.pdf_w)), mi.Float(0)),
-        reference=mi.Float(1),
-        eta=mi.Float(1),
-        edges=mi.UInt32(1),
-        seen=mi.Bool(False),
-        broken=mi.Bool(False),
-        active=active,
-    )
+    covered, active = active, active & (kernel.max_depth >= 1)
+    walk = _camera_walk(kernel, start, active)
 
     def add(c, total):
         if kernel.strategy_images:
             _deposit_strategy(kernel, film, c, start.counted, shared)
         return total + c.weighted()
 
-    def visit(z, state):
+    def visit(z, state, _):
         radiance, counters = state
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
@@ -304,41 +286,82 @@ def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
             radiance += connect.connect_one(kernel, z, path, stream, counters)
         return radiance, counters
 
-    side = Side("camera", False, kernel.max_depth, kernel.coefficient_splat, alpha=film.alpha)
+    side = Side(
+        "camera",
+        False,
+        kernel.max_depth,
+        kernel.coefficient_splat,
+        alpha=film.alpha,
+        parallel=kernel.camera.parallel,
+    )
     state = (dr.zeros(mi.Spectrum), counters)
     (radiance, counters), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters.camera += dr.select(active, walk.traced(), 0)
-    dropped = _deposit_camera(kernel, film, start.counted, radiance, walk.seen, shared, active)
+    features = []
+    if film.features is not None:
+        features = film.features.sample(points, stream, start.position, u_lens, shared.time, covered)
+    dropped = _deposit_camera(kernel, film, start.counted, radiance, walk.seen, features, shared, covered)
     counters.non_finite += dr.select(dropped | walk.broken, mi.UInt32(1), mi.UInt32(0))
     return counters
 
 
-def _deposit_camera(kernel, film, position, radiance, seen, shared, active):
+def _camera_walk(kernel, start, active) -> Walk:
+    """A camera subpath on its first edge."""
+    ray, weight = start.ray, mi.Spectrum(start.weight)
+    if kernel.plan.hide_emitters:
+        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.quadrics, ray, active, coherent=True)
+    else:
+        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    return Walk(
+        pi=pi,
+        ray=ray,
+        previous=start.p,
+        throughput=weight,
+        partial=_first_partial(kernel, start),
+        reference=dr.max(dr.abs(mi.unpolarized_spectrum(weight))),
+        eta=mi.Float(1),
+        edges=mi.UInt32(1),
+        seen=mi.Bool(False),
+        broken=mi.Bool(False),
+        active=active,
+    )
+
+
+def _first_partial(kernel, start):
+    """Partial sums of a camera subpath's first edge: t = 1 is its newest alternative, t = 0 an older one."""
+    h = kernel.heuristic
+    arrival = (
+        h.scale(h.start(start.arrival), kernel.coefficient_arrival) if kernel.plan.arrival else mi.Float(0)
+    )
+    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
+
+
+def _deposit_camera(kernel, film, position, radiance, seen, features, shared, active):
     """Add a camera sample; returns the mask of samples that count as zero for want of a finite value."""
-    rgb = kernel.to_rgb(radiance * shared.weight, shared.wavelengths)
-    finite = dr.all(dr.isfinite(rgb))
+    colours = film.colour(radiance * shared.weight, shared.wavelengths)
+    finite = dr.all(dr.isfinite(colours))
     opaque = seen
     if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
-        opaque = mi.Bool(True)  # `path`: a visible environment covers the image
+        opaque = kernel.max_depth >= 1  # `path`: a visible environment covers the image
     alpha = dr.select(opaque, mi.Float(1), mi.Float(0))
-    film.put_camera(position, dr.select(finite, rgb, 0), alpha, active)
+    film.put_camera(position, dr.select(finite, colours, 0), alpha, features, active)
     return active & ~finite
 
 
 def _deposit_splat(kernel, film, c, position, shared, counters):
-    """Add a contribution with t = 1; without finite value it counts as zero."""
-    value = kernel.to_rgb(c.weighted() * shared.weight, shared.wavelengths)
+    """Add a contribution with t <= 1; without finite value it counts as zero."""
+    value = film.colour(c.weighted() * shared.weight, shared.wavelengths)
     finite = dr.all(dr.isfinite(value))
     counters.non_finite += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
     film.put_light(position, value, c.active & finite)
     if kernel.strategy_images:
-        unweighted = kernel.to_rgb(c.value * shared.weight, shared.wavelengths)
+        unweighted = film.colour(c.value * shared.weight, shared.wavelengths)
         film.put_strategy(position, value, unweighted, c.s, c.t, c.active & finite)
 
 
 def _deposit_strategy(kernel, film, c, position, shared):
-    weighted = kernel.to_rgb(c.weighted() * shared.weight, shared.wavelengths)
-    unweighted = kernel.to_rgb(c.value * shared.weight, shared.wavelengths)
+    weighted = film.colour(c.weighted() * shared.weight, shared.wavelengths)
+    unweighted = film.colour(c.value * shared.weight, shared.wavelengths)
     finite = dr.all(dr.isfinite(weighted))
     film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
 

@@ -9,8 +9,9 @@ from numbers import Integral, Real
 
 import numpy as np
 
-from . import mis, points
+from . import features, mis, points
 from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
+from .strategies import layer_names
 
 # What numbers mean, for messages.
 MEANING = {
@@ -68,13 +69,33 @@ def _light_paths(props):
     return number
 
 
+def _aovs(props):
+    value = props.get("aovs", "")
+    if not isinstance(value, str):
+        raise TypeError(f"bdpt: aovs={value!r} must be a string, for example 'albedo:albedo,nn:sh_normal'")
+    features.check_syntax(value)
+    return value
+
+
+def _check_layers(settings: Settings):
+    """Raise ``ValueError`` if two layers of the film have the same name."""
+    seen = set()
+    names = features.feature_names(settings.aovs)
+    for layer in layer_names(settings.strategy_depth, settings.variance, names):
+        if layer in seen:
+            raise ValueError(
+                f"bdpt: aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
+            )
+        seen.add(layer)
+
+
 def _check_names(props):
     """Raise ``ValueError`` for parameters that do not exist, ``NotImplementedError`` for some that will."""
     known = [f for f in Settings.__dataclass_fields__]
     for name in props.keys():
         if name in known:
             continue
-        if name in ("aovs", "decisions"):
+        if name == "decisions":
             raise NotImplementedError(f"bdpt: {name} is not supported yet; leave it out")
         remedy = {"samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass"}.get(name)
         if remedy is None:
@@ -105,6 +126,7 @@ def read_settings(props) -> Settings:
         ),
         strategy_images=_boolean(props, "strategy_images"),
         variance=_boolean(props, "variance"),
+        aovs=_aovs(props),
         spp_per_pass=integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
         timeout=float(timeout),
     )
@@ -113,4 +135,5 @@ def read_settings(props) -> Settings:
             f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
             "set max_depth, for example to 5"
         )
+    _check_layers(settings)
     return settings

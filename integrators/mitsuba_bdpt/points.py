@@ -5,9 +5,10 @@ Every draw names its purpose and the vertex it serves, so that the point set can
 * ``sobol``: Owen-scrambled Sobol' pairs, padded, for the purposes in `STRATIFIED` at every vertex:
   one sequence over all samples of the image in pixel order (all samples of a pixel are neighbours
   in it, so each pixel holds a net, and so does each power-of-two group of pixels).
-* ``sampler``: the scene's own sampler for the first dimensions, see `_SAMPLER_TABLE`. Not for more:
-  Mitsuba's stratified samplers correlate pairs of dimensions (0.95 for ``stratified`` at 16
-  samples), which roulette and light choice would turn into visible structure.
+* ``sampler``: the scene's own sampler for the first dimensions, see `SAMPLER_TABLE`; more would take
+  memory and gain little. A path takes each number from another pixel's sequence of the sampler:
+  those of one sequence are correlated (0.92 for ``stratified`` at 4 samples, 0.25 for ``ldsampler``
+  at any number), which would bias the image. Figures: docs/samplers.md.
 * ``independent``: hashed numbers throughout.
 
 All else is hashed: a number is a function of seed, sample, vertex and purpose, so that no
@@ -63,8 +64,9 @@ STRATIFIED = {
     },
 }
 
-# What the scene's sampler provides, in this order: (side, purpose, vertex, dimensions).
-_SAMPLER_TABLE = (
+# What the scene's sampler provides, in this order: (side, purpose, vertex, dimensions). Row k of pixel p
+# comes from the sampler's sequence p + k.
+SAMPLER_TABLE = (
     ("camera", Purpose.FILM, 0, 2),
     ("camera", Purpose.APERTURE, 0, 2),
     ("camera", Purpose.EMITTER, 1, 2),
@@ -94,19 +96,26 @@ class Stream:
 class Points:
     """Hands out `Stream` objects and draws from them.
 
-    ``kind`` one of `POINTS`; ``seed`` the render's seed (``mi.UInt32``); ``sampler`` the scene's
-    sampler, seeded for the pass (only for ``kind="sampler"``).
+    ``kind`` one of `POINTS`; ``seed`` the render's seed (``mi.UInt32``); only for ``kind="sampler"``:
+    ``sampler`` the scene's sampler, seeded for the `sequences` of the pass with ``samples`` of each.
     """
 
-    def __init__(self, kind: str, seed, sampler=None):
+    def __init__(self, kind: str, seed, sampler=None, samples: int = 1):
         self.kind = kind
         self.seed = seed
         self._table = None
         if kind == "sampler":
             self._table = [
-                sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in _SAMPLER_TABLE
+                sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in SAMPLER_TABLE
             ]
             dr.eval(self._table)
+            self._samples = dr.opaque(mi.UInt32, samples)
+            self._slots = dr.opaque(mi.UInt32, dr.width(self._table[0]))
+
+    @staticmethod
+    def sequences(pixels: int) -> int:
+        """How many sequences of the scene's sampler a pass over so many pixels takes."""
+        return pixels + len(SAMPLER_TABLE) - 1
 
     def stream(self, side: str, index, slot) -> Stream:
         """Numbers of one subpath.
@@ -118,10 +127,12 @@ class Points:
         low, seed = sobol.split_index(index, side_seed)
         first = {}
         if self._table is not None:
-            for (owner, purpose, vertex, dims), values in zip(_SAMPLER_TABLE, self._table, strict=True):
+            for row, (owner, purpose, vertex, dims) in enumerate(SAMPLER_TABLE):
                 if owner == side:
                     kind = mi.Float if dims == 1 else mi.Point2f
-                    first[purpose, vertex] = dr.gather(kind, values, slot)
+                    at = slot + row * self._samples
+                    # The last lane may have slots behind the pass's last.
+                    first[purpose, vertex] = dr.gather(kind, self._table[row], at, at < self._slots)
         # A bijection of the index: no two of 2^32 samples of a sequence share their numbers.
         return Stream(dr.brev(low), sobol.mix(seed), sobol.mix(low ^ _KEY), first)
 

@@ -267,7 +267,16 @@ def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exp
     for key, value in attributes.items():
         image.metadata()[key] = value
     write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        bitmap = grey(pixels[..., : film.base_channels_count()])
     write_whole(developed(bitmap, exposure), output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
+
+
+def grey(bands: np.ndarray) -> mi.Bitmap:
+    """What a film without colours shows on a screen: the mean of its `bands`, whose units are the user's
+    own, so bright that one pixel in a hundred is white."""
+    mean = np.mean(bands, axis=-1, dtype=np.float32, keepdims=True)
+    return mi.Bitmap(mean / max(np.quantile(mean, 0.99), 1e-30), mi.Bitmap.PixelFormat.Y)
 
 
 def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 
 def strategies(depth: int):
-    """All ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, t >= 1, in order."""
-    return [(k, s, k + 1 - s) for k in range(1, depth + 1) for s in range(k + 1)]
+    """All ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, in order: k + 2 of each length."""
+    return [(k, s, k + 1 - s) for k in range(1, depth + 1) for s in range(k + 2)]
 
 
 def strategy_count(depth: int) -> int:
     """How many strategies make the paths of up to ``depth`` edges."""
-    return depth * (depth + 3) // 2
+    return depth * (depth + 5) // 2
 
 
 def strategy_index(s, t):
     """Place of the strategy (s, t) in `strategies`; integers or arrays of them."""
     k = s + t - 1
-    return (k - 1) * (k + 2) // 2 + s
+    return (k - 1) * (k + 4) // 2 + s
 
 
-def layer_names(depth: int, variance: bool) -> list[str]:
-    """Names of the film's layers, in the order in which `Accumulator` keeps them: the variance of the
-    pixels, and technique images of paths of up to ``depth`` edges."""
-    names = [f"variance.{channel}" for channel in "RGB"] if variance else []
+def layer_names(depth: int, variance: bool, features=(), colours=("R", "G", "B")) -> list[str]:
+    """Names of the film's layers, in the order in which `Accumulator` keeps them: ``features``, the
+    variance of the pixels in the film's ``colours``, and technique images of paths of up to ``depth``
+    edges."""
+    names = [*features, *(f"variance.{colour}" for colour in colours if variance)]
     return names + [
         f"{kind}.s{s}t{t}.{channel}"
         for _, s, t in strategies(depth)

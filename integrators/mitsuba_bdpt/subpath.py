@@ -71,7 +71,7 @@ class Side:
     alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera
     side). ``complete``: called with the first vertex of a light subpath, returns the density of
     next-event estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event
-    other than null happened.
+    other than null happened. ``parallel``: the first edge has one direction, its density is one across it.
     """
 
     name: str
@@ -80,17 +80,18 @@ class Side:
     coefficient: object
     complete: object = None
     alpha: bool = False
+    parallel: bool = False
 
 
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
 
-    ``visit(vertex, state)`` returns the new state.
+    ``visit(vertex, state, walk)`` returns the new state; ``walk`` as it was before it arrived.
     """
 
     def body(walk, state):
         vertex = _arrive(kernel, side, walk)
-        state = visit(vertex, state)
+        state = visit(vertex, state, walk)
         return _leave(kernel, side, walk, vertex, stream), state
 
     walk, state = dr.while_loop(
@@ -122,6 +123,8 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
         density = dr.select(first, side.complete(si, first), 1)
         partial = mis.Partial(h.scale(partial.d_vcm, density), partial.d_vc)
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
+    if side.parallel:
+        dist2 = dr.select(walk.edges == 1, 1, dist2)
     # A hit at exactly zero cosine has probability zero; its densities would be infinite.
     hit &= cos > 0
     in_area = mis.arrive(h, partial, dist2, cos)

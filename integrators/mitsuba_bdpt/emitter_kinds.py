@@ -1,0 +1,176 @@
+"""What kinds of emitters there are, and what each can do."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from .objects import children, number
+
+# The first four emit from surfaces or points, the next two from infinity; a directional area has no
+# direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
+# radiance: it can be hit and no more. UNKNOWN are classes that are not Mitsuba's: only the calls that camera
+# subpaths need are used.
+AREA, POINT, SPOT, PROJECTOR, INFINITE, DIRECTIONAL, DIRECTIONAL_AREA, UNSAMPLED, UNKNOWN = range(9)
+
+_KINDS = {
+    "AreaLight": AREA,
+    "PointLight": POINT,
+    "SpotLight": SPOT,
+    "Projector": PROJECTOR,
+    "DirectionalEmitter": DIRECTIONAL,
+    "DirectionalArea": DIRECTIONAL_AREA,
+    "ConstantBackgroundEmitter": INFINITE,
+    "EnvironmentMapEmitter": INFINITE,
+    "SunskyEmitter": INFINITE,
+    "TimedSunskyEmitter": INFINITE,
+}
+
+# Emitters at a point: their intensity is asked of Mitsuba, their density of emission is known here.
+POSITIONS = (POINT, SPOT, PROJECTOR)
+
+# Shapes whose textured radiance Mitsuba samples rightly. On a cylinder the points have other densities than
+# stated (0.4 to 1.6 times), on a mesh all faces with the same texture coordinates share one density but
+# only one face is sampled (a cube: a sixth).
+_TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
+
+_CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
+_SAMPLED = _TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
+
+
+def kind_of(emitter) -> int:
+    """The kind of an emitter; raises ``ValueError`` for one that Mitsuba itself renders inconsistently, and
+    ``NotImplementedError`` for one that it cannot sample."""
+    kind = _KINDS.get(emitter.class_name(), UNKNOWN)
+    if kind == INFINITE and "to_world" in mi.traverse(emitter):
+        _check_rotation(emitter)
+    if kind == AREA and not _tells_its_points(emitter):
+        return UNSAMPLED
+    return kind
+
+
+def _tells_its_points(emitter) -> bool:
+    """Whether the points that the shape of an area light samples have a density and a radiance."""
+    shape = emitter.get_shape()
+    if shape.shape_type() in _CURVES:
+        raise NotImplementedError(
+            f"bdpt: emitter '{emitter.id()}' is on a curve ('{shape.id()}'), which Mitsuba's emitters cannot "
+            "sample; use a cylinder or a mesh"
+        )
+    sampled = shape.shape_type() in _SAMPLED
+    if not sampled and number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
+        return False
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+        check_coordinates(emitter)
+    return not _reads_attributes(children(emitter)["radiance"])
+
+
+def _reads_attributes(texture) -> bool:
+    """Whether a texture reads a mesh's attributes, which need the number of a face; a sample has none."""
+    if texture.class_name() == "MeshAttribute":
+        return True
+    inner = (value for value in children(texture).values() if isinstance(value, mi.Texture))
+    return any(_reads_attributes(value) for value in inner)
+
+
+def is_hittable(emitter, kind: int) -> bool:
+    """Whether a camera subpath can hit the emitter."""
+    if kind == UNKNOWN:
+        return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+    return kind in (AREA, INFINITE, UNSAMPLED)
+
+
+def is_lit_directly(kind: int) -> bool:
+    """Whether next-event estimation can choose the emitter."""
+    return kind not in (DIRECTIONAL_AREA, UNSAMPLED)
+
+
+def is_traced(kind: int) -> bool:
+    """Whether light subpaths can start from the emitter."""
+    return kind not in (UNSAMPLED, UNKNOWN)
+
+
+_WHY_NOT = {
+    DIRECTIONAL_AREA: "its light leaves in one direction only",
+    UNSAMPLED: "no points of it with a known radiance can be sampled; it can only be hit",
+    UNKNOWN: "its class is not Mitsuba's: only the calls that camera subpaths need are used",
+}
+
+
+def left_out(emitter, kind: int) -> list[tuple[str, str]]:
+    """What an emitter cannot take part in, and why."""
+    names = ["s=1"] * (not is_lit_directly(kind)) + ["light subpaths"] * (not is_traced(kind))
+    return [(f"{name} of emitter '{emitter.id()}'", _WHY_NOT[kind]) for name in names]
+
+
+def needs_evaluation(emitter) -> bool:
+    """Whether the emitter's calls fail while a kernel is recorded: it asks for the value of a mask."""
+    return emitter.class_name() == "TimedSunskyEmitter"
+
+
+def is_textured(emitter, kind: int) -> bool:
+    """Whether an area light has another radiance at each of its points."""
+    return kind == AREA and mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+
+
+def is_sampled_by_texture(emitter, kind: int) -> bool:
+    """Whether Mitsuba chooses a point of the emitter by its texture, and rightly."""
+    return is_textured(emitter, kind) and emitter.get_shape().shape_type() in _TEXTURE_SAMPLED
+
+
+def check_coordinates(emitter):
+    """Raise ``ValueError`` for a texture on a mesh that has no texture coordinates."""
+    shape = emitter.get_shape()
+    if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
+        raise ValueError(
+            f"bdpt: emitter '{emitter.id()}' has a textured radiance on a mesh without texture coordinates "
+            f"('{shape.id()}'); make the radiance uniform, or give the mesh coordinates"
+        )
+
+
+def refuse_curves(scene, emitter, why: str):
+    """Raise ``NotImplementedError`` if a call on shapes, which ``emitter`` needs, would meet curves: they
+    have no ``sample_position``."""
+    for shape in scene.shapes():
+        if shape.shape_type() in _CURVES:
+            raise NotImplementedError(
+                f"bdpt: emitter '{emitter.id()}' {why}, which is not supported beside curves "
+                f"('{shape.id()}'); remove one of them, or use integrator type 'path'"
+            )
+
+
+def _check_rotation(emitter):
+    """Raise ``ValueError`` unless the ``to_world`` of an environment keeps lengths: with any other matrix
+    Mitsuba's own calls disagree with each other (next-event estimation four times the radiance)."""
+    columns = _columns(emitter)
+    if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
+        raise ValueError(
+            f"bdpt: to_world of {_plugin(emitter)} '{emitter.id()}' is not a rotation (the lengths of its "
+            f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
+        )
+
+
+def check_projector(emitter):
+    """Raise ``ValueError`` if the ``to_world`` of a projector distorts angles."""
+    columns = _columns(emitter)
+    scale = np.linalg.norm(columns, axis=0).mean()
+    if not np.allclose(columns.T @ columns, np.eye(3) * scale**2, atol=1e-3 * scale**2):
+        raise ValueError(
+            f"bdpt: to_world of projector '{emitter.id()}' distorts angles (the lengths of its columns are "
+            f"{_lengths(columns)}); leave out scaling and shear, and set fov instead"
+        )
+
+
+def _columns(emitter):
+    matrix = mi.traverse(emitter)["to_world"].matrix
+    return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+
+
+def _lengths(columns) -> str:
+    return ", ".join(f"{x:.4g}" for x in np.linalg.norm(columns, axis=0))
+
+
+def _plugin(emitter) -> str:
+    return {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}.get(
+        emitter.class_name(), emitter.class_name().removesuffix("Emitter").lower()
+    )

@@ -1,0 +1,37 @@
+"""What Mitsuba's objects hold."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+
+
+def number(x) -> float:
+    """A number of Python from one of Dr.Jit."""
+    return float(dr.slice(x) if dr.is_array_v(x) else x)
+
+
+def children(owner) -> dict:
+    """What ``owner`` holds, by name: objects and numbers, as its ``traverse`` reports them."""
+    return _collector(mi.variant())().of(owner)
+
+
+@cache
+def _collector(variant: str):
+    """The class that collects, one per variant. (Made anew for each call it would be garbage that only the
+    cycle collector frees; until then it keeps emitters alive beyond their scene, and the next virtual call of
+    any scene crashes.)"""
+
+    class Collector(mi.TraversalCallback):
+        def of(self, owner) -> dict:
+            self.found = {}
+            owner.traverse(self)
+            found, self.found = self.found, {}
+            return found
+
+        def put(self, name, value, flags, cpptype=None):
+            self.found[name] = value
+
+    return Collector

@@ -1,0 +1,316 @@
+"""Feature layers: the parameter `aovs`, against Mitsuba's integrator `aov`."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from metrics import sidak
+from welch import LEVEL, Comparisons, assert_agree, compare_images
+
+T = mi.ScalarTransform4f
+
+ALL = (
+    "albedo:albedo,dd.y:depth, pos:position uv:uv,ng:geo_normal,nn:sh_normal,"
+    "du:dp_du,dv:dp_dv,dx:duv_dx,dy:duv_dy,prim:prim_index,shape:shape_index"
+)
+ALL_NAMES = [
+    *("albedo.R", "albedo.G", "albedo.B", "dd.y.T", "pos.X", "pos.Y", "pos.Z", "uv.U", "uv.V"),
+    *(f"{name}.{axis}" for name in ("ng", "nn", "du", "dv") for axis in "XYZ"),
+    *("dx.U", "dx.V", "dy.U", "dy.V", "prim.I", "shape.I"),
+]
+
+
+class Fixed(mi.Sampler):
+    """Every number is the same: the samples of a pixel see the same point, in every integrator."""
+
+    def __init__(self, props=None):
+        super().__init__(mi.Properties() if props is None else props)
+
+    def clone(self):
+        return Fixed()
+
+    fork = clone
+
+    def next_1d(self, active=True):
+        return dr.full(mi.Float, 0.3, self.wavefront_size())
+
+    def next_2d(self, active=True):
+        return mi.Point2f(self.next_1d(), 0.8)
+
+
+def bitmap():
+    y, x = np.mgrid[0:16, 0:16] / 16
+    return mi.Bitmap(np.stack([x, y, 0.5 + 0 * x], axis=-1).astype(np.float32))
+
+
+def film(kind="hdrfilm", **keys):
+    keys = {"width": 12, "height": 10, "component_format": "float32"} | keys
+    return {"type": kind} | keys | {"rfilter": {"type": keys.get("rfilter", "box")}}
+
+
+def sensor(film, **keys):
+    to_world = mi.ScalarTransform4f().look_at([1, 1.5, 4], [0, 0.4, 0], [0, 1, 0])
+    return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film} | keys
+
+
+def scene(sensor):
+    """Textured, bumpy, hidden and glowing things before nothing."""
+    t = mi.ScalarTransform4f()
+    texture = {"type": "bitmap", "bitmap": bitmap(), "raw": mi.is_rgb}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor,
+            "floor": {
+                "type": "rectangle",
+                "to_world": t.rotate([1, 0, 0], -90).scale(2),
+                "bsdf": {"type": "diffuse", "reflectance": texture},
+            },
+            "ball": {
+                "type": "sphere",
+                "center": [-0.5, 0.6, 0],
+                "radius": 0.6,
+                "bsdf": {
+                    "type": "bumpmap",
+                    "texture": {"type": "bitmap", "bitmap": bitmap(), "raw": True},
+                    "scale": 2.0,
+                    "bsdf": {"type": "plastic", "diffuse_reflectance": 0.3},
+                },
+            },
+            "box": {
+                "type": "cube",
+                "to_world": t.translate([0.8, 0.3, 0.3]).rotate([0, 1, 0], 30).scale(0.3),
+            },
+            "lamp": {
+                "type": "sphere",
+                "center": [0.2, 1.2, 1],
+                "radius": 0.2,
+                "emitter": {"type": "area", "radiance": 5.0},
+            },
+        }
+    )
+
+
+def layers(method, target, spp, seed=0):
+    """The layers of ``method``, without the image's colours."""
+    image = np.array(method.render(target, spp=spp, seed=seed), dtype=np.float64)
+    return image[..., image.shape[-1] - len(method.aov_names()) :]
+
+
+def aov(aovs=ALL):
+    return mi.load_dict({"type": "aov", "aovs": aovs})
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 3, "aovs": ALL} | parameters)
+
+
+@pytest.mark.parametrize(
+    ("film_keys", "sensor_keys", "parameters"),
+    [
+        ({}, {}, {}),
+        ({"rfilter": "gaussian", "pixel_format": "rgba"}, {}, {"hide_emitters": True}),
+        (
+            {"rfilter": "mitchell", "sample_border": True},
+            {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 4.0},
+            {"skip": "none"},
+        ),
+        (
+            {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 6, "crop_height": 7, "rfilter": "tent"},
+            {"principal_point_offset_x": 0.1},
+            {"spp_per_pass": 2},
+        ),
+        ({"rfilter": "lanczos"}, {}, {"variance": True, "strategy_images": True}),
+        ({"pixel_format": "luminance_alpha"}, {}, {"max_depth": 0}),
+    ],
+    ids=["plain", "hidden emitters", "thin lens, border", "crop, passes", "all layers", "depth 0"],
+)
+def test_features_are_those_of_aov(film_keys, sensor_keys, parameters):
+    """Rationale: features are Mitsuba's own, at our camera samples. With a sampler that always gives the
+    same number both integrators see the same points, so that there is no noise. Expected: all kinds of
+    layers equal `aov`'s in every pixel for any film, sensor and parameter, except where its uv derivatives
+    are NaN, as its misses are; they follow the image and come before other layers. Tolerance: 1e-4 of a
+    layer's largest value (rays are set up in another order; sums in single precision).
+    """
+    mi.register_sampler("fixed", Fixed)
+    target = scene(sensor(film(**film_keys), sampler={"type": "fixed"}, **sensor_keys))
+    integrator = bdpt(points="sampler", **parameters)
+    spp = 16 if "variance" in parameters else 4
+    names, result = integrator.aov_names(), layers(integrator, target, spp)
+    assert names[: len(ALL_NAMES)] == ALL_NAMES
+    held = layer_names(target)
+    assert held[target.sensors()[0].film().base_channels_count() :] == names
+    expected = layers(aov(), target, spp)
+    result, defined = result[..., : len(ALL_NAMES)], np.isfinite(expected)
+    assert defined.mean() > 0.9 and np.isfinite(result).all()
+    scale = np.abs(np.where(defined, expected, 0)).max((0, 1))
+    assert (scale > 0).all()
+    difference = np.where(defined, np.abs(result - expected), 0).max((0, 1)) / scale
+    assert difference.max() < 1e-4, dict(zip(ALL_NAMES, difference, strict=True))
+    assert integrator.statistics["rays"]["features"] == spp * region(target)
+
+
+def layer_names(target):
+    return [channel.name for channel in target.sensors()[0].film().bitmap().struct_()]
+
+
+def region(target):
+    """How many pixels camera samples cover."""
+    film = target.sensors()[0].film()
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    return int(np.prod([int(n) + border for n in film.crop_size()]))
+
+
+def test_features_of_the_usual_points():
+    """Rationale: with points and splats as usual, features are the mean over the pixel. Expected: equal to
+    `aov` in every layer and tile of 2x2 pixels where `aov` has a value (see above). Statistic: Welch over
+    tiles with Sidak for all, 12 seeds a side, gaussian filter. (Layers share their samples, so that
+    p-values of all need not be uniform.)
+    """
+    target = scene(sensor(film(rfilter="gaussian", pixel_format="rgba")))
+
+    def tiles(method, seeds, spp):
+        images = np.stack([layers(method, target, spp, seed) for seed in seeds])
+        n, h, w, channels = images.shape
+        return images.reshape(n, h // 2, 2, w // 2, 2, channels).mean((2, 4)).reshape(n, -1, channels)
+
+    # The same number of samples: uv derivatives shrink with it.
+    a, b = tiles(bdpt(max_depth=2), range(12), 16), tiles(aov(), range(50, 62), 16)
+    defined = np.isfinite(b).all(0)
+    assert defined.mean() > 0.8 and np.isfinite(a).all()
+    found = Comparisons.join(
+        [compare_images(a[:, defined[:, i], i], b[:, defined[:, i], i], n) for i, n in enumerate(ALL_NAMES)]
+    )
+    worst = found.p.argmin()
+    assert found.continuous.sum() > 200
+    assert sidak(found.p) > LEVEL, found.labels[worst]
+
+
+def test_uv_derivatives_of_misses_are_zero():
+    """Expected: 0 in the upper left corner, which sees nothing, and not beside it on the floor."""
+    result = layers(bdpt(aovs="dx:duv_dx,dy:duv_dy", max_depth=1), scene(sensor(film())), 4)
+    assert (result[0, 0] == 0).all() and (result[-1, -1] != 0).all()
+
+
+def test_the_image_is_the_same_with_features():
+    """Expected: the image of a render without `aovs`, sample by sample (1e-4: atomic sums)."""
+    target = scene(sensor(film(rfilter="gaussian")))
+    plain = np.array(bdpt(aovs="", skip="none").render(target, spp=8, seed=3))
+    result = np.array(bdpt(skip="none").render(target, spp=8, seed=3))
+    assert plain.shape[-1] == 3
+    np.testing.assert_allclose(result[..., :3], plain, rtol=1e-4, atol=1e-5)
+
+
+def test_an_interrupted_render_keeps_features():
+    """Expected: after two of five passes the layers show the plane z = 1 (1e-5)."""
+
+    def interrupt(report):
+        if report.spp_done >= 2:
+            raise KeyboardInterrupt
+
+    to_world = T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    target = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(film(rfilter="gaussian"), to_world=to_world),
+            "wall": {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(9)},
+            "lamp": {"type": "point", "position": [0, 0, 5]},
+        }
+    )
+    integrator = bdpt(aovs="pos:position", spp_per_pass=1, skip="none")
+    integrator.on_pass = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        integrator.render(target, spp=5)
+    position = np.array(target.sensors()[0].film().develop())[..., 3:]
+    np.testing.assert_allclose(position[..., 2], 1, rtol=1e-5)
+    assert position[..., :2].min() < -0.5 and position[..., :2].max() > 0.5
+
+
+def test_spectral_albedo():
+    """Rationale: a spectral film's wavelengths follow its bands, which says nothing about RGB. Expected:
+    the albedo on a `specfilm`, between its bands and its weight, and on an `hdrfilm` is `aov`'s on an
+    `hdrfilm`. Statistic: Welch over tiles of 5x6 pixels, 12 seeds a side.
+    """
+    mi.set_variant("llvm_ad_spectral")
+    bands = {"near": {"type": "spectrum", "value": [(600, 0.0), (700, 1.0), (800, 0.0)]}}
+    aovs = "albedo:albedo,dd:depth"
+
+    def renders(target, integrator, seeds, spp):
+        result = np.stack([np.array(integrator.render(target, spp=spp, seed=s)) for s in seeds])
+        n, h, w, channels = result.shape
+        return result.reshape(n, h // 5, 5, w // 6, 6, channels).mean((2, 4)).reshape(n, -1, channels)
+
+    rgb, near = scene(sensor(film())), scene(sensor(film("specfilm", **bands)))
+    integrator = bdpt(aovs=aovs, max_depth=2)
+    b = renders(rgb, aov(aovs), range(50, 62), 256)
+    for target, first in ((rgb, 3), (near, 1)):
+        a = renders(target, integrator, range(12), 256)[..., first : first + 4]
+        assert layer_names(target)[first:] == ["albedo.R", "albedo.G", "albedo.B", "dd.T"]
+        assert_agree(compare_images(a.reshape(12, -1), b.reshape(12, -1)), at_least=8)
+
+
+@pytest.mark.parametrize(
+    ("aovs", "message"),
+    [
+        ("depth", "'depth' is not a pair name:kind; write for example"),
+        (":depth", "':depth' is not a pair"),
+        ("dd:", "'dd:' is not a pair"),
+        ("a:b:depth", "'b:depth' is not a kind of feature"),
+        ("dd:dept", "'dept' is not a kind of feature; did you mean depth.*shape_index"),
+        ("a:uv,a:duv_dx", "two layers a.U; give the feature another name"),
+        ("variance:albedo", "two layers variance.R"),
+        ("weighted.s0t2:albedo", "two layers weighted.s0t2.R"),
+    ],
+)
+def test_bad_features_are_named(aovs, message):
+    """Expected: ValueError before anything is rendered, with parameter, value and remedy. (Mitsuba puts
+    what a constructor raises into a RuntimeError.)"""
+    with pytest.raises((ValueError, RuntimeError), match=f"(?s)ValueError.*bdpt: aovs='{aovs}'.*{message}"):
+        bdpt(aovs=aovs, variance=True, strategy_images=True)
+
+
+def test_features_must_be_text():
+    with pytest.raises((TypeError, RuntimeError), match="(?s)TypeError.*aovs=3 must be a string"):
+        bdpt(aovs=3)
+
+
+@pytest.mark.parametrize("aovs", ["", " , "])
+def test_no_features(aovs):
+    """Expected: no layer, no rays of theirs."""
+    integrator = bdpt(aovs=aovs)
+    assert integrator.aov_names() == []
+    integrator.render(scene(sensor(film())), spp=1)
+    assert "features" not in integrator.statistics["rays"]
+
+
+def test_features_in_a_scene_file():
+    """Rationale: the plugin `aov` is loaded while a scene is, on the loader's threads. Expected: it works."""
+    text = """
+        <scene version="3.0.0">
+            <integrator type="bdpt"><string name="aovs" value="dd:depth, nn:sh_normal"/></integrator>
+            <sensor type="perspective"/>
+            <shape type="sphere"><emitter type="area"/></shape>
+        </scene>"""
+    names = mi.load_string(text, parallel=True).integrator().aov_names()
+    assert names == ["dd.T", "nn.X", "nn.Y", "nn.Z"]
+
+
+def test_features_leave_the_sampler_alone():
+    """Expected: the sensor's sampler gives after the render what it would have given without."""
+    target = scene(sensor(film(), sampler={"type": "stratified", "sample_count": 9}))
+    sampler = target.sensors()[0].sampler()
+    sampler.seed(3, 64)
+    expected = np.array(sampler.next_2d())
+    sampler.seed(3, 64)
+    bdpt().render(target, spp=4)
+    assert sampler.sample_count() == 9
+    np.testing.assert_array_equal(np.array(sampler.next_2d()), expected)
+
+
+def test_another_sample_count_does_not_recompile():
+    """Expected: the spread of ray differentials, which follows the samples per pixel, is no literal."""
+    target, integrator = scene(sensor(film())), bdpt(spp_per_pass=1)
+    integrator.render(target, spp=4)
+    dr.sync_thread()
+    integrator.render(target, spp=9)
+    assert integrator.statistics["kernels"]["compiled"] == 0

@@ -1,0 +1,470 @@
+"""Every kind of emitter with every kind of sensor: the image, the strategies, and what is left out.
+
+The reference is Mitsuba's `path`, or a closed form where it is blind. Scenes and the table of who takes part
+in what: `scene_parts`. In its open scene the geometry term is bounded, so that single strategies can be
+compared as well: all estimates of paths of k edges by different strategies have one mean.
+
+Statistics: the sample is the mean of a quarter of the image (and of all of it) in one render; renders of
+12 seeds. Against `path` Welch's t-test, against a known value and between the strategies of the same
+renders (which share subpaths) Student's of the differences; Sidak over all comparisons of a test, at 1e-4.
+Roulette is off (paths of up to 3 edges).
+"""
+
+import re
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import scene_parts as parts
+import welch as st
+
+LEVEL = 1e-4
+DEPTH = 3
+SEEDS = 12
+CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
+SAMPLES = 1 << 15  # of ours in a render; twice as many of `path`
+SAMPLES_OF_A_PIXEL = 1 << 14  # where there is one alone
+LEAST_SHARE = 0.9  # of the renders in which a tile must be lit to be compared
+
+ROOT = Path(__file__).resolve().parents[1]
+T = parts.T
+
+
+def renders(scene, method, samples, first_seed, seeds=SEEDS):
+    """Images of ``seeds`` renders, (seeds, height, width, channels)."""
+    width, height = scene.sensors()[0].film().crop_size()
+    pixels = width * height
+    spp = samples // pixels if pixels > 1 else samples * SAMPLES_OF_A_PIXEL // SAMPLES
+    return np.stack(
+        [np.array(method.render(scene, seed=first_seed + i, spp=spp), dtype=np.float64) for i in range(seeds)]
+    )
+
+
+def tiles(images):
+    """One number for each quarter of the images: (seeds, 4), or (seeds, 1) of a single pixel."""
+    count = 2 if images.shape[1] > 1 else 1
+    return np.stack([st.tile_means(image, count) @ CHANNELS for image in images[..., :3]])
+
+
+def bdpt(**parameters):
+    settings = {"max_depth": DEPTH, "rr_depth": 100, "skip": "none"} | parameters
+    return mi.load_dict({"type": "bdpt", **settings})
+
+
+def path(max_depth=DEPTH):
+    return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 100})
+
+
+def layer(images, method, kind, s, t):
+    """Tiles of the technique image (s, t); None if there is none."""
+    names = method.aov_names()
+    name = f"{kind}.s{s}t{t}.R"
+    if name not in names:
+        return None
+    first = images.shape[-1] - len(names) + names.index(name)
+    return tiles(images[..., first : first + 3])
+
+
+def paired(a, b, label):
+    """Student's test of the differences of two estimates from the same renders, tile by tile and for the
+    whole image, as far as both are lit: a few lumps are not normal."""
+    a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
+    lit = np.minimum((a != 0).mean(0), (b != 0).mean(0)) >= LEAST_SHARE
+    found = st.one_sample((a - b)[:, lit], 0.0, label)
+    found.continuous[:] = False  # not independent of each other: no test of uniformity
+    return found
+
+
+def assert_agree(comparisons):
+    st.assert_agree(st.Comparisons.join(comparisons), LEVEL, at_least=0)
+
+
+def precise(images, relative, label):
+    """The mean of all renders must be known well enough for the comparison to mean something."""
+    whole = images.mean(1)
+    error = whole.std(ddof=1) / np.sqrt(len(whole))
+    assert whole.mean() > 0, f"{label}: nothing to compare"
+    assert error < relative * whole.mean(), f"{label}: too noisy, {error / whole.mean():.2%}"
+
+
+# -- pairs ------------------------------------------------------------------------------------
+
+# `path` loses the emitter's light, or there is no equal for it.
+NO_REFERENCE = {
+    # The emitter's own shape stands between the scene and the sensor; see the known answers below.
+    ("directionalarea", "distant"),
+    # These see its dark outside only.
+    ("inside of a sphere", "distant"),
+    ("inside of a sphere", "distant, point"),
+    ("inside of a sphere", "distant, shape"),
+}
+PAIRS = [(e, s) for e in parts.EMITTERS for s in parts.SENSORS if (e, s) not in NO_REFERENCE]
+
+# In every run: each emitter with a camera, each sensor with an emitter near and one at infinity, of which
+# one can be hit and one cannot, in turns.
+WITH_SENSORS = (("sphere", "directional"), ("spot", "envmap"))
+QUICK = {(e, s) for i, s in enumerate(parts.SENSORS) for e in WITH_SENSORS[i % 2]}
+
+
+def pairs(slow=lambda emitter, sensor: True):
+    """Parameters of a test for all pairs, those for which ``slow`` holds marked so."""
+    return [pytest.param(*p, marks=[pytest.mark.slow] * slow(*p), id=" + ".join(p)) for p in PAIRS]
+
+
+@pytest.mark.parametrize(
+    ("emitter", "sensor"), pairs(lambda e, s: not (s == "perspective" or (e, s) in QUICK))
+)
+def test_pair(emitter, sensor):
+    """Rationale: each pair has its own combination of strategies, measures and special cases.
+
+    Expected: the image with all strategies (skip=none) is `path`'s; the weighted layers add up to the image
+    (1e-4 of its mean: other orders of float32 sums); and for k = 1, 2, 3 every strategy that the table of
+    `scene_parts` gives to the pair has the mean of the first of them, all others are dark. Tolerance: the
+    mean of all renders is known to 1 %; see the module. Light that comes straight from a delta emitter is
+    out of sight (`path` misses it where the sensor has area).
+    """
+    scene = parts.pair(emitter, sensor)
+    method = bdpt(strategy_images=True)
+    images = renders(scene, method, SAMPLES, 0)
+    other = parts.pair(emitter, sensor, reference=True)
+    with parts.evaluated(emitter == "timed_sunsky"):
+        reference = tiles(renders(other, path(), 2 * SAMPLES, 1000))
+    label = f"{emitter} + {sensor}"
+    precise(tiles(images), 0.01, label)
+    found = [st.compare_images(reference, tiles(images), label)]
+    found += strategies(images, method, emitter, sensor)
+    assert_agree(found)
+
+    total = sum(
+        layer(images, method, "weighted", s, k + 1 - s)
+        for k in range(1, DEPTH + 1)
+        for s in range(k + 2)
+        if layer(images, method, "weighted", s, k + 1 - s) is not None
+    )
+    np.testing.assert_allclose(total, tiles(images), atol=1e-4 * tiles(images).mean())
+
+
+def strategies(images, method, emitter, sensor):
+    """Comparisons of the unweighted layers with each other; asserts that there is nothing where the
+    pair has no strategy."""
+    found = []
+    for k in range(1, DEPTH + 1):
+        first = None
+        for s in range(k + 2):
+            t = k + 1 - s
+            estimate = layer(images, method, "unweighted", s, t)
+            label = f"{emitter} + {sensor}, ({s},{t})"
+            if not parts.takes_part(emitter, sensor, s, t):
+                assert estimate is None or (estimate == 0).all(), label
+                continue
+            assert estimate is not None, f"{label}: no layer"
+            if first is None:
+                first, its = estimate, f"({s},{t})"
+            else:
+                found.append(paired(estimate, first, f"{label} against {its}"))
+    return found
+
+
+@pytest.mark.parametrize(("emitter", "sensor"), pairs())
+def test_pair_with_defaults(emitter, sensor):
+    """Rationale: as `test_pair`, with the default choice of what to skip: one light subpath for four camera
+    subpaths, one connection, roulette.
+
+    Expected: the image is `path`'s. Tolerance and statistic as there.
+    """
+    ours = tiles(renders(parts.pair(emitter, sensor), bdpt(skip="auto"), 2 * SAMPLES, 0))
+    other = parts.pair(emitter, sensor, reference=True)
+    with parts.evaluated(emitter == "timed_sunsky"):
+        reference = tiles(renders(other, path(), 2 * SAMPLES, 1000))
+    assert_agree([st.compare_images(reference, ours, f"{emitter} + {sensor}")])
+
+
+# -- what is left out -------------------------------------------------------------------------
+
+CLASSES = {"s=0": (0, 3), "s=1": (1, 2), "t=1": (2, 1), "t=0": (3, 0), "inner": (2, 2), "(1,1)": (1, 1)}
+
+
+# One emitter of each plugin; in every run one of those that take part in the same.
+PLUGINS = {parts.plugin_of(make()): name for name, make in reversed(parts.EMITTERS.items())}
+DISTINCT = {part: PLUGINS[plugin] for plugin, part in parts.EMITTER_PARTS.items()}.values()
+
+
+@pytest.mark.parametrize("sensor", parts.SENSORS)
+@pytest.mark.parametrize(
+    "emitter",
+    [pytest.param(e, marks=[pytest.mark.slow] * (e not in DISTINCT)) for e in PLUGINS.values()],
+)
+def test_explain_names_what_is_impossible(emitter, sensor):
+    """Rationale: a kind that cannot take part in a strategy is skipped in the open, not failed or ignored.
+
+    Expected: `explain` has a line `skipped (impossible): CLASS: why` for each class of strategies that the
+    table of `scene_parts` does not give to the pair, with a reason, and for no other; and a line that names
+    the emitter if no light subpath starts from it, or next-event estimation cannot choose it.
+    """
+    text = bdpt().explain(parts.pair(emitter, sensor))
+    skipped = dict(re.findall(r"skipped \(impossible\): ([^:]+): (.+)", text))
+    expected = {c for c, (s, t) in CLASSES.items() if not parts.takes_part(emitter, sensor, s, t)}
+    assert {c for c in skipped if "of emitter" not in c} == expected, text
+    part = parts.emitter_part(emitter)
+    assert any("light subpaths of emitter" in c for c in skipped) == (not part.traced), text
+    assert any("s=1 of emitter" in c for c in skipped) == (not part.direct), text
+    assert all(len(why) > 10 for why in skipped.values())
+
+
+def test_kinds_that_take_part_partly_beside_others():
+    """Rationale: an emitter that starts no light subpaths, or none but these, must not keep others in the
+    scene from what they can do, nor be chosen where it cannot be used.
+
+    Expected: a point light, a plugin of unknown class, a lamp of the class `directionalarea` and an area
+    light together make the sum of the images that each makes alone. Tolerance: the mean of all
+    renders is known to 1 %. Statistic: Welch, see the module.
+    """
+    parts.register_plugins()
+    lamps = {
+        "a": parts.EMITTERS["sphere"](),
+        "b": parts.EMITTERS["own lamp"](),
+        "c": BEAM | {"to_world": T().translate([0.3, 2.6, 0.6]).rotate([1, 0, 0], 90).scale(0.3)},
+        "d": parts.EMITTERS["textured projector"](),
+    }
+    alone = 0
+    for i, (name, lamp) in enumerate(lamps.items()):
+        dark = {k: unlit(v) for k, v in lamps.items() if k != name and "bsdf" in v}
+        scene = mi.load_dict(parts.open_scene(**{name: lamp}, **dark))
+        alone = alone + tiles(renders(scene, bdpt(), 4 * SAMPLES, 1000 * (i + 1)))
+    together = mi.load_dict(parts.open_scene(**lamps))
+    ours = tiles(renders(together, bdpt(), 4 * SAMPLES, 0))
+    precise(ours, 0.01, "together")
+    assert_agree([st.compare_images(alone, ours, "together")])
+
+
+def unlit(part):
+    """The entry of a shape without its emitter."""
+    return {key: value for key, value in part.items() if key != "emitter"}
+
+
+@pytest.mark.parametrize(("own", "builtin"), [("own lamp", "point"), ("own sky", None)])
+def test_plugins_of_users(own, builtin):
+    """Rationale: an emitter of a class that the package does not know takes part by Mitsuba's calls alone.
+
+    Expected: `own lamp` makes the image of the built-in emitter that it repeats; for both, s = 1 alone (and
+    s = 0) makes what all strategies together make. Statistic: Welch, see the module.
+    """
+    images = renders(parts.pair(own, "perspective"), bdpt(), SAMPLES, 0)
+    if builtin:
+        others = renders(parts.pair(builtin, "perspective"), bdpt(), SAMPLES, 1000)
+    else:
+        others = renders(parts.pair(own, "perspective"), bdpt(light_paths=0), SAMPLES, 1000)
+    assert_agree([st.compare_images(tiles(images), tiles(others), own)])
+
+
+# -- known answers ----------------------------------------------------------------------------
+
+BEAM = {
+    "type": "rectangle",
+    "bsdf": parts.grey(0.0),
+    "emitter": {"type": "directionalarea", "radiance": {"type": "rgb", "value": [2.0, 3.0, 4.0]}},
+}
+RADIANCE = np.array([2.0, 3.0, 4.0]) @ CHANNELS
+
+
+def beam_scene(sensor, half=0.5, height=1.5):
+    """A lamp that shines straight down on a floor of reflectance 0.6."""
+    lamp = BEAM | {"to_world": T().translate([0, height, 0]).rotate([1, 0, 0], 90).scale(half)}
+    floor = {
+        "type": "rectangle",
+        "bsdf": parts.grey(0.6),
+        "to_world": T().rotate([1, 0, 0], -90).scale(2),
+    }
+    return mi.load_dict({"type": "scene", "sensor": sensor, "floor": floor, "lamp": lamp})
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
+def test_directionalarea_lights_what_is_below(kind):
+    """Rationale: `path` sees nothing of a directionalarea emitter, which only light subpaths find.
+
+    Expected: of radiance L it has the power L A (Mitsuba's convention), so that the irradiance below it is
+    L and the floor's radiance 0.6 L / pi, in every pixel of a view that lies in the lit square. Statistic:
+    Student's t-test against it per tile.
+    """
+    look = T().look_at([1.5, 1, 0], [0, 0, 0], [0, 1, 0])
+    sensor = {
+        "perspective": lambda: parts.perspective((1.5, 1, 0), (0, 0, 0), fov=12, size=8),
+        "thinlens": lambda: parts.thinlens(0.05, 1.8, origin=(1.5, 1, 0), target=(0, 0, 0), fov=12, size=8),
+        "orthographic": lambda: parts.sensor("orthographic", {"to_world": look.scale([0.2, 0.2, 1])}, size=8),
+    }[kind]()
+    images = renders(beam_scene(sensor), bdpt(max_depth=2), 4 * SAMPLES, 0)
+    precise(tiles(images), 0.01, kind)
+    assert_agree([st.compare_known(tiles(images), 0.6 / np.pi * RADIANCE, kind)])
+
+
+def test_directionalarea_seen_from_afar():
+    """Rationale: as above, for the sensor that has no film to speak of.
+
+    Expected: the mean radiance over the disk that covers the scene's bounding sphere of radius R: the lit
+    square's radiance times its share of the disk, A cos / (pi R^2). Statistic: Student's t-test.
+    """
+    direction = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)
+    scene = beam_scene(parts.distant(direction=direction.tolist()))
+    images = renders(scene, bdpt(max_depth=2), SAMPLES, 0)
+    radius = scene.bbox().bounding_sphere().radius * (1 + 1500 * 2.0**-24)  # Mitsuba's RayEpsilon
+    known = 0.6 / np.pi * RADIANCE * abs(direction[1]) / (np.pi * radius**2)
+    assert_agree([st.compare_known(tiles(images), known, "distant")])
+
+
+def test_directionalarea_by_inner_connections():
+    """Rationale: (2,2) and (3,1) make the same paths; with a lamp that no camera path can find, nothing
+    else checks them.
+
+    Expected: for k = 3 their unweighted images agree, and so does (2,1) with the image for k = 2, in the
+    scene of a floor, a ball and a box. Statistic: Student's t-test of the differences.
+    """
+    method = bdpt(strategy_images=True)
+    images = renders(parts.pair("directionalarea", "perspective"), method, 4 * SAMPLES, 0)
+    inner, splat = (layer(images, method, "unweighted", s, 4 - s) for s in (2, 3))
+    precise(inner, 0.02, "inner")
+    assert_agree([paired(inner, splat, "(2,2) against (3,1)")])
+
+
+# A meter of half-width 0.4 that faces up, and lamps above it.
+UPWARDS = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(0.4)}
+ABOVE = T().translate([0.2, 1, 0]).rotate([1, 0, 0], 90).scale(0.7)
+LAMPS_ABOVE = {
+    "rectangle": lambda: {
+        "type": "rectangle",
+        "to_world": ABOVE,
+        "bsdf": parts.grey(0.0),
+        "emitter": {"type": "area", "radiance": 2.0},
+    },
+    "point": lambda: {"type": "point", "position": [0.2, 1, 0], "intensity": 3.0},
+    "spot": lambda: {
+        "type": "spot",
+        "intensity": 3.0,
+        "cutoff_angle": 40,
+        "beam_width": 39.9,
+        "to_world": T().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1]),
+    },
+    "projector": lambda: {
+        "type": "projector",
+        "irradiance": 1.0,
+        "fov": 60,
+        "to_world": T().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1]),
+    },
+    "directional": lambda: {"type": "directional", "direction": [0.6, -0.8, 0], "irradiance": 3.0},
+    "constant": lambda: {"type": "constant", "radiance": 0.7},
+    "directionalarea": lambda: {
+        "type": "rectangle",
+        "to_world": ABOVE,
+        "bsdf": parts.grey(0.0),
+        "emitter": {"type": "directionalarea", "radiance": 2.0},
+    },
+}
+
+
+def irradiance_above(lamp):
+    """Mean irradiance of the meter under a lamp of `LAMPS_ABOVE`: integrals over grids of midpoints."""
+    middle = (np.arange(40) + 0.5) / 20 - 1
+    x, z = (0.4 * v for v in np.meshgrid(middle, middle))
+    if lamp == "constant":
+        return 0.7 * np.pi
+    if lamp == "directional":
+        return 3.0 * 0.8
+    if lamp == "directionalarea":
+        return 2.0  # all of the meter is below the lamp
+    if lamp == "rectangle":
+        u, v = (0.7 * v for v in np.meshgrid(middle, middle))
+        to = [a[..., None, None] - b for a, b in ((x, 0.2 + u), (z, v))]
+        dist2 = to[0] ** 2 + to[1] ** 2 + 1
+        return 2.0 * np.mean(1 / dist2**2) * 1.4**2
+    dist2 = (x - 0.2) ** 2 + z**2 + 1
+    intensity = 3.0
+    if lamp == "projector":
+        axis = np.array([-0.2, -1, 0]) / np.hypot(0.2, 1)
+        cos = ((x - 0.2) * axis[0] - axis[1]) / np.sqrt(dist2)
+        intensity = np.pi / cos**3
+    return np.mean(intensity / dist2**1.5)
+
+
+@pytest.mark.parametrize("lamp", LAMPS_ABOVE)
+def test_meter_reads_the_known_irradiance(lamp):
+    """Rationale: what a sensor with area sees of a lamp directly has strategies of its own, (0,2), (1,1)
+    and (2,0), and `path` misses all light of delta emitters here.
+
+    Expected: the irradiance of a plate under the lamp, from each of these strategies that
+    `scene_parts` gives to the pair, and from all together. Statistic: Student's t-test against it.
+    """
+    scene = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS), "lamp": LAMPS_ABOVE[lamp]()})
+    method = bdpt(max_depth=1, strategy_images=True)
+    images = renders(scene, method, SAMPLES, 0)
+    known = irradiance_above(lamp) * CHANNELS.sum()
+    found = [st.compare_known(tiles(images), known, lamp)]
+    for s in range(3):
+        if parts.takes_part(lamp, "irradiancemeter", s, 2 - s):
+            estimate = layer(images, method, "unweighted", s, 2 - s)
+            precise(estimate, 0.02, f"({s},{2 - s})")
+            found.append(st.compare_known(estimate, known, f"{lamp} ({s},{2 - s})"))
+    assert_agree(found)
+
+
+def test_lens_sees_a_point():
+    """Rationale: a point light in front of an open lens is a disk on the film, which only (1,1) and (2,0)
+    make; `path` misses it.
+
+    Expected: the image's mean is the mean over the lens of I / d^2 times the density of directions,
+    1 / (A cos^3), A being the film's area at distance 1. Statistic: Student's t-test for each of the two
+    and for both together.
+    """
+    sensor = parts.thinlens(0.4, 3.0, origin=(0, 0, 0), target=(0, 0, 1), fov=50, size=8)
+    lamp = {"type": "point", "position": [0.1, 0.05, 1.5], "intensity": 2.0}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp})
+    method = bdpt(max_depth=1, strategy_images=True)
+    images = renders(scene, method, 16 * SAMPLES, 0)
+    r, phi = np.meshgrid(0.4 * np.sqrt((np.arange(200) + 0.5) / 200), 2 * np.pi * np.arange(200) / 200)
+    dist2 = (0.1 - r * np.cos(phi)) ** 2 + (0.05 - r * np.sin(phi)) ** 2 + 1.5**2
+    cos = 1.5 / np.sqrt(dist2)
+    known = np.mean(2.0 / dist2 / (4 * np.tan(np.deg2rad(25)) ** 2 * cos**3)) * CHANNELS.sum()
+    found = []
+    for name, estimate in (
+        ("image", tiles(images)),
+        ("(1,1)", layer(images, method, "unweighted", 1, 1)),
+        ("(2,0)", layer(images, method, "unweighted", 2, 0)),
+    ):
+        whole = estimate.mean(1, keepdims=True)
+        precise(whole, 0.02, name)
+        found.append(st.compare_known(whole, known, name))
+    assert_agree(found)
+
+
+# -- the page ---------------------------------------------------------------------------------
+
+
+PAGE = ROOT / "docs" / "coverage.md"
+
+
+def test_the_page_names_tests_that_exist():
+    """Expected: every link of docs/coverage.md to a test leads to a file of tests/ that has the test of
+    that name.
+    """
+    links = re.findall(r"\]\(\.\./tests/(\w+\.py) \"(\w+)\"\)", PAGE.read_text())
+    assert len(links) > 50
+    for file, name in sorted(set(links)):
+        assert f"\ndef {name}(" in (ROOT / "tests" / file).read_text(), f"{file} has no {name}"
+
+
+def test_the_page_says_who_takes_part():
+    """Expected: docs/coverage.md has a row for every kind of emitter and sensor, with a dash exactly where
+    the table of `scene_parts`, which the tests above rely on, says that it has no part.
+    """
+    rows = re.findall(r"^\| `([\w ]+)` \| (.+) \|.*\|$", PAGE.read_text(), re.MULTILINE)
+    found = {name: [cell.startswith("[–]") for cell in cells.split(" | ")] for name, cells in rows}
+    kinds = {name: part for name, part in parts.EMITTER_PARTS.items() if not name.startswith("own")}
+    for name, part in kinds.items():
+        hit, direct, _, traced = found.pop(name)
+        assert (hit, direct, traced) == (not part.hit, not part.direct, not part.traced), name
+    sensors = {parts.plugin_of(make()): name for name, make in reversed(parts.SENSORS.items())}
+    del sensors["own_fisheye"]
+    for plugin, name in sensors.items():
+        camera, joined, _, area = found.pop(plugin)
+        part = parts.SENSOR_PARTS[name]
+        assert (camera, joined, area) == (False, not part.joined, not part.area), plugin
+    assert set(found) == {"plugin of yours"}

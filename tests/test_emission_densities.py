@@ -1,0 +1,233 @@
+"""The density of each kind of emission: it integrates to 1, and is the one that rays are sampled with.
+
+Histograms of sampled emissions are compared with integrals of the stated density over the same bins, taken
+with points or directions that are uniform there. Statistic: a normal test per bin (both sides have noise),
+Sidak over the bins, at 1e-4; the sum over all bins against 1 within five standard errors.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import scene_parts as parts
+from mitsuba_bdpt.emitters import Emitters
+from scipy import stats
+
+COUNT = 200_000
+LEVEL = 1e-4
+FEWEST = 50  # samples that a bin must have to be normal
+
+AT_A_POINT = ("point", "spot", "textured spot", "projector", "textured projector")
+AT_INFINITY = ("constant", "envmap", "rotated envmap", "sunsky", "timed_sunsky")
+ON_SURFACES = [
+    name for name in parts.EMITTERS if parts.plugin_of(parts.EMITTERS[name]()) in ("area", "directionalarea")
+]
+
+
+def emission(name, **others):
+    """Scene, tables and `COUNT` sampled emissions of the emitter ``name``, which is alone but for a ball."""
+    ball = {"type": "sphere", "center": [0.3, 0.5, 0], "radius": 0.5}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": parts.EMITTERS[name]()} | others)
+    emitters = Emitters(scene)
+    u = [mi.Float(v) for v in numbers(4)]
+    like = dr.zeros(mi.Interaction3f)  # time and wavelengths
+    like.time = mi.Float(0.3)
+    with parts.evaluated(name == "timed_sunsky"):
+        e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+        dr.eval(e)
+    return scene, emitters, e
+
+
+def numbers(rows, seed=11):
+    return np.random.default_rng(seed).random((rows, COUNT), dtype=np.float32)
+
+
+def column(x):
+    """A Dr.Jit array as (COUNT,) or (components, COUNT), in double precision."""
+    x = np.array(x, dtype=np.float64)
+    shape = (COUNT,) if x.ndim < 2 else (x.shape[0], COUNT)
+    return np.array(np.broadcast_to(x, shape))
+
+
+def agree(sampled, uniform, density, measure):
+    """``sampled`` bins (numbers) of emissions; ``uniform`` bins of places that are uniform in a region of
+    the given ``measure``, with the stated ``density`` there."""
+    bins = int(max(sampled.max(), uniform.max())) + 1
+    value = measure * density
+    share = np.bincount(sampled, minlength=bins) / COUNT
+    expected = np.bincount(uniform, value, bins) / COUNT
+    square = np.bincount(uniform, value**2, bins) / COUNT
+    error = np.sqrt((share * (1 - share) + square - expected**2) / COUNT)
+    whole_error = value.std() / np.sqrt(COUNT)
+    assert whole_error < 0.02
+    assert abs(value.mean() - 1) < 5 * whole_error + 1e-4, f"integrates to {value.mean():.4f}"
+    enough = np.maximum(share, expected) * COUNT > FEWEST
+    assert enough.sum() >= 20
+    assert share[~enough].sum() < 0.02
+    z = np.abs(share - expected)[enough] / error[enough]
+    p = 2 * stats.norm.sf(z)
+    family = -np.expm1(len(p) * np.log1p(-p.min()))
+    worst = np.flatnonzero(enough)[np.argmin(p)]
+    assert family > LEVEL, f"bin {worst}: {share[worst]:.5f} sampled, {expected[worst]:.5f} stated"
+
+
+def sphere_bins(d, axis, cos_least, rings=10, sectors=16):
+    """Bin of each direction (3, n): rings of equal solid angle around ``axis`` down to ``cos_least``."""
+    helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
+    x = np.cross(axis, helper)
+    x /= np.linalg.norm(x)
+    y = np.cross(axis, x)
+    ring = np.clip((1 - axis @ d) / (1 - cos_least) * rings, 0, rings - 1).astype(int)
+    sector = np.floor((np.arctan2(y @ d, x @ d) / (2 * np.pi) % 1) * sectors).astype(int) % sectors
+    return ring * sectors + sector
+
+
+@pytest.mark.parametrize("name", AT_A_POINT)
+def test_directions_from_a_point(name):
+    """Rationale: Mitsuba offers no density for what a spot or a projector sends out.
+
+    Expected: the stated density of directions is that of the sampled ones, and each emission states
+    its own. Statistic: see the module.
+    """
+    _, emitters, e = emission(name)
+    d = column(e.d)
+    axis, cos_least = np.array([-1, -3, -1.5]) / np.sqrt(12.25), -1.0
+    if "spot" in name:  # beyond its cone nobody asks
+        cos_least = np.cos(np.deg2rad(35))
+    elif "projector" in name:
+        cos_least = (axis @ d).min() - 1e-3
+    u = numbers(2, 12)
+    local = column(mi.warp.square_to_uniform_cone(mi.Point2f(u[0], u[1]), mi.Float(float(cos_least))))
+    frame = mi.Frame3f(mi.Vector3f(*axis.tolist()))
+    uniform = frame.to_world(mi.Vector3f(*(mi.Float(v.astype(np.float32)) for v in local)))
+    density = column(emitters.direction_density(e, uniform, mi.Bool(True)))
+    own = column(emitters.direction_density(e, e.d, mi.Bool(True)))
+    stated = column(e.pdf_second)
+    # Directions on the border of two texels, by rounding.
+    assert np.mean(np.abs(own - stated) > 1e-3 * stated) < 1e-3
+    bins = [sphere_bins(v, axis, cos_least) for v in (d, column(uniform))]
+    agree(*bins, density, 2 * np.pi * (1 - cos_least))
+
+
+@pytest.mark.parametrize("name", AT_INFINITY)
+def test_directions_from_infinity(name):
+    """Rationale: emission, next-event estimation and hits of an environment share one density of directions.
+
+    Expected: the density that a camera ray that leaves the scene states is that of the sampled emissions,
+    which state the same. Statistic: see the module.
+    """
+    scene, emitters, e = emission(name)
+    d = column(e.d)
+    u = numbers(2, 12)
+    uniform = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
+
+    def density(outward):
+        si = scene.ray_intersect(mi.Ray3f(emitters.center + outward * (3 * emitters.radius), outward))
+        si.time = mi.Float(0.3)
+        with parts.evaluated(name == "timed_sunsky"):
+            return column(emitters.hit_densities(si, mi.Point3f(emitters.center), mi.Bool(True))[1])
+
+    stated, own = column(e.pdf_first), density(-e.d)
+    assert np.mean(np.abs(own - stated) > 2e-3 * stated) < 0.01  # borders of pixels and of the sun
+    axis = np.array([0, 1.0, 0])
+    bins = [sphere_bins(v, axis, -1.0) for v in (-d, column(uniform))]
+    agree(*bins, density(uniform), 4 * np.pi)
+
+
+@pytest.mark.parametrize("name", [*AT_INFINITY, "directional"])
+def test_light_from_infinity_covers_the_scene_evenly(name):
+    """Rationale: Mitsuba's `envmap` starts from a wrong disk if it is rotated.
+
+    Expected: seen along its direction, an emission starts on the plane before the scene's bounding sphere and
+    evenly on the disk that covers it: its squared distance from the middle is uniform, and so is its
+    angle. Statistic: Kolmogorov-Smirnov at 1e-4, within 1e-4 of the radius for the plane.
+    """
+    _, emitters, e = emission(name)
+    d, radius = column(e.d), float(emitters.radius[0])
+    start = (column(e.anchor.p) - np.array(emitters.center, dtype=np.float64).reshape(3, 1)) / radius
+    along = np.sum(start * d, axis=0)
+    np.testing.assert_allclose(along, -1, atol=1e-4)
+    flat = start - along * d
+    assert stats.kstest(np.sum(flat**2, axis=0), "uniform").pvalue > LEVEL
+    assert np.abs(flat.mean(1)).max() < 5 / np.sqrt(COUNT)
+    pdf = column(e.pdf_second)
+    np.testing.assert_allclose(pdf, 1 / (np.pi * radius**2), rtol=1e-4)
+
+
+def place_bins(p, low, high, cells=6):
+    """Bin of each point (3, n) in a grid over the box between ``low`` and ``high``."""
+    extent = np.maximum(high - low, 1e-6)
+    cell = np.clip((p - low[:, None]) / extent[:, None] * cells, 0, cells - 1).astype(int)
+    return (cell[0] * cells + cell[1]) * cells + cell[2]
+
+
+@pytest.mark.parametrize("name", ON_SURFACES)
+def test_places_on_a_surface(name):
+    """Rationale: emission chooses places by area or by texture; what a camera ray that hits the
+    surface states must be that.
+
+    Expected: the stated density of places is that of the sampled ones, and directions have the density
+    cos / pi about the normal (a directionalarea: only that one). Statistic: see the module, for directions
+    Kolmogorov-Smirnov at 1e-4.
+    """
+    scene, emitters, e = emission(name)
+    shape = scene.emitters()[0].get_shape()
+    u = numbers(2, 12)
+    ps = shape.sample_position(0.0, mi.Point2f(u[0], u[1]))
+    above = ps.p + ps.n * 0.01
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(above), mi.Vector3f(-ps.n)))
+    found = column(dr.select(si.shape == mi.ShapePtr(shape), 1.0, 0.0))
+    assert found.mean() > 0.999
+    if name == "directionalarea":  # cannot be hit: all places are alike
+        density = np.full(COUNT, 1 / float(shape.surface_area()[0]))
+        np.testing.assert_allclose(column(e.pdf_first), density, rtol=1e-5)
+        np.testing.assert_allclose(column(e.d), column(e.si.sh_frame.n), atol=1e-6)
+    else:
+        density = column(emitters.hit_densities(si, mi.Point3f(above), mi.Bool(True))[1])
+        cos = column(dr.dot(e.si.sh_frame.n, e.d))
+        assert stats.kstest(cos**2, "uniform").pvalue > LEVEL
+        np.testing.assert_allclose(column(e.pdf_second), cos / np.pi, rtol=1e-3, atol=1e-5)
+    box = shape.bbox()
+    low, high = (np.array(v, dtype=np.float64).ravel() for v in (box.min, box.max))
+    bins = [place_bins(column(v), low, high) for v in (e.si.p, ps.p)]
+    agree(*bins, density, float(shape.surface_area()[0]))
+
+
+@pytest.mark.parametrize("name", ["projector", "textured projector"])
+def test_power_of_a_projector(name):
+    """Rationale: a projector's weight is irradiance at distance 1 over the density of its directions.
+
+    Expected: the mean weight is its power, the integral of Mitsuba's own intensity over directions (points
+    at distance 1 and `sample_direction`). Statistic: five standard errors of both sides.
+    """
+    scene, _, e = emission(name)
+    lamp = scene.emitters()[0]
+    d = column(e.d)
+    axis = d.mean(1) / np.linalg.norm(d.mean(1))
+    cos_least = (axis @ d).min() - 1e-3
+    u = numbers(2, 12)
+    local = mi.warp.square_to_uniform_cone(mi.Point2f(u[0], u[1]), mi.Float(float(cos_least)))
+    it = dr.zeros(mi.Interaction3f, COUNT)
+    middle = mi.Point3f(e.anchor.p)
+    it.p = middle + mi.Frame3f(mi.Vector3f(*axis.tolist())).to_world(local)
+    _, intensity = lamp.sample_direction(it, mi.Point2f(0.5))
+    power = column(intensity)[0] * 2 * np.pi * (1 - cos_least)
+    weight = column(e.weight)[0]
+    error = np.hypot(power.std(), weight.std()) / np.sqrt(COUNT)
+    assert error < 0.02 * power.mean()
+    assert abs(power.mean() - weight.mean()) < 5 * error + 1e-4 * power.mean()
+
+
+def test_selection_beside_what_cannot_be_traced():
+    """Rationale: an emitter that starts no light subpath keeps its share of the choice, and the
+    emissions of the others carry theirs.
+
+    Expected: of a point light and a plugin of unknown class only the emissions of the first carry light, half
+    of all, and their mean is the point light's power. Statistic: five standard errors.
+    """
+    parts.register_plugins()
+    _, _, e = emission("point", other=parts.EMITTERS["own lamp"]())
+    weight = column(e.weight)[0]
+    assert abs(np.mean(weight > 0) - 0.5) < 5 * 0.5 / np.sqrt(COUNT)
+    power = 4 * np.pi * 5
+    assert abs(weight.mean() - power) < 5 * weight.std() / np.sqrt(COUNT)

@@ -1,0 +1,325 @@
+"""Films: spectral bands, crop windows, borders, filters, pixel formats and alpha.
+
+Known answers come from a lamp in a unit sphere: a point light of intensity pi at the centre of a sphere
+of reflectance r gives the radiance r + r^2 + ... everywhere, and most of it can be made by splats.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from welch import assert_agree, compare_images, compare_known
+
+T = mi.ScalarTransform4f
+
+SPECTRAL = "llvm_ad_spectral"
+
+# Nodes 50 nm apart, as far as Mitsuba's film samples its responses; integrals 50 and 100.
+BANDS = {"visible": [(450, 0), (500, 1), (550, 0)], "infrared": [(800, 0), (850, 2), (900, 0)]}
+INTEGRALS = np.array([50.0, 100.0])
+
+# A reflectance that is constant within each band.
+STEP = [(400, 0.25), (600, 0.25), (750, 0.75), (950, 0.75)]
+REFLECTANCES = np.array([0.25, 0.75])
+
+CROP = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 8, "crop_height": 12}
+
+
+def spectrum(values):
+    return {"type": "spectrum", "value": values}
+
+
+def spectral_film(bands=None, **keys):
+    bands = {name: spectrum(values) for name, values in (bands or BANDS).items()}
+    keys["rfilter"] = {"type": keys.get("rfilter", "box")}
+    return {"type": "specfilm", "width": 16, "height": 16, "component_format": "float32"} | bands | keys
+
+
+def rgb_film(**keys):
+    keys["rfilter"] = {"type": keys.get("rfilter", "box")}
+    return {"type": "hdrfilm", "width": 16, "height": 16, "component_format": "float32"} | keys
+
+
+def camera(film, **keys):
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0])
+    return {"type": "perspective", "fov": 60, "near_clip": 1e-3, "to_world": to_world, "film": film} | keys
+
+
+def lamp_in_a_sphere(film, reflectance=None):
+    """See above; the sphere has the spectrum `STEP` unless another is given."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera(film),
+            "wall": {
+                "type": "sphere",
+                "bsdf": {
+                    "type": "twosided",
+                    "bsdf": {"type": "diffuse", "reflectance": reflectance or spectrum(STEP)},
+                },
+            },
+            "lamp": {"type": "point", "intensity": {"type": "uniform", "value": float(np.pi)}},
+        }
+    )
+
+
+def known(depth):
+    """The bands of the sphere's radiance on paths of up to ``depth`` edges."""
+    return INTEGRALS * sum(REFLECTANCES**m for m in range(1, depth))
+
+
+def integrator(kind="bdpt", **parameters):
+    return mi.load_dict({"type": kind, **parameters})
+
+
+def renders(scene, method, seeds, spp):
+    """Images of many seeds: (seeds, height, width, channels)."""
+    return np.stack([np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
+
+
+def tiles(images, size=4):
+    """Means of tiles of size x size pixels: (seeds, tiles x channels)."""
+    n, h, w, channels = images.shape
+    cut = images.reshape(n, h // size, size, w // size, size, channels)
+    return cut.mean((2, 4)).reshape(n, -1)
+
+
+def layer_names(scene):
+    return [channel.name for channel in scene.sensors()[0].film().bitmap().struct_()]
+
+
+# -- bands of a spectral film -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "film"),
+    [
+        ({}, {}),
+        ({"skip": "none"}, {"rfilter": "gaussian", **CROP}),
+        ({"skip": "none"}, {"rfilter": "mitchell", "sample_border": True}),
+        ({"light_paths": 0}, {"rfilter": "lanczos", "sample_border": True, **CROP}),
+    ],
+    ids=["default", "gaussian crop", "mitchell border", "camera side, lanczos crop border"],
+)
+def test_bands_are_known(parameters, film):
+    """Rationale: a band is the integral of radiance times its response, for camera samples and splats, of
+    any filter and at any border, also outside the visible range. Expected: 50 and 100, the responses'
+    integrals, times r + r^2 + r^3 in every tile and along the border. Statistic: Student's t over 12
+    seeds with Sidak's correction; standard errors below 0.3 % of a tile and 0.06 % of the image.
+    """
+    mi.set_variant(SPECTRAL)
+    scene = lamp_in_a_sphere(spectral_film(**film))
+    images = renders(scene, integrator(max_depth=4, **parameters), range(12), 64)
+    assert layer_names(scene) == ["visible", "infrared"] and images.shape[-1] == 2
+    images /= known(4)
+    border = np.concatenate(
+        [x.mean(1) for x in (images[:, 0], images[:, -1], images[:, :, 0], images[:, :, -1])], axis=1
+    )
+    for samples, bound in ((tiles(images), 0.003), (border, 0.003), (images.mean((1, 2)), 0.0006)):
+        assert (samples.std(0, ddof=1) / np.sqrt(12)).max() < bound
+        assert_agree(compare_known(samples, np.ones(samples.shape[1])), at_least=0)
+
+
+COLOURFUL = {
+    "blue": [(400, 0), (450, 1), (500, 0.2), (550, 0)],
+    "green": [(450, 0), (500, 0.4), (550, 1), (600, 0.4), (650, 0)],
+    "red": [(550, 0), (600, 0.5), (650, 3), (700, 0)],
+}
+
+
+@pytest.mark.parametrize(
+    "film", [{}, {"rfilter": "gaussian", "sample_border": True, **CROP}], ids=["box", "gaussian crop border"]
+)
+def test_overlapping_bands_equal_path(film):
+    """Rationale: bands may overlap and differ in scale; lamp, walls and sky have colours of their own.
+    Expected: equal to `path` in every tile and band. Statistic: Welch over tiles, 12 seeds a side; the
+    image's mean is compared to some 1 %.
+    """
+    mi.set_variant(SPECTRAL)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera(spectral_film(COLOURFUL, **film)),
+            "sky": {"type": "constant", "radiance": spectrum([(400, 0.1), (700, 0.4)])},
+            "lamp": {
+                "type": "sphere",
+                "radius": 0.2,
+                "center": [0.7, 0.5, -0.6],
+                "emitter": {"type": "area", "radiance": spectrum([(400, 3), (550, 8), (700, 2)])},
+            },
+            "floor": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().translate([0, -0.7, -2]).rotate([1, 0, 0], -90).scale(2),
+                "bsdf": {"type": "diffuse", "reflectance": spectrum([(400, 0.8), (700, 0.1)])},
+            },
+            "ball": {
+                "type": "sphere",
+                "radius": 0.4,
+                "center": [0.1, -0.2, -1.5],
+                "bsdf": {"type": "roughconductor", "alpha": 0.4},
+            },
+        }
+    )
+    a = renders(scene, integrator(max_depth=4), range(12), 64)
+    b = renders(scene, integrator("path", max_depth=4), range(50, 62), 256)
+    assert layer_names(scene) == list(COLOURFUL)
+    scale = b.mean((0, 1, 2))
+    assert_agree(compare_images(tiles(a / scale), tiles(b / scale)), at_least=15)
+    for band in range(3):
+        x, y = a[..., band].mean((1, 2)), b[..., band].mean((1, 2))
+        assert np.hypot(x.std(ddof=1), y.std(ddof=1)) / np.sqrt(12) < 0.012 * y.mean()
+
+
+def test_unit_of_a_response_does_not_matter():
+    """Rationale: a response of 1 over 100 nm makes an image a hundred times as bright as the radiance,
+    and roulette on connections compares with the image. Expected: responses x 1000 give 1000 times the
+    image (1e-3: the threshold is rounded to powers of two) with the same rays, and roulette ends as many
+    of the connections as on an RGB film (a factor of two: the RGB of a spectrum of 1 is 0.9 to 1.2, and
+    powers of two).
+    """
+    mi.set_variant(SPECTRAL)
+    loud = {name: [(x, 1000 * y) for x, y in values] for name, values in BANDS.items()}
+    flat = {"type": "uniform", "value": 0.5}
+    images, ended = [], []
+    for film in (spectral_film(), spectral_film(loud), rgb_film()):
+        bdpt = integrator(max_depth=6)
+        images += list(renders(lamp_in_a_sphere(film, flat), bdpt, [1], 16))
+        counts = bdpt.statistics["connections"]
+        ended.append(counts["rouletted"] / (counts["evaluated"] + bdpt.statistics["rays"]["shadow_t1"]))
+    np.testing.assert_allclose(images[1], 1000 * images[0], rtol=1e-3)
+    assert ended[1] == pytest.approx(ended[0], rel=1e-3)
+    assert ended[2] > 0 and ended[0] == pytest.approx(ended[2], rel=1)
+
+
+def test_variance_of_bands():
+    """Expected: layers named after the bands, whose mean over 12 seeds is the spread of the pixels over
+    these; and `statistics["error"]` is the relMSE of bands in units of their responses. Tolerance: 20 %:
+    12 seeds give each pixel's variance to 43 %, 256 pixels, correlated by the filter, the mean to 4 %.
+    Statistic: ratio of means.
+    """
+    mi.set_variant(SPECTRAL)
+    scene = lamp_in_a_sphere(spectral_film(rfilter="gaussian"))
+    bdpt = integrator(max_depth=3, variance=True)
+    result = renders(scene, bdpt, range(12), 16)
+    assert layer_names(scene) == ["visible", "infrared", "variance.visible", "variance.infrared"]
+    images, estimates = result[..., :2], result[..., 2:]
+    expected = images.var(0, ddof=1).mean((0, 1))
+    np.testing.assert_allclose(estimates.mean((0, 1, 2)), expected, rtol=0.2)
+    last, variance = images[-1] / INTEGRALS, estimates[-1] / INTEGRALS**2
+    error = (variance / (last**2 + 0.01 * last.mean() ** 2)).mean()
+    assert bdpt.statistics["error"] == pytest.approx(error, rel=1e-3)
+
+
+def test_one_band_without_noise():
+    """Rationale: one band's wavelengths are drawn in proportion to its response. Expected: light of
+    radiance 0.7 gives exactly 0.7 times the response's integral (1e-5), alpha does not exist."""
+    mi.set_variant(SPECTRAL)
+    sky = {"type": "constant", "radiance": {"type": "uniform", "value": 0.7}}
+    film = spectral_film({"only": BANDS["infrared"]}, rfilter="gaussian")
+    scene = mi.load_dict({"type": "scene", "sensor": camera(film), "sky": sky})
+    image = renders(scene, integrator(max_depth=1, light_paths=0), [0], 4)[0]
+    assert image.shape == (16, 16, 1)
+    np.testing.assert_allclose(image, 70, rtol=1e-5)
+
+
+def test_strategy_images_of_bands_are_refused():
+    """Rationale: they are RGB in every variant, and the RGB of a film that samples its bands only would be
+    wrong. Expected: the parameter and the remedy are named, by render and by explain."""
+    mi.set_variant(SPECTRAL)
+    scene = lamp_in_a_sphere(spectral_film())
+    bdpt = integrator(max_depth=3, strategy_images=True)
+    for call in (bdpt.render, bdpt.explain):
+        with pytest.raises(NotImplementedError, match="strategy_images=True.*SpecFilm.*use hdrfilm"):
+            call(scene)
+
+
+class OtherFilm(mi.Film):
+    """A film that wants samples of its own."""
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.m_flags = int(mi.FilmFlags.Special)
+
+
+def test_other_special_films_are_refused():
+    """Expected: the class is named, and what can be used."""
+    mi.register_film("other", OtherFilm)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera({"type": "other", "width": 4, "height": 4}),
+            "l": {"type": "point"},
+        }
+    )
+    with pytest.raises(NotImplementedError, match="film .* is not supported; use hdrfilm or specfilm"):
+        integrator().render(scene, spp=1)
+
+
+# -- crop windows, borders, formats -----------------------------------------------------------
+
+
+def lamps_and_sky(film, sky):
+    """A lamp before the camera, a wall, glass without colour; past all of them, the sky if there is one."""
+    scene = {
+        "type": "scene",
+        "sensor": camera(film, to_world=T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]), fov=45),
+        "wall": {
+            "type": "rectangle",
+            "to_world": T().translate([0.3, -0.2, 0]).scale([1.2, 1, 1]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}},
+        },
+        "lamp": {
+            "type": "sphere",
+            "radius": 0.25,
+            "center": [-0.4, 0.3, 0.8],
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [2.0, 3.0, 5.0]}},
+        },
+        "pane": {
+            "type": "rectangle",
+            "to_world": T().translate([-1, -0.6, 0.5]).scale(0.5),
+            "bsdf": {"type": "thindielectric"},
+        },
+    }
+    if sky:
+        scene["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.3, 0.1]}}
+    return mi.load_dict(scene)
+
+
+FORMATS = [
+    ("rgba", "tent", True, True, False),
+    ("rgba", "catmullrom", True, True, True),
+    ("rgb", "lanczos", True, False, True),
+    ("luminance_alpha", "gaussian", True, True, False),
+    ("luminance", "mitchell", False, False, False),
+    ("xyza", "box", False, True, True),
+    ("xyz", "gaussian", True, True, False),
+]
+
+
+@pytest.mark.parametrize(("pixel_format", "rfilter", "border", "hide", "sky"), FORMATS)
+def test_cropped_formats_equal_path(pixel_format, rfilter, border, hide, sky):
+    """Rationale: a crop window with a border, a format and hidden emitters all change what the film's
+    channels hold, and where splats count. Expected: each channel, alpha included, equals `path` in tiles
+    of 2x2 pixels of an 8x12 crop, which splats reach from outside. Statistic: Welch with Sidak, 12
+    seeds a side; the mean of each channel is compared to 2 %.
+    """
+    keys = {"pixel_format": pixel_format, "rfilter": rfilter, "sample_border": border, **CROP}
+    scene = lamps_and_sky(rgb_film(**keys), sky)
+    a = renders(scene, integrator(max_depth=3, hide_emitters=hide), range(12), 64)
+    b = renders(scene, integrator("path", max_depth=3, hide_emitters=hide), range(50, 62), 256)
+    alpha = pixel_format.endswith("a") or pixel_format.endswith("alpha")
+    assert a.shape == b.shape == (12, 12, 8, (1 if "lum" in pixel_format else 3) + alpha)
+    scale = b.mean((0, 1, 2))
+    assert_agree(compare_images(tiles(a / scale, 2), tiles(b / scale, 2)), at_least=20)
+    error = np.hypot(*(np.std(x.mean((1, 2)), axis=0, ddof=1) for x in (a, b))) / np.sqrt(12)
+    assert (error < 0.02 * scale).all()
+    if alpha and not (sky and not hide):
+        assert b[..., -1].mean(0).min() < 0.5 < b[..., -1].mean(0).max()
+
+
+@pytest.mark.parametrize("hide", [False, True])
+def test_depth_zero_is_black_and_clear(hide):
+    """Expected: as with `path`, nothing is seen at max_depth=0, and alpha is 0 under a sky too."""
+    scene = lamps_and_sky(rgb_film(pixel_format="rgba"), True)
+    for kind in ("bdpt", "path"):
+        image = renders(scene, integrator(kind, max_depth=0, hide_emitters=hide), [0], 4)
+        assert (image == 0).all()

@@ -1,0 +1,189 @@
+"""Sensors that are no cameras, and light that arrives at a sensor (t = 0): densities and importance.
+
+What is asked of every sensor: a join gives back the ray that a camera subpath would take, with its
+density; the importance integrates to what a camera subpath's weight is (1 for radiance, pi for
+irradiance); an arrival states what the start in the opposite direction does.
+"""
+
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import scene_parts as parts
+from mitsuba_bdpt import sensors
+from mitsuba_bdpt.kernel import Shared
+from mitsuba_bdpt.rays import Quadrics
+
+COUNT = 200_000
+T = parts.T
+
+SPHERE = {"type": "sphere", "center": [0.3, 1.0, 0.5], "radius": 0.3}
+SENSORS = {
+    "orthographic": parts.orthographic,
+    "orthographic, crop": lambda: parts.orthographic(
+        size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
+    ),
+    "distant": parts.distant,
+    "thinlens": lambda: parts.thinlens(0.3, 3.0),
+    "thinlens, crop": lambda: parts.thinlens(
+        0.3, 3.0, size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
+    ),
+    "irradiancemeter": parts.meter,
+    "irradiancemeter, sphere": lambda: parts.meter(SPHERE),
+    "batch": parts.SENSORS["batch"],
+    "batch of lenses": parts.SENSORS["batch of lenses"],
+}
+PARALLEL = ("orthographic", "orthographic, crop", "distant")
+AREA = ("thinlens", "thinlens, crop", "irradiancemeter", "irradiancemeter, sphere")
+
+
+def prepared(name):
+    """Scene, Mitsuba's sensor, ours, and numbers in [0, 1)."""
+    scene = mi.load_dict(parts.open_scene(SENSORS[name]()))
+    sensor = scene.sensors()[0]
+    u = np.random.default_rng(6).random((10, COUNT), dtype=np.float32)
+    return scene, sensor, sensors.prepare(sensor, Quadrics(scene)), u
+
+
+def start_of(camera, u):
+    """Starts in random pixels."""
+    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+    width, height = (int(x) for x in camera.region.size)
+    index = mi.UInt32((u[4] * width * height).astype(np.uint32))
+    pixel = camera.region.pixel(index)
+    return camera.start(pixel, mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like)
+
+
+def column(x):
+    x = np.array(x, dtype=np.float64)
+    return np.array(np.broadcast_to(x, (COUNT,) if x.ndim < 2 else (x.shape[0], COUNT)))
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_rays_are_those_of_mitsuba(name):
+    """Rationale: camera rays are made here. Expected: origin, direction and weight of Mitsuba's for the same
+    film position and aperture sample, within 1e-4 (its offsets from a meter's shape and ours differ).
+    """
+    _, sensor, camera, u = prepared(name)
+    start = start_of(camera, u)
+    uv = camera.region.to_uv(start.position)
+    ray, weight = sensor.sample_ray_differential(0, 0.5, uv, mi.Point2f(u[2], u[3]))
+    np.testing.assert_allclose(column(start.ray.o), column(ray.o), atol=2e-4)
+    np.testing.assert_allclose(column(start.ray.d), column(ray.d), atol=1e-5)
+    np.testing.assert_allclose(column(start.weight), column(weight)[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_join_is_the_ray_back(name):
+    """Rationale: t = 1 makes the paths that camera subpaths make, with what these state.
+
+    Expected: a point on a camera ray, joined with the sensor point of that ray, has its film position
+    (where the film has positions), direction and density, within 1e-3 pixels and 1e-3.
+    """
+    _, _, camera, u = prepared(name)
+    start = start_of(camera, u)
+    p = start.ray.o + start.ray.d * mi.Float(0.5 + 5 * u[5])
+    u_film = camera.region.to_uv(start.position)
+    if "batch" in name:  # chooses the view, as the film position does
+        u_film = mi.Point2f(u_film.x, 0)
+    join = camera.join(p, mi.Point2f(u[2], u[3]), u_film)
+    valid = column(dr.select(join.valid, 1.0, 0.0)) > 0
+    assert valid.mean() > 0.999
+    near = column(start.pdf_w) > 1e-2  # off grazing directions, where rounding decides
+    valid &= near
+    np.testing.assert_allclose(column(join.d)[:, valid], -column(start.ray.d)[:, valid], atol=1e-3)
+    np.testing.assert_allclose(column(join.pdf_w)[valid], column(start.pdf_w)[valid], rtol=5e-3)
+    if name != "distant":
+        for axis in "xy":
+            found, known = (column(getattr(r.position, axis))[valid] for r in (join, start))
+            np.testing.assert_allclose(found, known, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_importance_integrates_to_the_weight(name):
+    """Rationale: what a sensor makes of uniform radiance 1 does not depend on the strategy.
+
+    Expected: the integral of the importance is 1, for a meter pi: over directions, the points being far
+    away and uniform about the sensor; of parallel sensors over a square across their direction.
+    Tolerance: five standard errors, which are below 3 %, plus 2e-3 for points that are not at infinity.
+    """
+    _, _, camera, u = prepared(name)
+    lens, choice = mi.Point2f(u[2], u[3]), mi.Point2f(u[6], u[7])
+    if name in PARALLEL:
+        start = start_of(camera, u)
+        frame = mi.Frame3f(mi.Vector3f(start.ray.d))
+        side = 12.0
+        middle = column(start.ray.o + start.ray.d * 4).mean(1)
+        p = mi.Point3f(*middle.tolist()) + side * (
+            frame.s * mi.Float(u[0] - 0.5) + frame.t * mi.Float(u[1] - 0.5)
+        )
+        measure = side**2
+    else:
+        # From all directions, so that views of a batch that look elsewhere are seen too.
+        middle = mi.Point3f(0, 1.5, 3)
+        p = middle + mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1])) * 3000
+        measure = 4 * np.pi
+    join = camera.join(p, lens, choice)
+    values = np.where(column(dr.select(join.valid, 1.0, 0.0)) > 0, column(join.importance), 0) * measure
+    error = values.std() / np.sqrt(COUNT)
+    known = np.pi if "meter" in name else 1.0
+    assert error < 0.03 * known
+    assert abs(values.mean() - known) < 5 * error + 2e-3 * known
+
+
+@pytest.mark.parametrize("name", AREA)
+def test_an_arrival_is_a_start_in_reverse(name):
+    """Rationale: t = 0 makes the paths that camera subpaths make, from the other end.
+
+    Expected: light that comes along a camera ray arrives at its film position (a meter: anywhere on its
+    pixel), and importance times cosine over both densities is the camera subpath's weight; the
+    densities are those of the start, which also states cos / (both densities). Tolerance: 5e-3.
+    """
+    scene, _, camera, u = prepared(name)
+    start = start_of(camera, u)
+    p = start.ray.o + start.ray.d * mi.Float(0.5 + 5 * u[5])
+    ray = mi.Ray3f(p, mi.Vector3f(-start.ray.d))
+    pi = scene.ray_intersect_preliminary(ray)
+    si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+    lens = name.startswith("thinlens")
+    if lens:  # nothing in between: what is there does not matter to the question
+        pi = dr.zeros(mi.PreliminaryIntersection3f, COUNT)
+        pi.t = mi.Float(dr.inf)
+    walk = SimpleNamespace(previous=p, ray=ray, pi=pi, active=mi.Bool(True))
+    vertex = SimpleNamespace(si=si, cos=dr.abs(dr.dot(si.n, ray.d)), hit=si.is_valid())
+    arrival = camera.arrive(walk, vertex, mi.Bool(False))
+    active = column(dr.select(arrival.active, 1.0, 0.0)) > 0
+    cos = column(arrival.cos)
+    keep = active & (cos > 0.05)
+    assert active.mean() > (0.999 if lens else 0.4)  # before a meter lies the scene
+    cos, both = cos[keep], (column(arrival.pdf_area) * column(arrival.pdf_w))[keep]
+    weight = column(arrival.importance)[keep] * cos / both
+    np.testing.assert_allclose(weight, column(start.weight)[keep], rtol=5e-3)
+    np.testing.assert_allclose(column(arrival.pdf_w)[keep], column(start.pdf_w)[keep], rtol=5e-3)
+    np.testing.assert_allclose(cos / both, column(start.arrival)[keep], rtol=5e-3)
+    if lens:
+        for axis in "xy":
+            found, known = (column(getattr(r.position, axis))[keep] for r in (arrival, start))
+            np.testing.assert_allclose(found, known, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["distant, point", "distant, shape", "radiancemeter", "own fisheye"])
+def test_sensors_by_their_rays_alone(name):
+    """Rationale: of these nothing but Mitsuba's camera rays is used. Expected: the start is that ray with its
+    weight, the sensor says that it cannot be joined and that it has no area, and why.
+    """
+    parts.register_plugins()
+    scene = mi.load_dict(parts.open_scene(parts.SENSORS[name]()))
+    sensor = scene.sensors()[0]
+    camera = sensors.prepare(sensor, Quadrics(scene))
+    u = np.random.default_rng(6).random((10, COUNT), dtype=np.float32)
+    start = start_of(camera, u)
+    uv = camera.region.to_uv(start.position)
+    ray, weight = sensor.sample_ray(0, 0.5, uv, mi.Point2f(u[2], u[3]))
+    np.testing.assert_allclose(column(start.ray.o), column(ray.o), atol=1e-5)
+    np.testing.assert_allclose(column(start.ray.d), column(ray.d), atol=1e-6)
+    np.testing.assert_allclose(column(start.weight), column(mi.Spectrum(weight)), rtol=1e-5)
+    assert not camera.joinable and not camera.area
+    assert len(camera.reason) > 10 and len(camera.no_area) > 10
