@@ -248,6 +248,17 @@ def blocker():
     return {"type": "disk", "bsdf": grey(0.0), "to_world": place}
 
 
+def hidden_lamp():
+    """A ball of light in front of a box. (No ball behind it: `path` shades those at a wrong place.)"""
+    place = transform().translate([0.1, 1.2, 2.6]).scale(0.5)
+    box = transform().translate([-0.5, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.4)
+    return scene(
+        ball=None,
+        box={"type": "cube", "bsdf": grey(0.5), "to_world": box},
+        lamp=lamp() | {"type": "sphere", "to_world": place},
+    )
+
+
 def tile_error(image, reference):
     """Root mean square of the relative differences of 8 x 8 tiles."""
 
@@ -299,8 +310,11 @@ CASES = [
     ),
     Case("`irradiancemeter`: the weight ignores the density", lambda: scene(meter(), lamp=lamp())),
     Case(
-        "`thinlens` with its default focus distance, the far plane: no film position is valid",
-        lambda: scene(sensor("thinlens", aperture_radius=0.02, near_clip=1e-3, far_clip=100.0), lamp=lamp()),
+        "`thinlens` focused beyond its far plane (at it, which is the default, rounding decides): no film "
+        "position is valid",
+        lambda: scene(
+            sensor("thinlens", aperture_radius=0.02, far_clip=15.0, focus_distance=20.0), lamp=lamp()
+        ),
     ),
     Case(
         "`perspective` with `principal_point_offset_x` = 0.3: part of the film is dark",
@@ -330,7 +344,7 @@ CASES = [
     ),
     Case(
         "`hide_emitters`: hidden lamps still cast their shapes on the image",
-        lambda: scene(lamp=lamp(to_world=transform().translate([0, 1, 2]).scale(0.4))),
+        hidden_lamp,
         parameters={"hide_emitters": True},
     ),
     Case(
@@ -368,9 +382,12 @@ CASES = [
         what="mean alpha",
     ),
     Case(
-        "faint light (radiance 1e-6), closed room, depth 30: roulette looks at radiance",
+        "faint light (radiance 1e-6), closed room, depth 30: roulette looks at radiance; noise drowns all",
         lambda: closed_room(1e-6),
         depth=30,
+        measure=tile_error,
+        what="relative error of tiles",
+        errors=True,
     ),
     Case(
         "point light before an open lens; `path` misses it as well",
@@ -391,8 +408,8 @@ CASES = [
         variant="llvm_ad_spectral",
     ),
     Case(
-        "the scene in millimetres (scaled by 1e-3): offsets of rays swallow it",
-        lambda: tiny(1e-3),
+        "a scene 0.4 mm wide (scaled by 1e-4): offsets of rays swallow it; of `path` too",
+        lambda: tiny(1e-4),
         equal=lambda: tiny(1.0),
     ),
 ]

@@ -300,7 +300,8 @@ def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
     features = []
     if film.features is not None:
         features = film.features.sample(points, stream, start.position, u_lens, shared.time, covered)
-    dropped = _deposit_camera(kernel, film, start.counted, radiance, walk.seen, features, shared, covered)
+    alpha = _alpha(kernel, walk.seen)
+    dropped = _deposit_camera(film, start.counted, radiance, alpha, features, shared, covered)
     counters.non_finite += dr.select(dropped | walk.broken, mi.UInt32(1), mi.UInt32(0))
     return counters
 
@@ -336,14 +337,18 @@ def _first_partial(kernel, start):
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
 
 
-def _deposit_camera(kernel, film, position, radiance, seen, features, shared, active):
+def _alpha(kernel, seen):
+    """Alpha of a camera sample, as in `path`: a visible environment covers the image."""
+    opaque = seen
+    if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
+        opaque = kernel.max_depth >= 1
+    return dr.select(opaque, mi.Float(1), mi.Float(0))
+
+
+def _deposit_camera(film, position, radiance, alpha, features, shared, active):
     """Add a camera sample; returns the mask of samples that count as zero for want of a finite value."""
     colours = film.colour(radiance * shared.weight, shared.wavelengths)
     finite = dr.all(dr.isfinite(colours))
-    opaque = seen
-    if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
-        opaque = kernel.max_depth >= 1  # `path`: a visible environment covers the image
-    alpha = dr.select(opaque, mi.Float(1), mi.Float(0))
     film.put_camera(position, dr.select(finite, colours, 0), alpha, features, active)
     return active & ~finite
 
