@@ -145,8 +145,9 @@ def test_emission_agrees_with_hits(name):
     sees, weight x density = radiance x cosine, and the densities must be those that a hit computes.
     Expected: for each emission, tracing back to y_0 from its first hit finds the same radiance and the
     same two density factors, and the density of next-event estimation there equals that of
-    `sample_direct`'s kind. Tolerance: 2e-3 relative for all but 2 % (edges of textures and pixels of
-    an environment, where the traced point falls on the other side).
+    `sample_direct`'s kind. Tolerance: 2e-3 relative for all but 2 % (poles of a
+    textured sphere; edges of textures and pixels of an environment, where the traced point falls on the
+    other side).
     """
     scene, emitters, e, _ = emission(name, 20_000)
     n = 20_000
@@ -179,7 +180,8 @@ def test_direct_sample_agrees_with_hits(name):
     """Rationale: next-event estimation and a hit of the same point must name the same density and the
     same radiance. Expected: weight x density = radiance at the point, density = the one that
     `hit_densities` gives, emission ratio = what its factors give. Tolerance: 2e-3 relative for all but
-    1 % of the samples (edges of textures).
+    1 % of the samples (edges of textures), 2 % on a textured sphere (its poles, where texture coordinates
+    crowd and float32 tells them badly).
     """
     n = 20_000
     rng = np.random.default_rng(12)
@@ -214,7 +216,7 @@ def test_direct_sample_agrees_with_hits(name):
     assert seen.sum() > 500
     assert off((direct.weight * direct.pdf_w).x, radiance.x) < 0.02
     # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rays.Quadrics).
-    few = 0.05 if name == "cylinder" else 0.01
+    few = {"cylinder": 0.05, "textured sphere": 0.02}.get(name, 0.01)
     assert off(direct.pdf_w, connect * to_angle) < few
     edge = dr.select(at.is_valid(), dr.rcp(dr.square(at.t)), 1)
     assert off(direct.emission_ratio, first * second / connect * edge) < few
@@ -750,6 +752,33 @@ def test_a_lamp_of_the_users_on_a_surface(height):
     a = render(ours, integrator(skip="none", max_depth=3), range(10), 512)
     b = render(theirs, integrator("path", max_depth=3), range(100, 110), 2048)
     agree(tiles(a), tiles(b), 0.03)
+
+
+def test_a_timed_sky_elsewhere_does_no_harm():
+    """Rationale: calls visit every living emitter, and `timed_sunsky` cannot be called while a kernel is
+    recorded: another scene that holds one ended the process. Expected: the image is what it was without it,
+    to the rounding of sums in another order (1e-4), and explain says why it is slow.
+    """
+    lit = mi.load_dict(room() | {"lamp": EMITTERS["point"]()})
+    bdpt = integrator(max_depth=3)
+    before = np.array(bdpt.render(lit, spp=4))
+    assert "slow:" not in bdpt.explain(lit)
+    other = mi.load_dict({"type": "scene", "sky": {"type": "timed_sunsky"}})
+    beside = np.array(bdpt.render(lit, spp=4))
+    assert "slow: a timed_sunsky lives" in bdpt.explain(lit) and len(other.emitters()) == 1
+    np.testing.assert_allclose(beside.mean(), before.mean(), rtol=1e-4)
+
+
+def test_a_distant_sensor_in_an_empty_scene_sees_the_sky():
+    """Expected: radiance 1, as by `path`; Mitsuba's sensor starts its rays nowhere if there are no bounds."""
+    one_pixel = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    sky = {"type": "constant", "radiance": 1.0}
+    eye = {"type": "distant", "direction": [0.2, 0.3, -1], "film": one_pixel}
+    scene = mi.load_dict({"type": "scene", "sky": sky, "eye": eye})
+    for skip in ("none", "auto"):
+        bdpt = integrator(max_depth=3, skip=skip)
+        assert np.array(bdpt.render(scene, spp=16)) == pytest.approx(1)
+        assert bdpt.statistics["non_finite"] == 0
 
 
 # -- film -------------------------------------------------------------------------------------

@@ -103,9 +103,9 @@ def left_out(emitter, kind: int) -> list[tuple[str, str]]:
     return [(f"{name} of emitter '{emitter.id()}'", _WHY_NOT[kind]) for name in names]
 
 
-def needs_evaluation(emitter) -> bool:
-    """Whether the emitter's calls fail while a kernel is recorded: it asks for the value of a mask."""
-    return emitter.class_name() == "TimedSunskyEmitter"
+def needs_evaluation(class_name: str) -> bool:
+    """Whether calls of such an emitter fail while a kernel is recorded: it asks for the value of a mask."""
+    return class_name == "TimedSunskyEmitter"
 
 
 def is_textured(emitter, kind: int) -> bool:

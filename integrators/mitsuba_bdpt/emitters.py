@@ -45,7 +45,7 @@ from .emitter_kinds import (
     refuse_curves,
 )
 from .emitter_tables import Placement, Projectors, SmoothMeshes, bounds, inverse_table, placement
-from .objects import children, number
+from .objects import children, living_emitters, number
 
 
 @dataclass
@@ -104,9 +104,10 @@ class Emitters:
     light subpaths can start from one, one of these points can be joined with a sensor; ``unhittable``: one
     cannot be hit; ``finite_hittable``: one that can be hit and joined is not at infinity; ``on_shapes``: one
     is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: one can be reached only
-    by the light subpaths that it starts; ``evaluated``: kernels that call one have to be recorded without
-    symbolic loops, calls and branches. ``left_out``: what single ones cannot take part in, and why.
-    ``center`` and ``radius`` of a sphere about all shapes; ``quadrics`` of the scene, for rays.
+    by the light subpaths that it starts; ``evaluated``: one that lives, be it in another scene, makes it
+    necessary to record kernels without symbolic loops, calls and branches. ``left_out``: what single ones
+    cannot take part in, and why. ``center`` and ``radius`` of a sphere about all shapes; ``quadrics`` of the
+    scene, for rays.
     """
 
     def __init__(self, scene):
@@ -125,7 +126,7 @@ class Emitters:
         self.on_shapes = any(e.get_shape() is not None for e in emitters)
         self.beams = DIRECTIONAL_AREA in self.kinds
         self.at_infinity = bool(self.kinds & {INFINITE, DIRECTIONAL})
-        self.evaluated = any(needs_evaluation(e) for e in emitters)
+        self.evaluated = any(needs_evaluation(name) for name in living_emitters())
         self.left_out = [text for e, k in zip(emitters, kinds, strict=True) for text in left_out(e, k)]
         if not kinds:
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import time
 from dataclasses import asdict, dataclass, replace
 
@@ -254,7 +255,7 @@ class Render:
         self.scene, self.sensor, self.settings, self.spp = scene, sensor, settings, spp
         self.film = sensor.film()
         self.emitters = Emitters(scene)
-        self.camera = prepare(sensor, self.emitters.quadrics)
+        self.camera = prepare(sensor, self.emitters.quadrics, bool(scene.shapes()))
         self.plan = plan(scene, self.emitters, self.camera, settings)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
@@ -512,7 +513,7 @@ def explain(scene, sensor, settings: Settings) -> str:
     check_scene(scene, sensor)
     check_film(sensor, settings)
     emitters = Emitters(scene)
-    camera = prepare(sensor, emitters.quadrics)
+    camera = prepare(sensor, emitters.quadrics, bool(scene.shapes()))
     p = plan(scene, emitters, camera, settings)
     used = [
         name
@@ -537,7 +538,10 @@ def explain(scene, sensor, settings: Settings) -> str:
         lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
     lines += [f"lost: {text}" for text in lost_paths(scene, emitters, camera, p, settings)]
     if emitters.evaluated:
-        lines.append("slow: timed_sunsky cannot be called while a kernel is recorded as a whole")
+        lines.append(
+            "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
+            "one kernel"
+        )
     return "\n".join(lines)
 
 
@@ -616,6 +620,12 @@ def _log(statistics: dict):
         f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
         f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
     )
+    if statistics.get("error") == math.inf:
+        mi.Log(
+            mi.LogLevel.Warn,
+            "bdpt: the render ended before two of the parts that the variance follows from were whole; ask "
+            "for no more samples per pixel than timeout allows",
+        )
     if statistics["non_finite"]:
         mi.Log(
             mi.LogLevel.Warn,

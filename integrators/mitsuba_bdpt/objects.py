@@ -13,6 +13,29 @@ def number(x) -> float:
     return float(dr.slice(x) if dr.is_array_v(x) else x)
 
 
+# Numbers in a row without an emitter after which no more are expected; those of freed ones are used again.
+_GAP = 64
+
+
+def living_emitters() -> list[str]:
+    """Class names of all emitters in the process: a virtual call visits those of other scenes too."""
+    found, index, missing = [], 0, 0
+    while missing < _GAP:
+        index += 1
+        emitter = _emitter(index)
+        missing = missing + 1 if emitter is None else 0
+        found += [emitter.class_name()] if emitter is not None else []
+    return found
+
+
+def _emitter(index: int):
+    """The emitter that Dr.Jit gave this number to, or None."""
+    try:
+        return dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(index))[0]
+    except RuntimeError:  # never given, or freed
+        return None
+
+
 def children(owner) -> dict:
     """What ``owner`` holds, by name: objects and numbers, as its ``traverse`` reports them."""
     return _collector(mi.variant())().of(owner)

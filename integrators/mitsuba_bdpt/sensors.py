@@ -12,9 +12,10 @@ from .sensor_records import Sensor
 UNTARGETED = "target = none"
 
 
-def prepare(sensor, quadrics) -> Sensor:
-    """The sensor for one render. Kinds that light vertices cannot be joined with take part by camera
-    subpaths alone, and say why. Raises ``NotImplementedError`` for what Mitsuba itself cannot render."""
+def prepare(sensor, quadrics, bounded=True) -> Sensor:
+    """The sensor for one render of a scene that has surfaces (``bounded``) or none. Kinds that light vertices
+    cannot be joined with take part by camera subpaths alone, and say why. Raises ``NotImplementedError`` for
+    what Mitsuba itself cannot render."""
     kind = sensor.class_name()
     if kind in cameras.KINDS:
         return cameras.Camera(sensor, [sensor])
@@ -31,7 +32,7 @@ def prepare(sensor, quadrics) -> Sensor:
     if kind == "DistantSensorImpl":
         # Only its text tells the three kinds apart.
         if UNTARGETED in str(sensor):
-            return Distant(sensor)
+            return Distant(sensor) if bounded else Opaque(sensor, "the scene has no surface")
         return Opaque(sensor, "the target of a distant sensor is out of a plugin's reach")
     return Opaque(sensor, f"of the class {kind} nothing but its camera rays is known")
 
