@@ -4,6 +4,7 @@ import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import analysis
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
@@ -40,7 +41,7 @@ def row(method="bdpt", seed=1, **values):
         "height": 8,
         "max_depth": 3,
         "machine": "a machine",
-        "versions": '{"mitsuba": "3.9.1"}',
+        "versions": '{"mitsuba": "3.9.1", "source": "s"}',
         "first": "bdpt",
         "reference_sha256": "",
         "tile_means": list(TRUE),
@@ -143,7 +144,8 @@ def results():
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
     values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}
-    probes = {"coldstart": {"versions": {"mitsuba": "3.9.1", "machine": "a machine"}, "values": values}}
+    kept = {"mitsuba": "3.9.1", "source": "s", "machine": "a machine"}
+    probes = {"coldstart": {"versions": kept, "values": values}}
     return Results(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes)
 
 
@@ -161,6 +163,26 @@ def test_the_stronger_path_decides(results):
 
 
 # -- report -----------------------------------------------------------------------------------
+
+
+def test_the_report_says_which_source_measured_what():
+    """Expected: one machine and version for all rows; a scene that was measured anew names its source, and
+    rows of one scene by two sources are refused, as those of two machines are.
+    """
+
+    def said(*rows):
+        keys = ("scene", "machine", "source")
+        rows = [dict(zip(keys, row, strict=True)) for row in rows]
+        rows = [row | {"versions": json.dumps({"mitsuba": "1", "source": row["source"]})} for row in rows]
+        return report.machine(SimpleNamespace(rows=rows))
+
+    assert said(("a", "m", "x"), ("b", "m", "x")) == "m; mitsuba 1, source x"
+    anew = said(("a", "m", "x"), ("b", "m", "x"), ("c", "m", "y"))
+    assert anew == "m; mitsuba 1, source x, y for `c`"
+    with pytest.raises(ValueError, match="rows of a are by several sources of the plugin; render them anew"):
+        said(("a", "m", "x"), ("a", "m", "y"))
+    with pytest.raises(ValueError, match="from several machines or versions"):
+        said(("a", "m", "x"), ("b", "other", "x"))
 
 
 def cells(text, first):
