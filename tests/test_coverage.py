@@ -99,6 +99,10 @@ NO_REFERENCE = {
     ("inside of a sphere", "distant"),
     ("inside of a sphere", "distant, point"),
     ("inside of a sphere", "distant, shape"),
+    # A beam, one surface, the sensor: t = 1 alone makes such paths, and these sensors have none. `explain`
+    # says that they are lost (test_explain_says_what_is_lost).
+    *(("directionalarea", s) for s in ("distant, point", "distant, shape", "radiancemeter")),
+    *(("directionalarea", s) for s in ("mixed batch", "own fisheye")),
 }
 PAIRS = [(e, s) for e in parts.EMITTERS for s in parts.SENSORS if (e, s) not in NO_REFERENCE]
 
