@@ -23,9 +23,6 @@ from report import replace_part, table, write_text
 
 import mitsuba as mi  # isort: skip
 
-ROOT = Path(__file__).resolve().parents[1]
-EGG = ROOT / "scenes" / "meshes" / "veach_bidir_egg.ply"
-
 RENDERS = 8
 SPP = 256  # at `SIZE`; `path` has `FINER` times as many
 FINER = 4

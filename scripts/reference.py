@@ -378,8 +378,8 @@ def _rendered(job: Job, depth: int):
     halves = Halves(SUMS / f"reference_{job.scene}_{job.resolution}_{depth}.npz", key)
     aim = Aim(scene, depth, job.spp, by_path)
     windows = [Window(job, share) for share in FOCUS.get(job.scene, ())]
-    stored = _stored(job, depth)
-    if halves.rounds == 0 and stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):
+    stored = _stored(job, depth) if halves.rounds == 0 else None
+    if stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):
         halves.go_on_from(stored, [window.slices for window in windows])
     started = time.perf_counter()
     reached = halves.rounds > 0 and aim.reached(halves.reference({}))

@@ -343,26 +343,21 @@ def write_text(path: Path, text: str):
 def machine(results: Results) -> str:
     """Where and with what it was measured; raises ``ValueError`` for rows of several machines or versions,
     and for those of one scene by several sources of the plugin (a scene may be measured anew by itself)."""
-    found, sources = set(), {}
+    found, source_of, scenes = set(), {}, {}
     for row in results.rows:
-        versions = json.loads(row["versions"])
-        sources.setdefault(versions.pop("source"), set()).add(row["scene"])
+        versions, scene = json.loads(row["versions"]), row["scene"]
+        source = versions.pop("source")
+        if source_of.setdefault(scene, source) != source:
+            raise ValueError(f"the rows of {scene} are by several sources of the plugin; render them anew")
+        scenes.setdefault(source, set()).add(scene)
         found.add((row["machine"], json.dumps(versions)))
     if len(found) > 1:
         raise ValueError(f"the rows are from several machines or versions: {sorted(found)}")
-    if twice := sorted(_twice(sources.values())):
-        raise ValueError(f"the rows of {twice[0]} are by several sources of the plugin; render them anew")
     ((where, versions),) = found
     text = where + "; " + ", ".join(f"{name} {version}" for name, version in json.loads(versions).items())
-    main, *others = sorted(sources, key=lambda source: -len(sources[source]))
-    named = "".join(f", {source} for `{'`, `'.join(sorted(sources[source]))}`" for source in others)
+    main, *others = sorted(scenes, key=lambda source: -len(scenes[source]))
+    named = "".join(f", {source} for `{'`, `'.join(sorted(scenes[source]))}`" for source in others)
     return f"{text}, source {main}{named}"
-
-
-def _twice(sets) -> list:
-    """Members of more than one of the sets."""
-    members = [member for s in sets for member in s]
-    return [member for member in set(members) if members.count(member) > 1]
 
 
 def page(results: Results, made: dict, goals: list, notes: dict) -> str:

@@ -7,7 +7,6 @@ stand for those of users: classes that the package has never heard of.
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -550,14 +549,3 @@ def pair(emitter, sensor, reference=False):
         part = with_shutter(part)
     lamp = reference_lamp(emitter) if reference else EMITTERS[emitter]()
     return mi.load_dict(open_scene(part, lamp=lamp))
-
-
-@contextlib.contextmanager
-def evaluated(on=True):
-    """Loops, calls and branches of kernels are not recorded but run one after the other, which
-    `timed_sunsky` needs under Mitsuba's own integrators."""
-    flags = (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals)
-    with contextlib.ExitStack() as stack:
-        for flag in flags if on else ():
-            stack.enter_context(dr.scoped_set_flag(flag, False))
-        yield

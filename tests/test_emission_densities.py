@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from mitsuba_bdpt.emitters import Emitters
+from mitsuba_bdpt.objects import step_by_step
 from scipy import stats
 
 COUNT = 200_000
@@ -32,7 +33,7 @@ def emission(name, **others):
     u = [mi.Float(v) for v in numbers(4)]
     like = dr.zeros(mi.Interaction3f)  # time and wavelengths
     like.time = mi.Float(0.3)
-    with parts.evaluated(name == "timed_sunsky"):
+    with step_by_step(name == "timed_sunsky"):
         e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
         dr.eval(e)
     return scene, emitters, e
@@ -124,7 +125,7 @@ def test_directions_from_infinity(name):
     def density(outward):
         si = scene.ray_intersect(mi.Ray3f(emitters.center + outward * (3 * emitters.radius), outward))
         si.time = mi.Float(0.3)
-        with parts.evaluated(name == "timed_sunsky"):
+        with step_by_step(name == "timed_sunsky"):
             return column(emitters.hit_densities(si, mi.Point3f(emitters.center), mi.Bool(True))[1])
 
     stated, own = column(e.pdf_first), density(-e.d)

@@ -21,7 +21,7 @@ import numpy as np
 
 from . import rays
 from .objects import number
-from .sensor_records import Arrival, CameraJoin, CameraStart, Sensor
+from .sensor_records import Arrival, CameraJoin, CameraStart, Sensor, view_at
 
 KINDS = ("PerspectiveCamera", "ThinLensCamera")
 
@@ -98,8 +98,8 @@ class Camera(Sensor):
     def _start(self, uv, u_lens, like) -> CameraStart:
         index = mi.UInt32(0)
         if self._count > 1:
-            index = dr.minimum(mi.UInt32(uv.x * self._count), self._count - 1)
-            uv = mi.Point2f(uv.x * self._count - mi.Float(index), uv.y)
+            index, x = view_at(uv.x, self._count)
+            uv = mi.Point2f(x, uv.y)
         view = self._view(index)
         uv = uv - view.origin
         a = view.from_film
@@ -133,7 +133,7 @@ class Camera(Sensor):
     def _lens_point(self, u_lens, u_film):
         index = mi.UInt32(0)
         if self._count > 1:
-            index = dr.minimum(mi.UInt32(u_film.x * self._count), self._count - 1)
+            index, _ = view_at(u_film.x, self._count)
         view = self._view(index)
         local = view.lens_point(u_lens) if self.lens else mi.Point3f(0)
         return index, view, _transform(view.to_world, local, 1)

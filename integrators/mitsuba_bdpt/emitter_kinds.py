@@ -103,6 +103,11 @@ def left_out(emitter, kind: int) -> list[tuple[str, str]]:
     return [(f"{name} of emitter '{emitter.id()}'", _WHY_NOT[kind]) for name in names]
 
 
+def is_foreign(class_name: str) -> bool:
+    """Whether an emitter's class is not Mitsuba's."""
+    return class_name not in _KINDS
+
+
 def needs_evaluation(class_name: str) -> bool:
     """Whether calls of such an emitter fail while a kernel is recorded: it asks for the value of a mask."""
     return class_name == "TimedSunskyEmitter"

@@ -34,6 +34,7 @@ from .emitter_kinds import (
     PROJECTOR,
     UNKNOWN,
     UNSAMPLED,
+    is_foreign,
     is_hittable,
     is_lit_directly,
     is_sampled_by_texture,
@@ -126,13 +127,16 @@ class Emitters:
         self.on_shapes = any(e.get_shape() is not None for e in emitters)
         self.beams = DIRECTIONAL_AREA in self.kinds
         self.at_infinity = bool(self.kinds & {INFINITE, DIRECTIONAL})
-        self.evaluated = any(needs_evaluation(name) for name in living_emitters())
+        living = living_emitters()
+        self.evaluated = any(needs_evaluation(name) for name in living)
         self.left_out = [text for e, k in zip(emitters, kinds, strict=True) for text in left_out(e, k)]
         if not kinds:
             return
         self._pointers = scene.emitters_dr()
         sampling_weight = mi.Float([number(e.sampling_weight()) for e in emitters])
         self._kind, self._pmf = mi.UInt32(kinds), sampling_weight / dr.sum(sampling_weight)
+        foreign = any(is_foreign(name) for name in living)
+        self._ask_shapes = foreign and not _all_answer(self._pointers)
         self._read_shapes(scene, emitters, kinds)
         placements = [placement(e, k) for e, k in zip(emitters, kinds, strict=True)]
         self._placements = Placement.table(placements)
@@ -158,7 +162,6 @@ class Emitters:
         ]
         self._inv_area = dr.rcp(mi.Float(areas))
         textured = [is_textured(e, k) for e, k in pairs]
-        self._ask_shapes = any(sampled) and not _all_answer(self._pointers)
         # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
         by_texture = [not self._ask_shapes and is_sampled_by_texture(e, k) for e, k in pairs]
         by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
@@ -166,7 +169,7 @@ class Emitters:
         self._any_by_shape, self._by_shape = any(by_shape), mi.Bool(by_shape)
         if self._any_by_shape:
             refuse_curves(scene, emitters[by_shape.index(True)], "has a textured radiance on such a shape")
-        if self._ask_shapes:
+        if self._ask_shapes and any(sampled):
             refuse_curves(
                 scene, emitters[sampled.index(True)], "lives with a class that has no sample_position"
             )

@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .points import Purpose
+from .sensor_records import Region
 
 # What ``aov`` of Mitsuba 3.9.1 knows.
 KINDS = (
@@ -74,15 +75,13 @@ class FeatureLayers:
     def __init__(self, scene, sensor, aovs: str, spp: int):
         self._scene, self._sensor, self._plugin = scene, sensor, _plugin(aovs)
         self.names = self._plugin.aov_names()
-        film = sensor.film()
-        self._size = dr.opaque(mi.Point2f, [float(n) for n in film.crop_size()])
-        self._offset = dr.opaque(mi.Point2f, [float(n) for n in film.crop_offset()])
+        self._region = Region(sensor.film())
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
 
     def sample(self, points, stream, position, u_lens, time, active) -> list:
         """One number per layer for the camera sample at the film ``position`` (pixels), seen through
         the point of the lens that ``u_lens`` chooses."""
-        uv = (position - self._offset) / self._size
+        uv = self._region.to_uv(position)
         ray, _ = self._sensor.sample_ray_differential(time, 0.5, uv, u_lens, active)
         ray.scale_differential(self._spread)
         if mi.is_spectral:

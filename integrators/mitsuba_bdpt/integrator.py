@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
 import time
@@ -17,6 +16,7 @@ from .emitters import Emitters
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import Batch, Counters, Kernel, trace
+from .objects import step_by_step
 from .parameters import integer, is_index, read_settings
 from .plan import UNLIMITED, Settings, plan, scene_bsdfs
 from .sensor_records import Sensor
@@ -319,7 +319,7 @@ class Render:
             if launch:
                 self._wait()
             drawn = self._points(step, batch)
-            with _recorded(self.emitters):
+            with step_by_step(self.emitters.evaluated):
                 counts = trace(self.kernel, self.accumulator, batch, drawn, step.of)
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 self.accumulator.evaluate(counts)
@@ -396,16 +396,6 @@ class Render:
             **({"error": self.accumulator.error()} if self.settings.variance else {}),
             "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
         }
-
-
-@contextlib.contextmanager
-def _recorded(emitters: Emitters):
-    """How kernels are recorded: as a whole, or step by step where an emitter cannot be called otherwise."""
-    with contextlib.ExitStack() as stack:
-        if emitters.evaluated:
-            for flag in (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
-                stack.enter_context(dr.scoped_set_flag(flag, False))
-        yield
 
 
 def _check_strategy_memory(depth: int, film):

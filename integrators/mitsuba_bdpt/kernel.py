@@ -211,19 +211,9 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
-    walk = Walk(
-        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
-        ray=ray,
-        previous=mi.Point3f(e.si.p),
-        throughput=mi.Spectrum(e.weight),
-        partial=mis.Partial(h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse))),
-        reference=dr.max(dr.abs(mi.unpolarized_spectrum(e.weight))),
-        eta=mi.Float(1),
-        edges=mi.UInt32(1),
-        seen=mi.Bool(False),
-        broken=mi.Bool(False),
-        active=active,
-    )
+    pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    partial = mis.Partial(h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse)))
+    walk = Walk.begin(pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
     side = Side(
         "light",
         True,
@@ -308,24 +298,12 @@ def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
 
 def _camera_walk(kernel, start, active) -> Walk:
     """A camera subpath on its first edge."""
-    ray, weight = start.ray, mi.Spectrum(start.weight)
+    ray = start.ray
     if kernel.plan.hide_emitters:
         pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.quadrics, ray, active, coherent=True)
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    return Walk(
-        pi=pi,
-        ray=ray,
-        previous=start.p,
-        throughput=weight,
-        partial=_first_partial(kernel, start),
-        reference=dr.max(dr.abs(mi.unpolarized_spectrum(weight))),
-        eta=mi.Float(1),
-        edges=mi.UInt32(1),
-        seen=mi.Bool(False),
-        broken=mi.Bool(False),
-        active=active,
-    )
+    return Walk.begin(pi, ray, start.p, mi.Spectrum(start.weight), _first_partial(kernel, start), active)
 
 
 def _first_partial(kernel, start):

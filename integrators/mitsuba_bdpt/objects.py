@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from functools import cache
 
 import drjit as dr
@@ -34,6 +35,17 @@ def _emitter(index: int):
         return dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(index))[0]
     except RuntimeError:  # never given, or freed
         return None
+
+
+@contextlib.contextmanager
+def step_by_step(on=True):
+    """Loops, calls and branches of kernels are not recorded as a whole but run one after the other, which
+    calls of `timed_sunsky` need."""
+    flags = (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals)
+    with contextlib.ExitStack() as stack:
+        for flag in flags if on else ():
+            stack.enter_context(dr.scoped_set_flag(flag, False))
+        yield
 
 
 def children(owner) -> dict:

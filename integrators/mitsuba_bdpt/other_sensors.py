@@ -9,7 +9,7 @@ import numpy as np
 from . import rays
 from .emitter_tables import SmoothMeshes
 from .objects import number
-from .sensor_records import Arrival, CameraJoin, CameraStart, Sensor
+from .sensor_records import Arrival, CameraJoin, CameraStart, Sensor, view_at
 
 
 class _Parallel(Sensor):
@@ -210,9 +210,8 @@ class Opaque(Sensor):
         self._views = views or [sensor]
 
     def _start(self, uv, u_lens, like) -> CameraStart:
-        count = len(self._views)
-        index = dr.minimum(mi.UInt32(uv.x * count), count - 1)
-        uv = mi.Point2f(uv.x * count - mi.Float(index), uv.y)
+        index, x = view_at(uv.x, len(self._views))
+        uv = mi.Point2f(x, uv.y)
         chosen = None
         for i, view in enumerate(self._views):
             ray, weight = view.sample_ray_differential(like.time, like.u_wavelength, uv, u_lens)

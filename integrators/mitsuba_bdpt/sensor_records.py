@@ -116,6 +116,12 @@ class Region:
         return dr.all((uv >= self.low) & (uv < self.high))
 
 
+def view_at(x, count: int):
+    """Which of ``count`` views side by side ``x`` in [0, 1) is in, and its place within that view."""
+    index = dr.minimum(mi.UInt32(x * count), count - 1)
+    return index, x * count - mi.Float(index)
+
+
 class Sensor:
     """What the kernel may ask of a sensor; made anew for each render.
 

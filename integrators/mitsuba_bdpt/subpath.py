@@ -39,6 +39,23 @@ class Walk:
     broken: object
     active: object
 
+    @staticmethod
+    def begin(pi, ray, previous, throughput, partial, active) -> Walk:
+        """A subpath on its first edge."""
+        return Walk(
+            pi=pi,
+            ray=ray,
+            previous=mi.Point3f(previous),
+            throughput=throughput,
+            partial=partial,
+            reference=dr.max(dr.abs(mi.unpolarized_spectrum(throughput))),
+            eta=mi.Float(1),
+            edges=mi.UInt32(1),
+            seen=mi.Bool(False),
+            broken=mi.Bool(False),
+            active=active,
+        )
+
     def traced(self):
         """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
         return dr.maximum(self.edges, 2) - 1
