@@ -689,10 +689,15 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         last_arrival=u32(k),
         last_light=u32(k if plan.arrival else k - 1),
         count_light=f(1),
-        coefficient_splat=f(kappa.splat),
-        coefficient_endpoints=f(kappa.endpoints),
-        coefficient_inner=f(kappa.inner),
-        coefficient_arrival=f(kappa.arrival),
+        kappa=kernel.Coefficients(
+            hit=f(1),
+            direct=f(1),
+            splat=f(kappa.splat) if plan.splat else 0,
+            endpoints=f(kappa.endpoints) if plan.endpoints else 0,
+            arrival=f(kappa.arrival) if plan.arrival else 0,
+            inner=f(kappa.inner) if kappa.inner > 0 else 0,
+        ),
+        refracts=True,
         points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
         quadrics=Flat(),
@@ -738,14 +743,14 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))
 
     shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
-    counters = kernel.Counters(*(u32(0) for _ in kernel.Counters.__dataclass_fields__))
     scene.begin(from_light=True)
     monkeypatch.setattr(dr, "while_loop", python_loop(k if plan.arrival else k - 1))
-    path, counters = kernel._light_subpath(k_, Nothing(), k_.points.stream(), shared, None, counters)
+    path, _ = kernel._light_subpath(k_, Nothing(), k_.points.stream(), shared, None)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
     lane = kernel._Lane(place, shared, path)
+    counters = dict.fromkeys(kernel.COUNTERS, u32(0))
     kernel._camera_subpath(k_, Nothing(), lane, u32(0), counters, mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)

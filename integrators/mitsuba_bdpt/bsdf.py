@@ -156,16 +156,21 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
     return _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
 
 
+def brightest(value):
+    """The largest entry of a spectrum, in size."""
+    return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
+
+
 def is_zero(value):
     """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
-    return dr.max(dr.abs(mi.unpolarized_spectrum(value))) == 0
+    return brightest(value) == 0
 
 
 def _back(bsdf, si, bs, u1, u2, active, mode):
     """Sample a delta event from its other end; whether it leads back, and its weight."""
     back, weight = bsdf.sample(mi.BSDFContext(mode), with_wi(si, bs.wo), u1, u2, active)
     same = dr.squared_norm(back.wo - si.wi) < 1e-4
-    return same & (dr.max(dr.abs(mi.unpolarized_spectrum(weight))) > 0), weight
+    return same & (brightest(weight) > 0), weight
 
 
 def _event_cos_ratio(si, bs):
@@ -211,6 +216,11 @@ def needs_round_trip(bsdfs) -> bool:
         b.class_name() in ("BumpMap", "NormalMap") and mi.has_flag(b.flags(), mi.BSDFFlags.Delta)
         for b in nested(bsdfs)
     )
+
+
+def any_refracts(bsdfs) -> bool:
+    """Whether light may cross a surface, and thereby change the index of refraction."""
+    return any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in bsdfs)
 
 
 def nested(bsdfs):

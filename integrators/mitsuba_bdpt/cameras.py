@@ -180,7 +180,7 @@ class Camera(Sensor):
         """Where the walk's ray crosses the lens, which is no shape of the scene. What lies between the lens
         and the near plane does not hide it: camera rays start there too."""
         view = self._view(mi.UInt32(0))
-        o, d = _transform(view.to_camera, walk.previous, 1), _transform(view.to_camera, walk.ray.d, 0)
+        o, d = _transform(view.to_camera, walk.previous, 1), _transform(view.to_camera, walk.d, 0)
         towards = walk.active & (d.z < 0) & (o.z > 0)
         slope = dr.select(towards, -d.z, 1)
         distance = o.z / slope
@@ -189,7 +189,7 @@ class Camera(Sensor):
         unhidden = distant | ~walk.pi.is_valid() | (walk.pi.t >= (o.z - view.near) / slope)
         within = distant | ((o.z >= view.near) & (o.z <= view.far))
         z0 = _transform(view.to_world, local, 1)
-        position, _, inside = self._project(mi.UInt32(0), view, -walk.ray.d, z0)
+        position, _, inside = self._project(mi.UInt32(0), view, -walk.d, z0)
         pdf_area, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
         return Arrival(
             dist2=dr.square(distance),
@@ -201,11 +201,11 @@ class Camera(Sensor):
             active=towards & on_lens & unhidden & within & inside,
             # Camera rays see the surroundings behind the far plane, and whatever is there does not hide them.
             surroundings=mi.Ray3f(
-                z0 - walk.ray.d * (view.near / slope),
-                -walk.ray.d,
+                z0 - walk.d * (view.near / slope),
+                -walk.d,
                 (view.far - view.near) / slope,
-                walk.ray.time,
-                walk.ray.wavelengths,
+                vertex.si.time,
+                vertex.si.wavelengths,
             ),
         )
 

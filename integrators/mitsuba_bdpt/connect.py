@@ -23,9 +23,6 @@ from .subpath import Vertex, newest_coefficient
 # Least probability of surviving roulette: random numbers are multiples of 2^-24.
 LEAST_SURVIVAL = 2.0**-20
 
-# kappa of s = 0 and s = 1: a sample each per camera vertex.
-NEXT_EVENT = HIT = 1.0
-
 
 @dataclass
 class Contribution:
@@ -121,10 +118,10 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     active &= ~bsdf.is_zero(radiance)
     connect, first, second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
-    endpoints = kernel.coefficient_endpoints * first
+    endpoints = mis.times(kernel.kappa.endpoints, first)
     if kernel.camera.parallel:  # (1,1) would need just this direction
-        endpoints = dr.select(z.hit, endpoints, 0)
-    newest = dr.select(directly, endpoints, NEXT_EVENT * connect)
+        endpoints = mis.choose(z.hit, endpoints, 0)
+    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, connect))
     older = dr.select(kernel.within_store(z.edges), first * second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
@@ -132,7 +129,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
     )
-    weight = h.weight(HIT, mi.Float(0), camera_side)
+    weight = h.weight(kernel.kappa.hit, 0, camera_side)
     return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active)
 
 
@@ -149,10 +146,10 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
     value = z.throughput * f.value * e.weight
     active &= ~bsdf.is_zero(value)
 
-    light_side = h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w))
-    older = dr.select(kernel.within_store(k), z.partial.d_vc, 0)
-    newest = newest_coefficient(kernel, kernel.coefficient_splat, z.edges)
-    newest = dr.select(kernel.within_store(k), newest, 0)
+    light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
+    older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
+    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    newest = mis.choose(kernel.within_store(k), newest, 0)
     camera_side = mis.alternatives(
         h,
         mis.Partial(z.partial.d_vcm, older),
@@ -160,13 +157,13 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
         f.pdf_rev_w,
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
-    weight = h.weight(NEXT_EVENT, light_side, camera_side)
+    weight = h.weight(kernel.kappa.direct, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point = rays.segment(z.anchor, e.anchor, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    counters.shadow_s1 += _one(active)
+    counters["shadow_s1"] += _one(active)
     active &= ~rays.occluded(kernel.scene, ray, active)
     return Contribution(value, weight, mi.UInt32(1), z.edges + 1, active)
 
@@ -193,14 +190,14 @@ def join_endpoints(kernel, emission, stream, counters, active):
     active &= ~bsdf.is_zero(value)
     # s = 0: the camera hits the same point.
     ratio = join.pdf_w * geometry / emission.pdf_first
-    light_side = h.start(dr.select(emission.delta, 0, ratio))
-    camera_side = mi.Float(0)
+    light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
+    camera_side = 0
     if kernel.plan.arrival:
         towards = kernel.emitters.direction_density(emission, join.d, active)
         covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
         towards = dr.select(covered, towards, 0)
-        camera_side = h.scale(h.start(towards * join.arrival), kernel.coefficient_arrival)
-    weight = h.weight(kernel.coefficient_endpoints, light_side, camera_side)
+        camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
+    weight = h.weight(kernel.kappa.endpoints, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
@@ -208,7 +205,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     away = rays.spawn(join.anchor, -join.d, emission.si)
     away.maxt = join.reach  # camera rays see the surroundings behind the far plane
     ray = dr.select(emission.infinite, away, ray)
-    counters.shadow_t1 += _one(active)
+    counters["shadow_t1"] += _one(active)
     active &= ~rays.occluded(kernel.scene, ray, active)
     return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active), join.position
 
@@ -232,18 +229,18 @@ def splat(kernel, y: Vertex, stream, counters):
     value = estimate * dr.rcp(kernel.count_light)
     active &= ~bsdf.is_zero(value)
 
-    newest = newest_coefficient(kernel, NEXT_EVENT, y.edges)
+    newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
-    camera_side = mi.Float(0)
+    camera_side = 0
     if kernel.plan.arrival:
-        camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.coefficient_arrival)
-    weight = h.weight(kernel.coefficient_splat, light_side, camera_side)
+        camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
+    weight = h.weight(kernel.kappa.splat, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active)
     active, survival = _roulette(kernel, c.weighted(), u, active, counters)
-    counters.shadow_t1 += _one(active)
+    counters["shadow_t1"] += _one(active)
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
         pi, _ = rays.intersect_past_emitters(scene, kernel.quadrics, ray, active, coherent=False)
@@ -274,9 +271,9 @@ def arrive(kernel, emission, y: Vertex, walk):
     before = mis.Partial(h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)), walk.partial.d_vc)
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
     partial = mis.arrive(h, before, dist2, z.cos)
-    newest = dr.select(directly, kernel.coefficient_endpoints, kernel.coefficient_splat)
+    newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
-    weight = h.weight(kernel.coefficient_arrival, light_side, mi.Float(0))
+    weight = h.weight(kernel.kappa.arrival, light_side, 0)
     active &= _counts(kernel, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
@@ -307,18 +304,18 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     light_side = mis.alternatives(
         h,
         y.partial,
-        newest_coefficient(kernel, NEXT_EVENT, y.edges),
+        newest_coefficient(kernel, kernel.kappa.direct, y.edges),
         f_y.pdf_rev_w,
         f_z.pdf_fwd_w * cos_y * inverse,
     )
     camera_side = mis.alternatives(
         h,
         z.partial,
-        newest_coefficient(kernel, kernel.coefficient_splat, z.edges),
+        newest_coefficient(kernel, kernel.kappa.splat, z.edges),
         f_z.pdf_rev_w,
         f_y.pdf_fwd_w * cos_z * inverse,
     )
-    weight = h.weight(kernel.coefficient_inner, light_side, camera_side)
+    weight = h.weight(kernel.kappa.inner, light_side, camera_side)
     active &= _counts(kernel, weight)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active)
 
@@ -344,9 +341,9 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
         body,
         label="inner connections",
     )
-    counters.evaluated += candidates
-    counters.zero += candidates - nonzero
-    counters.shadow_inner += nonzero
+    counters["evaluated"] += candidates
+    counters["zero"] += candidates - nonzero
+    counters["shadow_inner"] += nonzero
     return total
 
 
@@ -384,13 +381,13 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         body,
         label="draw an inner connection",
     )
-    counters.evaluated += candidates
-    counters.zero += candidates - nonzero
-    counters.non_finite += _one(broken)
+    counters["evaluated"] += candidates
+    counters["zero"] += candidates - nonzero
+    counters["non_finite"] += _one(broken)
     value = chosen * (total / _size(chosen))
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)
-    counters.shadow_inner += _one(active)
+    counters["shadow_inner"] += _one(active)
     active &= ~rays.occluded(kernel.scene, rays.segment_to(z.anchor, end, z.si), active)
     return dr.select(active, value / survival, 0)
 
@@ -419,7 +416,7 @@ def _roulette(kernel, value, u, active, counters):
     survival = dr.clip(size * kernel.inverse_threshold, LEAST_SURVIVAL, 1)
     survival = dr.select(dr.isfinite(size), survival, 1)
     survived = u < survival
-    counters.rouletted += _one(active & ~survived)
+    counters["rouletted"] += _one(active & ~survived)
     return active & survived, survival
 
 
@@ -430,7 +427,7 @@ def _counts(kernel, weight):
 
 def _size(value):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
-    return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
+    return bsdf.brightest(value)
 
 
 def _one(mask):

@@ -15,7 +15,7 @@ from .colour import Bands, film_colours
 from .emitters import Emitters
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
-from .kernel import Batch, Counters, Kernel, trace
+from .kernel import COUNTERS, Batch, Kernel, trace
 from .objects import step_by_step
 from .parameters import integer, is_index, read_settings
 from .plan import UNLIMITED, Settings, plan, scene_bsdfs
@@ -271,7 +271,7 @@ class Render:
             scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
         )
         self._samplers, self._running = {}, []
-        self._counts = dict.fromkeys(Counters.names(), 0)
+        self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds = 0, 0, 0.0
 
     def run(self, on_pass, cancelled=lambda: False):

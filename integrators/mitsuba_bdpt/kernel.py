@@ -9,7 +9,7 @@ or image size.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -23,25 +23,32 @@ from .subpath import Side, Walk, random_walk
 STORE_SIZES = (64, MAX_STORED)
 
 
+# What lanes count (``UInt32``): rays by kind, inner connections by what became of them (``rouletted``: splats
+# too), samples that count as zero for want of a finite value.
+COUNTERS = (
+    "camera",
+    "light",
+    "shadow_s1",
+    "shadow_t1",
+    "shadow_inner",
+    "evaluated",
+    "zero",
+    "rouletted",
+    "non_finite",
+)
+
+
 @dataclass
-class Counters:
-    """What a lane has done; ``UInt32`` each. First rays by kind, then inner connections by what became
-    of them (``rouletted``: splats too), then samples that count as zero for want of a finite value."""
+class Coefficients:
+    """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`; the Python
+    number 0 for classes that are not in use."""
 
-    camera: object
-    light: object
-    shadow_s1: object
-    shadow_t1: object
-    shadow_inner: object
-    evaluated: object
-    zero: object
-    rouletted: object
-    non_finite: object
-
-    @classmethod
-    def names(cls) -> list[str]:
-        """In the order in which `trace` returns the sums."""
-        return [field.name for field in fields(cls)]
+    hit: object
+    direct: object
+    splat: object
+    endpoints: object
+    arrival: object
+    inner: object
 
 
 @dataclass
@@ -80,8 +87,7 @@ class Kernel:
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
         self.strategy_images = settings.strategy_images
-        count = 1 / plan.served if plan.light else 0.0  # nominal, see `bound`
-        inner = 1.0 if plan.connections != "none" else 0.0
+        self.refracts = bsdf.any_refracts(scene_bsdfs(scene))
         u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
         self._reach = u32(reach)
@@ -90,10 +96,7 @@ class Kernel:
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
         self.served = u32(plan.served)
-        self.coefficient_splat = f32(count * plan.splat_coefficient if plan.splat else 0)
-        self.coefficient_endpoints = f32(count if plan.endpoints else 0)
-        self.coefficient_arrival = f32(count if plan.arrival else 0)
-        self.coefficient_inner = f32(inner)
+        self.kappa = _coefficients(plan)
         self.inverse_threshold = f32(dr.inf)
 
     def bound(self, points, count_light: float) -> Kernel:
@@ -117,20 +120,20 @@ class Kernel:
 
 def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
     """Trace one batch and add it to ``film`` (an `Accumulator`); ``spp`` is the render's total,
-    which places the batch in the image's point sequence. Returns what `Counters` counted (``UInt64``,
-    one after the other); nothing is evaluated yet."""
+    which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
+    after the other); nothing is evaluated yet."""
     total = batch.pixels * batch.samples
     lanes = -(-total // kernel.plan.served)
     kernel = kernel.bound(points, lanes / total)  # exact also where S does not divide the batch
     lane = dr.arange(mi.UInt32, lanes)
     place = _Places(kernel, batch, spp)
-    counters = Counters(*(mi.UInt32(0) for _ in Counters.names()))
 
     stream = kernel.points.stream("light", place.index(lane), lane)
     shared = _shared(kernel, stream)
     path = connect.allocate_light_path(kernel.store_size, lanes)
+    of_light = {}
     if kernel.plan.light:
-        path, counters = _light_subpath(kernel, film, stream, shared, path, counters)
+        path, of_light = _light_subpath(kernel, film, stream, shared, path)
 
     common = _Lane(place, shared, path)
 
@@ -140,7 +143,8 @@ def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
         counters = _camera_subpath(kernel, film, common, slot, counters, active)
         return served + 1, counters
 
-    if kernel.plan.served == 1:
+    counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
+    if not kernel.plan.light:
         _, counters = body(mi.UInt32(0), counters)
     else:
         _, counters = dr.while_loop(
@@ -149,7 +153,7 @@ def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
             body,
             label="camera subpaths of one light subpath",
         )
-    return _sum(counters)
+    return _sum(of_light, counters)
 
 
 @dataclass
@@ -197,7 +201,23 @@ def _shared(kernel, stream) -> Shared:
     return Shared(time, wavelengths, weight, u)
 
 
-def _light_subpath(kernel, film, stream, shared, path, counters):
+def _zeros(*names) -> dict:
+    """Counters of these ``names``. Loops hold only those that they change, see `Walk`."""
+    return {name: mi.UInt32(0) for name in names}
+
+
+def _counted_by_light(plan):
+    names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
+    return names + ["non_finite"] * (plan.splat or plan.arrival)
+
+
+def _counted_by_camera(plan):
+    one = plan.connections == "one"
+    names = ["shadow_s1"] * plan.direct + ["non_finite"] * one + ["rouletted"] * (one and plan.roulette)
+    return names + ["shadow_inner", "evaluated", "zero"] * (plan.connections != "none")
+
+
+def _light_subpath(kernel, film, stream, shared, path):
     points, h, emitters = kernel.points, kernel.heuristic, kernel.emitters
     e = emitters.sample_emission(
         points.draw_2d("light", stream, Purpose.EMISSION_POINT),
@@ -205,6 +225,7 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
         shared,
         mi.Bool(True),
     )
+    counters = _zeros("shadow_t1", "light", "non_finite")
     if kernel.plan.endpoints:
         c, position = connect.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
         _deposit_splat(kernel, film, c, position, shared, counters)
@@ -212,13 +233,16 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    partial = mis.Partial(h.start(inverse), dr.select(e.delta, 0, h.start(e.cos * inverse)))
-    walk = Walk.begin(pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
+    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse)), kernel.kappa.hit)
+    partial = mis.Partial(h.start(inverse), mis.present(hit))
+    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
     side = Side(
         "light",
+        shared,
+        bsdf.brightest(walk.throughput),
         True,
         kernel.last_light,
-        connect.NEXT_EVENT,
+        kernel.kappa.direct,
         complete=lambda si, first: emitters.connection_density(e, si, first),
     )
 
@@ -234,10 +258,21 @@ def _light_subpath(kernel, film, stream, shared, path, counters):
             connect.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    (path, counters), walk = random_walk(kernel, side, walk, stream, visit, (path, counters))
-    counters.light += dr.select(active, walk.traced(), 0)
-    counters.non_finite += dr.select(walk.broken, mi.UInt32(1), mi.UInt32(0))
+    state = path, _zeros(*_counted_by_light(kernel.plan))
+    (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
+    counters = _added(counters, counted)
+    counters["light"] += dr.select(active, walk.traced(), 0)
+    counters["non_finite"] += dr.select(walk.broken, mi.UInt32(1), mi.UInt32(0))
     return path, counters
+
+
+def _added(*several) -> dict:
+    """Counters added up by name."""
+    total = {}
+    for counters in several:
+        for name, value in counters.items():
+            total[name] = total[name] + value if name in total else value
+    return total
 
 
 def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
@@ -278,21 +313,24 @@ def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
 
     side = Side(
         "camera",
+        shared,
+        bsdf.brightest(walk.throughput),
         False,
         kernel.max_depth,
-        kernel.coefficient_splat,
+        kernel.kappa.splat,
         alpha=film.alpha,
         parallel=kernel.camera.parallel,
     )
-    state = (dr.zeros(mi.Spectrum), counters)
-    (radiance, counters), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters.camera += dr.select(active, walk.traced(), 0)
+    state = (dr.zeros(mi.Spectrum), _zeros(*_counted_by_camera(plan)))
+    (radiance, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
+    counters = _added(counters, counted)
+    counters["camera"] += dr.select(active, walk.traced(), 0)
     features = []
     if film.features is not None:
         features = film.features.sample(points, stream, start.position, u_lens, shared.time, covered)
     alpha = _alpha(kernel, walk.seen)
     dropped = _deposit_camera(film, start.counted, radiance, alpha, features, shared, covered)
-    counters.non_finite += dr.select(dropped | walk.broken, mi.UInt32(1), mi.UInt32(0))
+    counters["non_finite"] += dr.select(dropped | walk.broken, mi.UInt32(1), mi.UInt32(0))
     return counters
 
 
@@ -303,15 +341,16 @@ def _camera_walk(kernel, start, active) -> Walk:
         pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.quadrics, ray, active, coherent=True)
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    return Walk.begin(pi, ray, start.p, mi.Spectrum(start.weight), _first_partial(kernel, start), active)
+    partial = _first_partial(kernel, start)
+    return Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active)
 
 
 def _first_partial(kernel, start):
     """Partial sums of a camera subpath's first edge: t = 1 is its newest alternative, t = 0 an older one."""
     h = kernel.heuristic
-    arrival = (
-        h.scale(h.start(start.arrival), kernel.coefficient_arrival) if kernel.plan.arrival else mi.Float(0)
-    )
+    arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
+    if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
+        arrival = mis.present(arrival)
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
 
 
@@ -335,7 +374,7 @@ def _deposit_splat(kernel, film, c, position, shared, counters):
     """Add a contribution with t <= 1; without finite value it counts as zero."""
     value = film.colour(c.weighted() * shared.weight, shared.wavelengths)
     finite = dr.all(dr.isfinite(value))
-    counters.non_finite += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
+    counters["non_finite"] += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
     film.put_light(position, value, c.active & finite)
     if kernel.strategy_images:
         unweighted = film.colour(c.value * shared.weight, shared.wavelengths)
@@ -349,12 +388,28 @@ def _deposit_strategy(kernel, film, c, position, shared):
     film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
 
 
-def _sum(counters: Counters):
-    """The lanes' counters added up, ``UInt64`` in the order of `Counters.names`."""
-    total = dr.zeros(mi.UInt64, len(Counters.names()))
-    for i, value in enumerate(vars(counters).values()):
-        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt64(value), mi.UInt32(i), mode=dr.ReduceMode.Expand)
+def _sum(*several):
+    """The lanes' counters added up, ``UInt64`` in the order of `COUNTERS`."""
+    total = dr.zeros(mi.UInt64, len(COUNTERS))
+    for name, value in _added(*several).items():
+        index = mi.UInt32(COUNTERS.index(name))
+        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt64(value), index, mode=dr.ReduceMode.Expand)
     return total
+
+
+def _coefficients(plan) -> Coefficients:
+    def opaque(value, used):
+        return dr.opaque(mi.Float, value) if used else 0
+
+    count = 1 / plan.served if plan.light else 0.0  # nominal, see `Kernel.bound`
+    return Coefficients(
+        hit=opaque(1, plan.hit),
+        direct=opaque(1, plan.direct),
+        splat=opaque(count * plan.splat_coefficient, plan.splat),
+        endpoints=opaque(count, plan.endpoints),
+        arrival=opaque(count, plan.arrival),
+        inner=opaque(1, plan.connections != "none"),
+    )
 
 
 def _opaque(kind):

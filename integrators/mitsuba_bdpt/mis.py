@@ -17,7 +17,8 @@ combined by the heuristic (``a + b``, ``hypot``, ``max`` or a count); squares ar
 ratios of densities over 60 orders of magnitude stay finite. (3) The density of next-event
 estimation may depend on the vertex that is lit; see ``emitters``.
 
-Everything here is arithmetic on floats of any width; it knows no scene.
+Everything here is arithmetic on floats of any width; it knows no scene. A coefficient or partial sum that
+is the Python number 0 belongs to classes that are not in use: nothing is computed for them.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
 
 HEURISTICS = ("balance", "power", "maximum", "uniform")
 
@@ -41,6 +43,26 @@ class Partial:
     d_vc: object
 
 
+def is_absent(x) -> bool:
+    """Whether ``x`` stands for classes of strategies that are not in use."""
+    return isinstance(x, (int, float)) and x == 0
+
+
+def present(x):
+    """A partial sum to which classes in use may be added."""
+    return mi.Float(0) if is_absent(x) else x
+
+
+def choose(mask, a, b):
+    """``dr.select`` of two coefficients or partial sums; 0 where both classes are not in use."""
+    return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
+
+
+def times(coefficient, density):
+    """A coefficient times a density that enter a partial sum together."""
+    return 0 if is_absent(coefficient) else coefficient * density
+
+
 class Heuristic:
     """How alternatives are combined: ``balance``, ``power`` (exponent 2), ``maximum``, ``uniform``.
 
@@ -54,6 +76,8 @@ class Heuristic:
 
     def scale(self, x, factor):
         """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
+        if is_absent(x) or is_absent(factor):
+            return 0
         if self.name == "uniform":  # counts strategies: only whether a density is zero matters
             return dr.select(factor > 0, x, 0)
         # The factor as well: 0 times an infinite product of densities would be NaN.
@@ -61,6 +85,8 @@ class Heuristic:
 
     def combine(self, a, b):
         """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
+        if is_absent(a) or is_absent(b):
+            return b if is_absent(a) else a
         if self.name == "power":
             total = dr.hypot(a, b)
         elif self.name == "maximum":
@@ -88,6 +114,8 @@ class Heuristic:
             best = (near >= camera_side) & (coefficient > light_side * (1 + 1e-4))
             return dr.select(best, 1.0, 0.0)
         others = self.combine(light_side, camera_side)
+        if is_absent(others):
+            return mi.Float(1)
         if self.name == "uniform":
             return dr.rcp(1 + others)
         ratio = others / coefficient
@@ -118,11 +146,13 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
     )
     # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its forward and
     # reverse probabilities cancel.
-    kept = dr.select(
-        step.delta,
-        heuristic.scale(partial.d_vc, step.cos_out),
-        heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
-    )
+    kept = 0
+    if not is_absent(older):
+        kept = dr.select(
+            step.delta,
+            heuristic.scale(partial.d_vc, step.cos_out),
+            heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
+        )
     return Partial(
         d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
         d_vc=kept,

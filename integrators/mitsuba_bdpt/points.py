@@ -53,7 +53,15 @@ _KEY = 0x27D4EB2F  # keeps the key of sample 0 from being 0
 # Measured on a Cornell box: gains come from film, emission, first light sample and the first bounces;
 # beyond the third there are none, but telling these vertices apart would cost more.
 STRATIFIED = {
-    "camera": {Purpose.FILM, Purpose.APERTURE, Purpose.EMITTER, Purpose.BSDF, Purpose.LOBE},
+    "camera": {
+        Purpose.FILM,
+        Purpose.APERTURE,
+        Purpose.EMITTER,
+        Purpose.BSDF,
+        Purpose.LOBE,
+        Purpose.ROULETTE,
+        Purpose.CONNECTION,
+    },
     "light": {
         Purpose.TIME,
         Purpose.WAVELENGTH,
@@ -61,6 +69,8 @@ STRATIFIED = {
         Purpose.EMISSION_DIRECTION,
         Purpose.BSDF,
         Purpose.LOBE,
+        Purpose.ROULETTE,
+        Purpose.CONNECTION,
     },
 }
 

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import bsdf, mis, rays
+from .mis import choose
 from .points import Purpose
 
 
@@ -19,20 +20,22 @@ from .points import Purpose
 class Walk:
     """State of a subpath between two vertices.
 
-    ``pi``, ``ray`` the next hit and the ray that finds it; ``previous`` position of the last vertex
-    (for a camera subpath the pinhole or lens point, not the near plane where ``ray`` starts);
+    ``pi`` the next hit, ``o`` and ``d`` of the ray that finds it; ``previous`` position of the last vertex
+    (for a camera subpath the pinhole or lens point, not the near plane where the ray starts);
     ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
-    measure before that edge; ``reference`` the throughput that roulette compares with; ``eta``
-    product of relative indices of refraction; ``edges`` number of edges up to the next vertex;
-    ``seen``: an event other than null happened; ``broken``: it ended for want of a finite throughput.
+    measure before that edge; ``eta`` product of relative indices of refraction (1 where nothing
+    refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
+    happened; ``broken``: it ended for want of a finite throughput.
+
+    What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
     """
 
     pi: object
-    ray: object
+    o: object
+    d: object
     previous: object
     throughput: object
     partial: mis.Partial
-    reference: object
     eta: object
     edges: object
     seen: object
@@ -40,16 +43,16 @@ class Walk:
     active: object
 
     @staticmethod
-    def begin(pi, ray, previous, throughput, partial, active) -> Walk:
+    def begin(kernel, pi, ray, previous, throughput, partial, active) -> Walk:
         """A subpath on its first edge."""
         return Walk(
             pi=pi,
-            ray=ray,
+            o=mi.Point3f(ray.o),
+            d=mi.Vector3f(ray.d),
             previous=mi.Point3f(previous),
             throughput=throughput,
             partial=partial,
-            reference=dr.max(dr.abs(mi.unpolarized_spectrum(throughput))),
-            eta=mi.Float(1),
+            eta=mi.Float(1) if kernel.refracts else 1,
             edges=mi.UInt32(1),
             seen=mi.Bool(False),
             broken=mi.Bool(False),
@@ -82,7 +85,8 @@ class Vertex:
 
 @dataclass(frozen=True)
 class Side:
-    """What distinguishes the two kinds of subpath.
+    """What distinguishes the two kinds of subpath, and what stays the same along one: ``like`` has its time
+    and wavelengths, roulette compares the throughput with ``reference``.
 
     ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
     alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera
@@ -92,6 +96,8 @@ class Side:
     """
 
     name: str
+    like: object
+    reference: object
     adjoint: bool
     last_edge: object
     coefficient: object
@@ -124,15 +130,16 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
 def newest_coefficient(kernel, first, edges):
     """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1 (s = 0 differs,
     see `connect.hit_emitter`); ``first`` is that at vertex 1, see `Side`."""
-    return dr.select(edges == 1, first, kernel.coefficient_inner)
+    return choose(edges == 1, first, kernel.kappa.inner)
 
 
 def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the walk's edge; densities go over to the area measure."""
     h = kernel.heuristic
-    si = walk.pi.compute_surface_interaction(walk.ray, mi.RayFlags.All, walk.active)
+    ray = mi.Ray3f(walk.o, walk.d, side.like.time, side.like.wavelengths)
+    si = walk.pi.compute_surface_interaction(ray, mi.RayFlags.All, walk.active)
     hit = walk.active & si.is_valid()
-    cos = dr.abs(dr.dot(si.n, walk.ray.d))
+    cos = dr.abs(dr.dot(si.n, walk.d))
     dist2 = dr.squared_norm(si.p - walk.previous)
     partial = walk.partial
     if side.complete is not None:
@@ -145,12 +152,12 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
     # A hit at exactly zero cosine has probability zero; its densities would be infinite.
     hit &= cos > 0
     in_area = mis.arrive(h, partial, dist2, cos)
-    partial = dr.select(hit, in_area, partial)
+    partial = mis.Partial(choose(hit, in_area.d_vcm, partial.d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
         cos=cos,
-        anchor=rays.surface_anchor(si, walk.ray, kernel.quadrics),
+        anchor=rays.surface_anchor(si, ray, kernel.quadrics),
         throughput=walk.throughput,
         partial=partial,
         edges=walk.edges,
@@ -178,27 +185,26 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
     throughput = walk.throughput * step.weight
-    eta = walk.eta * step.eta
-    brightest = dr.max(dr.abs(mi.unpolarized_spectrum(throughput)))
+    eta = walk.eta * step.eta if kernel.refracts else 1
+    brightest = bsdf.brightest(throughput)
     broken = walk.broken | (active & ~dr.isfinite(brightest))
     active &= (brightest > 0) & ~broken
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
-    survive = dr.minimum(brightest / walk.reference * (1 if side.adjoint else dr.square(eta)), 0.95)
+    survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.edges)
     playing = walk.edges >= kernel.rr_depth
     throughput = dr.select(playing, throughput / survive, throughput)
     active &= ~playing | (u < survive)
 
     seen = walk.seen | (sampled & ~step.null)
-    ray = rays.spawn(vertex.anchor, si.to_world(step.wo), walk.ray)
-    ray = dr.select(active, ray, mi.Ray3f(walk.ray))
+    ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.like)
     return Walk(
         pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
-        ray=ray,
+        o=ray.o,
+        d=ray.d,
         previous=mi.Point3f(si.p),
         throughput=throughput,
         partial=partial,
-        reference=walk.reference,
         eta=eta,
         edges=walk.edges + 1,
         seen=seen,
