@@ -218,11 +218,6 @@ def needs_round_trip(bsdfs) -> bool:
     )
 
 
-def any_refracts(bsdfs) -> bool:
-    """Whether light may cross a surface, and thereby change the index of refraction."""
-    return any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in bsdfs)
-
-
 def nested(bsdfs):
     """``bsdfs`` and every BSDF inside them (two-sided, mask, blend, bump and normal maps)."""
     found = list(bsdfs)

@@ -27,13 +27,16 @@ LEAST_SURVIVAL = 2.0**-20
 @dataclass
 class Contribution:
     """``value`` unweighted estimate (a spectrum), ``weight`` in [0, 1], numbers of light vertices
-    ``s`` and camera vertices ``t``, ``active``."""
+    ``s`` and camera vertices ``t``, ``active``; ``shares`` see `mis.ByClass`,
+    ``kind`` the class among `mis.CLASSES`."""
 
     value: object
     weight: object
     s: object
     t: object
     active: object
+    shares: object = None
+    kind: str = ""
 
     def weighted(self):
         """What the strategy adds to the image."""
@@ -45,23 +48,27 @@ class LightPath:
     """Connectible vertices of a lane's light subpath in local memory, ``count`` of them.
 
     ``throughput`` is that of the vertex over its cosine of incidence (the constant part of the adjoint
-    factor); ``s`` the number of light vertices up to and including it.
+    factor); ``newest`` and ``older`` are its `mis.Partial`; ``s`` the number of light vertices up to and
+    including it.
     """
 
     si: object
     throughput: object
-    partial: object
+    newest: object
+    older: object
     anchor: object
     s: object
     count: object
 
 
-def allocate_light_path(size: int, lanes: int) -> LightPath:
-    """Local memory for ``size`` vertices; no field is a Bool (these abort LLVM code generation)."""
+def allocate_light_path(kernel, lanes: int) -> LightPath:
+    """Local memory for stored vertices; no field is a Bool (these abort LLVM code generation)."""
+    size = kernel.store_size
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
         throughput=dr.alloc_local(mi.Spectrum, size),
-        partial=dr.alloc_local(mi.Vector2f, size),
+        newest=dr.alloc_local(mi.Float, size),
+        older=dr.alloc_local(type(kernel.heuristic.zero()), size),
         anchor=dr.alloc_local(mi.Vector2f, size),
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
@@ -75,7 +82,8 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
     slot = path.count
     path.si.write(vertex.si, slot, keep)
     path.throughput.write(mi.Spectrum(vertex.throughput / vertex.cos), slot, keep)
-    path.partial.write(mi.Vector2f(vertex.partial.d_vcm, vertex.partial.d_vc), slot, keep)
+    path.newest.write(vertex.partial.d_vcm, slot, keep)
+    path.older.write(vertex.partial.d_vc, slot, keep)
     path.anchor.write(mi.Vector2f(vertex.anchor.offset, vertex.anchor.curvature), slot, keep)
     path.s.write(vertex.edges + 1, slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
@@ -84,7 +92,7 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
 def read_light_vertex(kernel, path: LightPath, slot) -> Vertex:
     """The stored vertex ``slot``, the same in all lanes that use it."""
     si = path.si[slot]
-    partial, anchor = path.partial[slot], path.anchor[slot]
+    anchor = path.anchor[slot]
     s = path.s[slot]
     return Vertex(
         si=si,
@@ -92,7 +100,7 @@ def read_light_vertex(kernel, path: LightPath, slot) -> Vertex:
         cos=mi.Float(1),
         anchor=rays.Anchor(si.p, si.n, anchor.x, anchor.y if kernel.quadrics.any else mi.Float(0)),
         throughput=path.throughput[slot],
-        partial=mis.Partial(partial.x, partial.y),
+        partial=mis.Partial(path.newest[slot], path.older[slot]),
         edges=s - 1,
         previous=None,
         seen=None,
@@ -129,8 +137,8 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
     )
-    weight = h.weight(kernel.kappa.hit, 0, camera_side)
-    return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active)
+    weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
+    return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active, shares, "hit")
 
 
 def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
@@ -157,7 +165,7 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
         f.pdf_rev_w,
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
-    weight = h.weight(kernel.kappa.direct, light_side, camera_side)
+    weight, shares = h.weigh(kernel.kappa.direct, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
@@ -165,7 +173,7 @@ def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
     ray = dr.select(e.infinite, to_infinity, to_point)
     counters["shadow_s1"] += _one(active)
     active &= ~rays.occluded(kernel.scene, ray, active)
-    return Contribution(value, weight, mi.UInt32(1), z.edges + 1, active)
+    return Contribution(value, weight, mi.UInt32(1), z.edges + 1, active, shares, "direct")
 
 
 def join_endpoints(kernel, emission, stream, counters, active):
@@ -197,7 +205,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
         covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
         towards = dr.select(covered, towards, 0)
         camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
-    weight = h.weight(kernel.kappa.endpoints, light_side, camera_side)
+    weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
@@ -207,7 +215,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     ray = dr.select(emission.infinite, away, ray)
     counters["shadow_t1"] += _one(active)
     active &= ~rays.occluded(kernel.scene, ray, active)
-    return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active), join.position
+    return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active, shares, "light"), join.position
 
 
 def splat(kernel, y: Vertex, stream, counters):
@@ -234,11 +242,11 @@ def splat(kernel, y: Vertex, stream, counters):
     camera_side = 0
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
-    weight = h.weight(kernel.kappa.splat, light_side, camera_side)
+    weight, shares = h.weigh(kernel.kappa.splat, light_side, camera_side)
     active &= _counts(kernel, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
-    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active)
+    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light")
     active, survival = _roulette(kernel, c.weighted(), u, active, counters)
     counters["shadow_t1"] += _one(active)
     ray = rays.segment(y.anchor, join.anchor, y.si)
@@ -273,12 +281,12 @@ def arrive(kernel, emission, y: Vertex, walk):
     partial = mis.arrive(h, before, dist2, z.cos)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
-    weight = h.weight(kernel.kappa.arrival, light_side, 0)
+    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= _counts(kernel, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
-    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active), z.position
+    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light"), z.position
 
 
 def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
@@ -315,15 +323,15 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
         f_z.pdf_rev_w,
         f_y.pdf_fwd_w * cos_z * inverse,
     )
-    weight = h.weight(kernel.kappa.inner, light_side, camera_side)
+    weight, shares = h.weigh(kernel.kappa.inner, light_side, camera_side)
     active &= _counts(kernel, weight)
-    return Contribution(value, weight, y.edges + 1, z.edges + 1, active)
+    return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
 
 
-def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
+def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
-    ``deposit(contribution, total)`` adds a contribution to a running total and returns it.
+    ``add(contribution, total)`` adds a contribution to the running ``total`` and returns it.
     """
 
     def body(slot, total, nonzero):
@@ -332,11 +340,11 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, deposit):
         nonzero = nonzero + _one(c.active)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         c.active = c.active & ~rays.occluded(kernel.scene, ray, c.active)
-        return slot + 1, deposit(c, total), nonzero
+        return slot + 1, add(c, total), nonzero
 
-    candidates = _candidates(kernel, z, path)
+    candidates = candidate_count(kernel, z, path)
     _, total, nonzero = dr.while_loop(
-        (mi.UInt32(0), dr.zeros(mi.Spectrum), mi.UInt32(0)),
+        (mi.UInt32(0), total, mi.UInt32(0)),
         lambda slot, total, nonzero: slot < candidates,
         body,
         label="inner connections",
@@ -372,7 +380,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         end = dr.select(take, rays.end_point(z.anchor, y.anchor), end)
         return slot + 1, chosen, total, end, u, nonzero + _one(c.active), broken
 
-    candidates = _candidates(kernel, z, path)
+    candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
     none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.Point3f(z.si.p)
     _, chosen, total, end, u, nonzero, broken = dr.while_loop(
@@ -392,7 +400,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     return dr.select(active, value / survival, 0)
 
 
-def _candidates(kernel, z: Vertex, path: LightPath):
+def candidate_count(kernel, z: Vertex, path: LightPath):
     """Number of light vertices to try at ``z``: slot i holds y_{i+1} or a later one, and paths have at
     most `Kernel.last_inner` edges."""
     possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)

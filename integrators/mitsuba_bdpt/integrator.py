@@ -10,18 +10,19 @@ from dataclasses import asdict, dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from . import mis, points
+from . import choice, mis, pilot, points
 from .colour import Bands, film_colours
-from .emitters import Emitters
+from .explain import explain
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Batch, Kernel, trace
 from .objects import step_by_step
 from .parameters import integer, is_index, read_settings
-from .plan import UNLIMITED, Settings, plan, scene_bsdfs
+from .plan import UNLIMITED, Settings, plan
 from .sensor_records import Sensor
-from .sensors import prepare
+from .sinks import Image
 from .strategies import layer_names, strategy_count
+from .world import World
 
 # Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
 # a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
@@ -40,6 +41,9 @@ RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 # Independent images whose spread gives the variance: as few as the contract allows, since each has a
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
+
+# Number of the pilot's sequence, see `sequence_seed`.
+PILOT_SEQUENCE = 1 << 16
 
 # What strategy images may take, in bytes, before the render is refused.
 STRATEGY_MEMORY = 2 << 30
@@ -184,11 +188,8 @@ def _most_samples(settings: Settings) -> int:
     return PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
 
 
-def pass_sizes(camera: Sensor, spp: int, settings: Settings, first: bool = True) -> list[int]:
-    """Samples per pixel of each pass, in order; their sum is ``spp``.
-
-    The ``first`` pass of a render has one sample and gives roulette the scale of the image.
-    """
+def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
+    """Samples per pixel of each pass, in order, ``spp`` in all; the first is 1 if ``small_first``."""
     limit = _most_samples(settings)
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels fits into four launches' worth, see `batches`.
@@ -198,7 +199,7 @@ def pass_sizes(camera: Sensor, spp: int, settings: Settings, first: bool = True)
     if settings.points == "sampler":
         # Stratified samplers number the samples of a pixel; passes must cut them evenly.
         size = next(n for n in range(min(size, spp), 0, -1) if spp % n == 0)
-    elif first and settings.skip != "none" and spp > 1:
+    elif small_first and spp > 1:
         sizes, spp = [1], spp - 1
     return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
 
@@ -215,15 +216,15 @@ class Step:
     last: bool
 
 
-def schedule(camera: Sensor, spp: int, settings: Settings) -> list[Step]:
-    """All passes of a render of ``spp`` samples per pixel."""
+def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[Step]:
+    """All passes of a render of ``spp`` samples per pixel; ``small_first`` see `pass_sizes`."""
     parts = [spp]
     if settings.variance:
         parts = [spp // REPLICATES + (i < spp % REPLICATES) for i in range(REPLICATES)]
     steps = []
     for replicate, part in enumerate(parts):
         done = 0
-        for size in pass_sizes(camera, part, settings, replicate == 0):
+        for size in pass_sizes(camera, part, settings, small_first and replicate == 0):
             steps.append(Step(replicate, done, size, part, done + size == part))
             done += size
     return steps
@@ -243,6 +244,13 @@ def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings)
     ]
 
 
+def sequence_seed(seed, number: int):
+    """Seed of a point sequence besides the image's own: numbers 1 to 7 are the replicates of `variance`."""
+    other = mi.sample_tea_32(seed, mi.UInt32(number))[1]
+    dr.make_opaque(other)
+    return other
+
+
 class Render:
     """One render of ``spp`` samples per pixel: its scene, plan, accumulators and progress. Lives for one
     call."""
@@ -254,9 +262,9 @@ class Render:
         self.started = time.perf_counter()
         self.scene, self.sensor, self.settings, self.spp = scene, sensor, settings, spp
         self.film = sensor.film()
-        self.emitters = Emitters(scene)
-        self.camera = prepare(sensor, self.emitters.quadrics, bool(scene.shapes()))
-        self.plan = plan(scene, self.emitters, self.camera, settings)
+        self.world = World(scene, sensor)
+        self.emitters, self.camera = self.world.emitters, self.world.camera
+        self._full = self.plan = plan(self.world, settings)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)
@@ -267,12 +275,37 @@ class Render:
         self.accumulator = Accumulator(
             self.film, colour, self.camera.region.border, depth, settings.variance, features
         )
-        self.kernel = Kernel(
-            scene, self.camera, self.emitters, self.plan, settings, mis.Heuristic(settings.heuristic)
-        )
         self._samplers, self._running = {}, []
+        self.decisions, self._moments, self._mean = [], None, None
+        self._adopt(self.plan)
         self._counts = dict.fromkeys(COUNTERS, 0)
-        self.compiled, self.cached, self.compile_seconds = 0, 0, 0.0
+        self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
+
+    def _adopt(self, chosen):
+        """Render with the plan ``chosen`` from now on."""
+        self.plan = chosen
+        self.kernel = Kernel(self.world, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
+        if self._mean is not None and chosen.roulette:
+            self.kernel.set_threshold(dr.opaque(mi.Float64, self._mean))
+
+    def decide(self) -> list:
+        """Run a pilot and adopt what it chooses, if there is a choice and the render is long enough to pay
+        for it; returns all candidates with cost and variance, the best first."""
+        number = len(self.accumulator.passes)
+        count = choice.lanes((self.spp - sum(self.accumulator.passes)) * int(self.camera.region.size.prod()))
+        if not (count and choice.is_open(self._full, self.settings)):
+            return []
+        started = time.perf_counter()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), step_by_step(self.emitters.evaluated):
+            seed = sequence_seed(self.seed, PILOT_SEQUENCE)
+            moments = pilot.measure(self.world, self._full, self.settings, seed, count)
+        possible = choice.candidates(self.world, self._full, self.settings)
+        decision, table = choice.choose(moments, possible, number)
+        self._mean = decision.mean
+        self.decisions.append(decision)
+        self._adopt(table[0][0].plan(self._full))
+        self.pilot_seconds += time.perf_counter() - started
+        return table
 
     def run(self, on_pass, cancelled=lambda: False):
         """Trace the samples, fewer under ``timeout``, when ``cancelled()`` after a pass or when
@@ -280,6 +313,7 @@ class Render:
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         try:
+            self.decide()
             for number, step in enumerate(self._steps()):
                 self._pass(step)
                 # The second pass is recorded while the first, a short one, runs.
@@ -299,7 +333,9 @@ class Render:
 
     def _steps(self):
         """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
-        for step in schedule(self.camera, self.spp, self.settings):
+        # The first pass gives roulette the scale of the image, if no pilot has.
+        small_first = self.plan.roulette and self.plan.light and self._mean is None
+        for step in schedule(self.camera, self.spp, self.settings, small_first):
             done, end = step.done, step.done + step.size
             while done < end:
                 size = min(end - done, self._affordable(step.size))
@@ -314,13 +350,13 @@ class Render:
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
 
     def _pass(self, step: Step):
-        first = not self.accumulator.passes
+        first = not self.accumulator.passes and self._mean is None
         for launch, batch in enumerate(batches(self.camera, step.done, step.size, self.settings)):
             if launch:
                 self._wait()
             drawn = self._points(step, batch)
             with step_by_step(self.emitters.evaluated):
-                counts = trace(self.kernel, self.accumulator, batch, drawn, step.of)
+                counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 self.accumulator.evaluate(counts)
             self._running.append(counts)
@@ -330,9 +366,8 @@ class Render:
 
     def _points(self, step, batch):
         seed = self.seed
-        if step.replicate:  # a sequence of its own
-            seed = mi.sample_tea_32(self.seed, mi.UInt32(step.replicate))[1]
-            dr.make_opaque(seed)
+        if step.replicate:
+            seed = sequence_seed(self.seed, step.replicate)
         if self.settings.points != "sampler":
             return points.Points(self.settings.points, seed)
         # One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do.
@@ -382,14 +417,14 @@ class Render:
         return {
             "seconds": {
                 "compile": self.compile_seconds,
-                "pilot": 0.0,
+                "pilot": self.pilot_seconds,
                 "render": total - self.compile_seconds,
                 "total": total,
             },
             "rays": self._rays(),
             "connections": connections,
             "skipped": list(self.plan.skipped),
-            "decisions": [],
+            "decisions": [d.record() for d in self.decisions],
             "passes": list(self.accumulator.passes),
             "non_finite": self._counts["non_finite"],
             "kernels": {"compiled": self.compiled, "cached": self.cached},
@@ -477,11 +512,15 @@ def _make_class():
             raise NotImplementedError(NO_DERIVATIVES)
 
         def explain(self, scene, sensor=0, spp=None):
-            """What will be done for ``scene`` and what is skipped, and why, as text."""
-            if spp is not None:
-                integer(spp, "spp", 0)  # no pilot yet: the decisions do not depend on it
+            """What will be done for ``scene`` and what is skipped, and why, as text; with ``spp`` also
+            what the pilot of such a render finds."""
             check_made_for(self, scene)
-            return explain(scene, _resolve(scene, sensor), self.settings)
+            sensor = _resolve(scene, sensor)
+            if spp is not None:
+                spp = _samples(sensor, integer(spp, "spp", 0), self.settings)
+            render = Render(scene, sensor, self.settings, 0, spp or 1)
+            table = render.decide() if spp else []
+            return explain(render.world, render.plan, self.settings, render.decisions, table)
 
         def to_string(self):
             values = asdict(self.settings) | {"max_depth": self.max_depth}
@@ -495,72 +534,6 @@ NO_DERIVATIVES = (
     "bdpt: derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
     "and render_backward"
 )
-
-
-def explain(scene, sensor, settings: Settings) -> str:
-    """Text about the strategies in use for ``scene`` and those that are skipped."""
-    check_variant()
-    check_scene(scene, sensor)
-    check_film(sensor, settings)
-    emitters = Emitters(scene)
-    camera = prepare(sensor, emitters.quadrics, bool(scene.shapes()))
-    p = plan(scene, emitters, camera, settings)
-    used = [
-        name
-        for name, on in (
-            ("s=0 (camera subpath hits an emitter)", p.hit),
-            ("s=1 (next-event estimation)", p.direct),
-            ("t=1 (light vertex seen by the sensor)", p.splat),
-            ("(1,1) (emitter point seen by the sensor)", p.endpoints),
-            ("t=0 (light subpath hits the sensor)", p.arrival),
-            (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
-        )
-        if on
-    ]
-    lines = [
-        f"heuristic {settings.heuristic}, one light subpath per {p.served} camera subpaths"
-        if p.light
-        else f"heuristic {settings.heuristic}, no light subpaths"
-    ]
-    lines += [f"used: {name}" for name in used]
-    lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
-    if (p.splat or p.arrival or p.connections != "none") and settings.stored_vertices < settings.max_depth:
-        lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
-    lines += [f"lost: {text}" for text in lost_paths(scene, emitters, camera, p, settings)]
-    if emitters.evaluated:
-        lines.append(
-            "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
-            "one kernel"
-        )
-    return "\n".join(lines)
-
-
-def lost_paths(scene, emitters: Emitters, camera: Sensor, p, settings: Settings) -> list[str]:
-    """Paths that no strategy in use can make, one text each."""
-    lost = []
-    deltas = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in scene_bsdfs(scene))
-    deltas = deltas and emitters.unhittable
-    starts = ["delta emitter, delta surfaces"] * deltas + ["directionalarea"] * emitters.beams
-    if not p.arrival:  # t = 0 finds all that follow
-        for start in starts:
-            if not p.splat:
-                lost.append(f"{start}, a surface that the sensor sees (needs t=1)")
-            if p.connections == "none":
-                lost.append(
-                    f"{start}, two other surfaces or more, delta surfaces or none, sensor "
-                    "(needs inner connections)"
-                )
-        if deltas:
-            lost.append(
-                "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
-                "neighbours can be joined)"
-            )
-        if not camera.delta and (deltas or emitters.beams):
-            lost.append(f"{' or '.join(starts)}, sensor (needs t=0)")
-    if starts and p.light and settings.stored_vertices < settings.max_depth:
-        longest = settings.stored_vertices
-        lost.append(f"{' or '.join(starts)}, ... on paths longer than {longest} edges (stored_vertices)")
-    return lost
 
 
 def _resolve(scene, sensor):

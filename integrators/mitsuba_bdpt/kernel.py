@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import bsdf, connect, mis, rays
-from .plan import MAX_STORED, UNLIMITED, scene_bsdfs
+from .plan import MAX_STORED, UNLIMITED
 from .points import Points, Purpose
 from .subpath import Side, Walk, random_walk
 
@@ -65,29 +65,28 @@ class Shared:
 @dataclass(frozen=True)
 class Batch:
     """The samples of one pass: pixels ``first_pixel`` and on, ``pixels`` of them (row by row in
-    the film region), samples ``first_sample`` and on, ``samples`` of each pixel."""
+    the film region, each ``stride``-th), samples ``first_sample`` and on, ``samples`` of each pixel."""
 
     first_pixel: int
     pixels: int
     first_sample: int
     samples: int
+    stride: int = 1
 
 
 class Kernel:
     """Everything that a pass needs besides its batch. Holds the scene for one render only."""
 
-    def __init__(self, scene, camera, emitters, plan, settings, heuristic):
-        self.scene, self.camera, self.emitters, self.plan = scene, camera, emitters, plan
-        self.heuristic = heuristic
-        self.quadrics = emitters.quadrics
-        self.surfaces = bool(scene.shapes())
-        self.full_pdf = bsdf.needs_full_pdf(scene_bsdfs(scene))
-        self.round_trip = bsdf.needs_round_trip(scene_bsdfs(scene))
+    def __init__(self, world, plan, settings, heuristic):
+        self.scene, self.camera, self.emitters = world.scene, world.camera, world.emitters
+        self.plan, self.heuristic = plan, heuristic
+        self.quadrics = world.emitters.quadrics
+        self.surfaces, self.refracts = world.surfaces, world.refracts
+        self.full_pdf, self.round_trip = world.full_pdf, world.round_trip
         depth = min(settings.max_depth, UNLIMITED)
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
         self.strategy_images = settings.strategy_images
-        self.refracts = bsdf.any_refracts(scene_bsdfs(scene))
         u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
         self._reach = u32(reach)
@@ -96,7 +95,7 @@ class Kernel:
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
         self.served = u32(plan.served)
-        self.kappa = _coefficients(plan)
+        self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
 
     def bound(self, points, count_light: float) -> Kernel:
@@ -118,8 +117,8 @@ class Kernel:
         dr.eval(self.inverse_threshold)
 
 
-def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
-    """Trace one batch and add it to ``film`` (an `Accumulator`); ``spp`` is the render's total,
+def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
+    """Trace one batch and put its contributions into ``sink`` (see `sinks`); ``spp`` is the render's total,
     which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
     after the other); nothing is evaluated yet."""
     total = batch.pixels * batch.samples
@@ -130,17 +129,17 @@ def trace(kernel: Kernel, film, batch: Batch, points: Points, spp: int):
 
     stream = kernel.points.stream("light", place.index(lane), lane)
     shared = _shared(kernel, stream)
-    path = connect.allocate_light_path(kernel.store_size, lanes)
+    path = connect.allocate_light_path(kernel, lanes)
     of_light = {}
     if kernel.plan.light:
-        path, of_light = _light_subpath(kernel, film, stream, shared, path)
+        path, of_light = _light_subpath(kernel, sink, stream, shared, path)
 
     common = _Lane(place, shared, path)
 
     def body(served, counters):
         slot = lane + served * dr.opaque(mi.UInt32, lanes)
         active = slot < dr.opaque(mi.UInt32, total)
-        counters = _camera_subpath(kernel, film, common, slot, counters, active)
+        counters = _camera_subpath(kernel, sink, common, slot, counters, active)
         return served + 1, counters
 
     counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
@@ -165,19 +164,30 @@ class _Lane:
     path: connect.LightPath
 
 
+@dataclass
+class _Sample:
+    """A camera sample: its `CameraStart`, random numbers, point of the lens, and whether there is one."""
+
+    start: object
+    stream: object
+    u_lens: object
+    covered: object
+
+
 class _Places:
     """Where a camera sample of the batch lies: pixel, and index in the image's sequence."""
 
     def __init__(self, kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
+        self._stride = dr.opaque(mi.UInt32, batch.stride)
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
         self._spp = dr.opaque(mi.UInt64, spp)
 
     def _split(self, slot):
         pixel = slot // self._samples
-        return pixel + self._first_pixel, slot - pixel * self._samples + self._first_sample
+        return pixel * self._stride + self._first_pixel, slot - pixel * self._samples + self._first_sample
 
     def index(self, slot):
         pixel, sample = self._split(slot)
@@ -217,7 +227,7 @@ def _counted_by_camera(plan):
     return names + ["shadow_inner", "evaluated", "zero"] * (plan.connections != "none")
 
 
-def _light_subpath(kernel, film, stream, shared, path):
+def _light_subpath(kernel, sink, stream, shared, path):
     points, h, emitters = kernel.points, kernel.heuristic, kernel.emitters
     e = emitters.sample_emission(
         points.draw_2d("light", stream, Purpose.EMISSION_POINT),
@@ -228,13 +238,13 @@ def _light_subpath(kernel, film, stream, shared, path):
     counters = _zeros("shadow_t1", "light", "non_finite")
     if kernel.plan.endpoints:
         c, position = connect.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
-        _deposit_splat(kernel, film, c, position, shared, counters)
+        sink.splat(kernel, c, position, shared, counters)
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse)), kernel.kappa.hit)
-    partial = mis.Partial(h.start(inverse), mis.present(hit))
+    partial = mis.Partial(h.start(inverse), h.present(hit))
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
     side = Side(
         "light",
@@ -250,10 +260,10 @@ def _light_subpath(kernel, film, stream, shared, path):
         path, counters = state
         if kernel.plan.arrival:
             c, position = connect.arrive(kernel, e, vertex, walk)
-            _deposit_splat(kernel, film, c, position, shared, counters)
+            sink.splat(kernel, c, position, shared, counters)
         if kernel.plan.splat:
             c, position = connect.splat(kernel, vertex, stream, counters)
-            _deposit_splat(kernel, film, c, position, shared, counters)
+            sink.splat(kernel, c, position, shared, counters)
         if kernel.plan.connections != "none":
             connect.store_light_vertex(kernel, vertex, path)
         return path, counters
@@ -275,41 +285,36 @@ def _added(*several) -> dict:
     return total
 
 
-def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
+def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
     points, plan = kernel.points, kernel.plan
-    place, shared, path = lane.place, lane.shared, lane.path
+    place, shared = lane.place, lane.shared
     stream = points.stream("camera", place.index(slot), slot)
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
     u_lens = mi.Point2f(0.5)
     if kernel.camera.needs_aperture_sample:
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
     start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
-    covered, active = active, active & (kernel.max_depth >= 1)
+    sample = _Sample(start, stream, u_lens, active)
+    active &= kernel.max_depth >= 1
     walk = _camera_walk(kernel, start, active)
 
-    def add(c, total):
-        if kernel.strategy_images:
-            _deposit_strategy(kernel, film, c, start.counted, shared)
-        return total + c.weighted()
-
     def visit(z, state, _):
-        radiance, counters = state
+        total, counters = state
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
-            radiance = dr.if_stmt(
-                (z, radiance),
+            total = dr.if_stmt(
+                (z, total),
                 connect.sees_emitter(kernel, z),
-                lambda z, radiance: add(connect.hit_emitter(kernel, z), radiance),
-                lambda z, radiance: radiance,
+                lambda z, total: sink.add(kernel, connect.hit_emitter(kernel, z), total, start, shared),
+                lambda z, total: total,
                 label="s = 0",
             )
         if plan.direct:
-            radiance = add(connect.next_event(kernel, z, stream, counters), radiance)
-        if plan.connections == "all":
-            radiance += connect.connect_all(kernel, z, path, counters, add)
-        elif plan.connections == "one":
-            radiance += connect.connect_one(kernel, z, path, stream, counters)
-        return radiance, counters
+            c = connect.next_event(kernel, z, stream, counters)
+            total = sink.add(kernel, c, total, start, shared)
+        if plan.connections != "none":
+            total = sink.connect(kernel, z, lane, stream, counters, total, start)
+        return total, counters
 
     side = Side(
         "camera",
@@ -318,19 +323,15 @@ def _camera_subpath(kernel, film, lane: _Lane, slot, counters, active):
         False,
         kernel.max_depth,
         kernel.kappa.splat,
-        alpha=film.alpha,
+        alpha=sink.alpha,
         parallel=kernel.camera.parallel,
     )
-    state = (dr.zeros(mi.Spectrum), _zeros(*_counted_by_camera(plan)))
-    (radiance, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
+    state = (sink.begin(), _zeros(*_counted_by_camera(plan)))
+    (total, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters = _added(counters, counted)
     counters["camera"] += dr.select(active, walk.traced(), 0)
-    features = []
-    if film.features is not None:
-        features = film.features.sample(points, stream, start.position, u_lens, shared.time, covered)
-    alpha = _alpha(kernel, walk.seen)
-    dropped = _deposit_camera(film, start.counted, radiance, alpha, features, shared, covered)
-    counters["non_finite"] += dr.select(dropped | walk.broken, mi.UInt32(1), mi.UInt32(0))
+    counters["non_finite"] += dr.select(walk.broken, mi.UInt32(1), mi.UInt32(0))
+    sink.end(kernel, lane, sample, total, walk.seen, counters)
     return counters
 
 
@@ -350,42 +351,8 @@ def _first_partial(kernel, start):
     h = kernel.heuristic
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
-        arrival = mis.present(arrival)
+        arrival = h.present(arrival)
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
-
-
-def _alpha(kernel, seen):
-    """Alpha of a camera sample, as in `path`: a visible environment covers the image."""
-    opaque = seen
-    if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
-        opaque = kernel.max_depth >= 1
-    return dr.select(opaque, mi.Float(1), mi.Float(0))
-
-
-def _deposit_camera(film, position, radiance, alpha, features, shared, active):
-    """Add a camera sample; returns the mask of samples that count as zero for want of a finite value."""
-    colours = film.colour(radiance * shared.weight, shared.wavelengths)
-    finite = dr.all(dr.isfinite(colours))
-    film.put_camera(position, dr.select(finite, colours, 0), alpha, features, active)
-    return active & ~finite
-
-
-def _deposit_splat(kernel, film, c, position, shared, counters):
-    """Add a contribution with t <= 1; without finite value it counts as zero."""
-    value = film.colour(c.weighted() * shared.weight, shared.wavelengths)
-    finite = dr.all(dr.isfinite(value))
-    counters["non_finite"] += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
-    film.put_light(position, value, c.active & finite)
-    if kernel.strategy_images:
-        unweighted = film.colour(c.value * shared.weight, shared.wavelengths)
-        film.put_strategy(position, value, unweighted, c.s, c.t, c.active & finite)
-
-
-def _deposit_strategy(kernel, film, c, position, shared):
-    weighted = film.colour(c.weighted() * shared.weight, shared.wavelengths)
-    unweighted = film.colour(c.value * shared.weight, shared.wavelengths)
-    finite = dr.all(dr.isfinite(weighted))
-    film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
 
 
 def _sum(*several):
@@ -397,18 +364,25 @@ def _sum(*several):
     return total
 
 
-def _coefficients(plan) -> Coefficients:
-    def opaque(value, used):
-        return dr.opaque(mi.Float, value) if used else 0
+def _coefficients(plan, by_class: bool) -> Coefficients:
+    """Run-time values, or ``by_class`` those of a pilot: 1 in the place of the class, see `mis.ByClass`."""
+
+    def entry(kind, value, used):
+        if not used:
+            return 0
+        if by_class:
+            return mi.Vector4f(*(1.0 if name == kind else 0.0 for name in mis.CLASSES))
+        return dr.opaque(mi.Float, value)
 
     count = 1 / plan.served if plan.light else 0.0  # nominal, see `Kernel.bound`
+    light = count * plan.splat_coefficient
     return Coefficients(
-        hit=opaque(1, plan.hit),
-        direct=opaque(1, plan.direct),
-        splat=opaque(count * plan.splat_coefficient, plan.splat),
-        endpoints=opaque(count, plan.endpoints),
-        arrival=opaque(count, plan.arrival),
-        inner=opaque(1, plan.connections != "none"),
+        hit=entry("hit", 1, plan.hit),
+        direct=entry("direct", plan.direct_coefficient, plan.direct),
+        splat=entry("light", light, plan.splat),
+        endpoints=entry("light", light, plan.endpoints),
+        arrival=entry("light", light, plan.arrival),
+        inner=entry("inner", 1, plan.connections != "none"),
     )
 
 

@@ -30,6 +30,9 @@ import mitsuba as mi
 
 HEURISTICS = ("balance", "power", "maximum", "uniform")
 
+# Classes whose coefficients a render may choose: s = 0, s = 1 (t >= 2), t <= 1, s and t >= 2.
+CLASSES = ("hit", "direct", "light", "inner")
+
 # A strategy beyond this ratio has a weight below 1e-37, the smallest that float32 tells from zero;
 # without the bound, infinity times a following reverse density of zero would be NaN.
 SATURATION = 1e37
@@ -46,11 +49,6 @@ class Partial:
 def is_absent(x) -> bool:
     """Whether ``x`` stands for classes of strategies that are not in use."""
     return isinstance(x, (int, float)) and x == 0
-
-
-def present(x):
-    """A partial sum to which classes in use may be added."""
-    return mi.Float(0) if is_absent(x) else x
 
 
 def choose(mask, a, b):
@@ -95,11 +93,23 @@ class Heuristic:
             total = a + b
         return dr.minimum(total, SATURATION)
 
+    def zero(self):
+        """An empty partial sum."""
+        return mi.Float(0)
+
+    def present(self, x):
+        """A partial sum to which classes in use may be added."""
+        return self.zero() if is_absent(x) else x
+
     def start(self, inverse_density):
         """Partial sum of one strategy whose ratio is ``inverse_density`` so far."""
         if self.name == "uniform":
             return dr.select(inverse_density > 0, 1.0, 0.0)
         return dr.minimum(inverse_density, SATURATION)
+
+    def weigh(self, coefficient, light_side, camera_side):
+        """`weight`, and the classes' shares of it, which only `ByClass` knows."""
+        return self.weight(coefficient, light_side, camera_side), None
 
     def weight(self, coefficient, light_side, camera_side):
         """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
@@ -120,6 +130,25 @@ class Heuristic:
             return dr.rcp(1 + others)
         ratio = others / coefficient
         return dr.rcp(1 + (dr.square(ratio) if self.name == "power" else ratio))
+
+
+class ByClass(Heuristic):
+    """The balance heuristic with partial sums split by classes of strategies: `CLASSES`, one entry each.
+
+    Coefficients are vectors with one entry that is not 0, so that every term finds its place.
+    """
+
+    def __init__(self):
+        super().__init__("balance")
+
+    def zero(self):
+        return mi.Vector4f(0)
+
+    def weigh(self, coefficient, light_side, camera_side):
+        """Weight of the strategy at hand, and the share of each class in the sum of all strategies."""
+        total = self.combine(self.combine(light_side, camera_side), coefficient)
+        shares = total / dr.sum(total)
+        return dr.sum(coefficient) / dr.sum(total), shares
 
 
 def arrive(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import mitsuba as mi
-
-from .objects import children
-
 UNLIMITED = 2**32 - 1
 
 # Most light vertices per lane (a lane's local memory lies on a thread's stack).
@@ -51,7 +47,8 @@ class Plan:
 
     Classes: ``hit`` s=0, ``direct`` s=1 with t>=2, ``splat`` t=1 with s>=2, ``endpoints`` (1,1),
     ``arrival`` t=0, ``inner`` s,t>=2. ``served``: camera subpaths per light subpath (S).
-    ``connections``: ``all``, ``one`` or ``none``. ``splat_coefficient``: kappa of t=1 over its count.
+    ``connections``: ``all``, ``one`` or ``none``. ``splat_coefficient``: kappa of t=1 over its count;
+    ``direct_coefficient``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out.
     """
@@ -64,6 +61,7 @@ class Plan:
     connections: str
     served: int
     splat_coefficient: float
+    direct_coefficient: float
     roulette: bool
     hide_emitters: bool
     skipped: tuple = field(default=())
@@ -74,20 +72,20 @@ class Plan:
         return self.splat or self.arrival or self.connections != "none" or self.endpoints
 
 
-def plan(scene, emitters, camera, settings: Settings) -> Plan:
+def plan(world, settings: Settings) -> Plan:
     """Decide from the scene alone what is impossible, and apply the parameters given by hand."""
+    emitters, camera = world.emitters, world.camera
     skipped = []
 
     def skip(name, level, why):
         skipped.append({"class": name, "level": level, "why": why})
         return False
 
-    smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in scene_bsdfs(scene))
     hit = emitters.hittable or skip("s=0", "impossible", "no emitter that a ray can hit")
 
     def possible(name, needed, where, why):
         """A class that joins surfaces, on paths of ``needed`` edges or more."""
-        why = _why_not(scene, smooth, emitters, settings.max_depth, needed) or ("" if where else why)
+        why = _why_not(world, settings.max_depth, needed) or ("" if where else why)
         return skip(name, "impossible", why) if why else True
 
     joinable = camera.joinable and emitters.traced
@@ -122,6 +120,7 @@ def plan(scene, emitters, camera, settings: Settings) -> Plan:
         connections=connections if inner else "none",
         served=round(1 / light_paths) if light_paths else 1,
         splat_coefficient=1.0 if settings.skip == "none" else 0.25,
+        direct_coefficient=1.0,
         roulette=settings.skip != "none" and not settings.strategy_images,
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
@@ -144,15 +143,15 @@ def _defaults(settings: Settings):
 _UNTRACED = "no light subpath can start from the emitters"
 
 
-def _why_not(scene, smooth, emitters, depth, needed) -> str:
+def _why_not(world, depth, needed) -> str:
     """Why no path of ``needed`` edges can be made by joining surfaces; empty if nothing forbids it."""
     if depth < needed:
         return f"max_depth={depth} allows no such path"
-    if emitters.count == 0:
+    if world.emitters.count == 0:
         return "the scene has no emitter"
-    if not scene.shapes():
+    if not world.surfaces:
         return "the scene has no surface"
-    return "" if smooth else "no surface has a lobe that is not delta"
+    return "" if world.smooth else "no surface has a lobe that is not delta"
 
 
 def _why_no_light(emitters, settings: Settings) -> str:
@@ -188,14 +187,29 @@ def _why_not_arrival(emitters, camera, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
-def scene_bsdfs(scene):
-    """The BSDFs of all shapes, those of shape groups included."""
-    found = [s.bsdf() for s in scene.shapes()]
-    waiting = list(scene.shapes())
-    while waiting:
-        for value in children(waiting.pop()).values():
-            if isinstance(value, mi.BSDF):
-                found.append(value)
-            elif isinstance(value, mi.Shape):
-                waiting.append(value)
-    return [b for b in found if b is not None]
+def lost_paths(world, p: Plan, settings: Settings) -> list[str]:
+    """Paths that no strategy in use can make, one text each."""
+    emitters, camera = world.emitters, world.camera
+    lost = []
+    deltas = world.delta and emitters.unhittable
+    starts = ["delta emitter, delta surfaces"] * deltas + ["directionalarea"] * emitters.beams
+    if not p.arrival:  # t = 0 finds all that follow
+        for start in starts:
+            if not p.splat:
+                lost.append(f"{start}, a surface that the sensor sees (needs t=1)")
+            if p.connections == "none":
+                lost.append(
+                    f"{start}, two other surfaces or more, delta surfaces or none, sensor "
+                    "(needs inner connections)"
+                )
+        if deltas:
+            lost.append(
+                "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
+                "neighbours can be joined)"
+            )
+        if not camera.delta and (deltas or emitters.beams):
+            lost.append(f"{' or '.join(starts)}, sensor (needs t=0)")
+    if starts and p.light and settings.stored_vertices < settings.max_depth:
+        longest = settings.stored_vertices
+        lost.append(f"{' or '.join(starts)}, ... on paths longer than {longest} edges (stored_vertices)")
+    return lost

@@ -1,0 +1,43 @@
+"""What a render knows of its scene and sensor before it decides anything."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from . import bsdf
+from .emitters import Emitters
+from .objects import children
+from .sensors import prepare
+
+
+class World:
+    """A scene seen by one of its sensors; lives for one render.
+
+    ``emitters`` and ``camera`` are the two kinds of endpoints, ``smooth``, ``delta`` and ``refracts``:
+    whether some BSDF has such a lobe; ``full_pdf`` and ``round_trip`` see `bsdf.sample`.
+    """
+
+    def __init__(self, scene, sensor):
+        self.scene = scene
+        self.surfaces = bool(scene.shapes())
+        self.emitters = Emitters(scene)
+        self.camera = prepare(sensor, self.emitters.quadrics, self.surfaces)
+        found = _bsdfs(scene)
+        self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
+        self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
+        self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
+        self.full_pdf = bsdf.needs_full_pdf(found)
+        self.round_trip = bsdf.needs_round_trip(found)
+
+
+def _bsdfs(scene):
+    """The BSDFs of all shapes, those of shape groups included."""
+    found = [s.bsdf() for s in scene.shapes()]
+    waiting = list(scene.shapes())
+    while waiting:
+        for value in children(waiting.pop()).values():
+            if isinstance(value, mi.BSDF):
+                found.append(value)
+            elif isinstance(value, mi.Shape):
+                waiting.append(value)
+    return [b for b in found if b is not None]
