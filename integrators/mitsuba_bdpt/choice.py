@@ -6,13 +6,14 @@ seed leads to the same decision on every machine.
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .pilot import WEIGHTINGS, Moments
-from .plan import LIGHT_PATHS, Plan, Settings, lost_paths
+from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number. A pilot's sample takes
 # three to seven times as long as one of path tracing alone.
@@ -64,6 +65,51 @@ class Decision:
             "mean": self.mean,
         }
 
+    def plan(self, full: Plan) -> Plan:
+        """``full`` with what is not done left out."""
+        light = self.light_paths > 0
+        return replace(
+            full,
+            splat=full.splat and light,
+            endpoints=full.endpoints and light,
+            arrival=full.arrival and light,
+            connections=self.connections if full.connections != "none" and light else "none",
+            served=round(1 / self.light_paths) if light else 1,
+            splat_coefficient=self.splat_coefficient,
+            direct_coefficient=self.direct_coefficient,
+        )
+
+
+def read_decisions(text: str) -> tuple[Decision, ...]:
+    """The parameter ``decisions``: JSON as in ``statistics``; raises ``ValueError`` saying what is wrong."""
+    try:
+        entries = json.loads(text) if text else []
+        return tuple(_read_decision(entry) for entry in entries)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f"bdpt: decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: "
+            f"{type(error).__name__} {error}"
+        ) from error
+
+
+def _read_decision(entry: dict) -> Decision:
+    light_paths, connections = float(entry["light_paths"]), entry["connections"]
+    if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
+        raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
+    if not light_paths and connections != "none":
+        raise ValueError(f"connections={connections!r} without light paths")
+    numbers = {
+        "first_pass": int(entry["pass"]),
+        "splat_coefficient": float(entry["coefficients"]["t=1"]),
+        "direct_coefficient": float(entry["coefficients"]["s=1"]),
+        **{name: float(entry[name]) for name in ("cost", "variance", "mean")},
+    }
+    for name, value in numbers.items():
+        least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
+        if not least <= value < math.inf:
+            raise ValueError(f"{name}={value!r}")
+    return Decision(light_paths=light_paths, connections=connections, **numbers)
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -76,21 +122,26 @@ class Candidate:
 
     @property
     def light_paths(self) -> float:
+        """As the parameter."""
         return 1 / self.served if WEIGHTINGS[self.weighting].light else 0
 
-    def plan(self, full: Plan) -> Plan:
-        """``full`` with what this candidate does not do left out."""
+    @property
+    def combination(self) -> str:
+        """See `pilot.Weighting.combination`."""
+        return WEIGHTINGS[self.weighting].combination
+
+    def decided(self, first_pass: int, cost: float, variance: float, mean: float) -> Decision:
+        """The decision for this candidate."""
         weighting = WEIGHTINGS[self.weighting]
-        light = weighting.light > 0
-        return replace(
-            full,
-            splat=full.splat and light,
-            endpoints=full.endpoints and light,
-            arrival=full.arrival and light,
+        return Decision(
+            first_pass=first_pass,
+            light_paths=self.light_paths,
             connections=self.connections,
-            served=self.served,
-            splat_coefficient=weighting.light * self.served if light else full.splat_coefficient,
+            splat_coefficient=weighting.light * self.served if weighting.light else 1.0,
             direct_coefficient=weighting.direct,
+            cost=cost,
+            variance=variance,
+            mean=mean,
         )
 
 
@@ -113,22 +164,20 @@ def is_open(full: Plan, settings: Settings) -> bool:
 def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
     """All ways to render that lose no light which ``full`` finds."""
     found = []
-    for number, weighting in enumerate(WEIGHTINGS):
-        for served in SERVED if weighting.light else (1,):
-            if weighting.light * served > 1:
-                continue  # kappa beyond its count is of no use
-            kinds = ("one", "all") if weighting.inner else ("none",)
-            found += [Candidate(number, served, kind) for kind in kinds]
     lost = lost_paths(world, full, settings)
     # A sensor with area sees delta emitters by light subpaths alone.
     tied = world.emitters.unhittable and not world.camera.delta and (full.endpoints or full.arrival)
-    return [
-        c
-        for c in found
-        if (full.connections != "none" or c.connections == "none")
-        and lost_paths(world, c.plan(full), settings) == lost
-        and (c.light_paths or not tied)
-    ]
+    for number, weighting in enumerate(WEIGHTINGS):
+        if weighting.inner and full.connections == "none" or tied and not weighting.light:
+            continue
+        kinds = ("one", "all") if weighting.inner else ("none",)
+        example = Candidate(number, 1, kinds[0]).decided(0, 1, 0, 0)
+        if lost_paths(world, example.plan(full), settings) != lost:
+            continue
+        # A coefficient beyond the count is of no use.
+        counts = [n for n in SERVED if weighting.light * n <= 1] if weighting.light else [1]
+        found += [Candidate(number, served, kind) for served in counts for kind in kinds]
+    return found
 
 
 def cost(candidate: Candidate, rays: dict) -> float:
@@ -143,24 +192,43 @@ def cost(candidate: Candidate, rays: dict) -> float:
     return total / camera
 
 
-def choose(moments: Moments, possible: list[Candidate], first_pass: int) -> tuple[Decision, list]:
-    """The best of the ``possible`` candidates; and (candidate, cost, variance) of all, the best first."""
-    table = []
-    for c in possible:
-        variance = float(np.median(moments.variance(c.weighting, c.served, c.connections == "one")))
-        if math.isfinite(variance):
-            table.append((c, cost(c, moments.rays), max(variance, LEAST_VARIANCE)))
-    table.sort(key=lambda row: row[1] * row[2])
-    best = table[0]
-    weighting = WEIGHTINGS[best[0].weighting]
-    decision = Decision(
-        first_pass=first_pass,
-        light_paths=best[0].light_paths,
-        connections=best[0].connections,
-        splat_coefficient=weighting.light * best[0].served,
-        direct_coefficient=weighting.direct,
-        cost=best[1],
-        variance=best[2],
-        mean=moments.mean,
+def choose(moments: Moments, possible: list[Candidate]) -> list:
+    """(candidate, cost, variance) of all ``possible`` candidates, that with the least product first."""
+    drawn, every = moments.variance(True), moments.variance(False)
+    parts = np.stack(
+        [(drawn if c.connections == "one" else every)[:, :, c.weighting] for c in possible], axis=1
     )
-    return decision, table
+    variances = parts[:, :, 0] + parts[:, :, 1] * [c.served for c in possible]
+    variances = _robust_mean(variances)
+    table = [
+        (c, cost(c, moments.rays), max(float(v), LEAST_VARIANCE))
+        for c, v in zip(possible, variances, strict=True)
+        if math.isfinite(v)
+    ]
+    return sorted(table, key=lambda row: row[1] * row[2])
+
+
+def _robust_mean(values):
+    """Mean over the groups (rows) without the quarter of them that is worst for all candidates (columns)
+    together: an outlier that no candidate does anything about hides how they differ."""
+    finite = np.isfinite(values).all(axis=0)
+    usual = values[:, finite] / np.maximum(values[:, finite].mean(axis=0), LEAST_VARIANCE)
+    order = np.argsort(usual.mean(axis=1))
+    return values[order[: len(order) * 3 // 4]].mean(axis=0)
+
+
+def left_out(table: list) -> list[dict]:
+    """What the best of `choose` does without, and why, as in ``statistics["skipped"]``."""
+    best = table[0]
+    skipped = []
+    for name, has in (("t<=1", "light_paths"), ("inner", "inner")):
+
+        def does(candidate, has=has):
+            return candidate.light_paths > 0 if has == "light_paths" else candidate.connections != "none"
+
+        others = [row for row in table if does(row[0])]
+        if others and not does(best[0]):
+            ratio = others[0][1] * others[0][2] / (best[1] * best[2])
+            why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
+            skipped.append({"class": name, "level": "not worth its cost", "why": why})
+    return skipped

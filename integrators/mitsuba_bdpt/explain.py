@@ -5,10 +5,10 @@ from __future__ import annotations
 from .plan import Plan, Settings, lost_paths
 
 
-def explain(world, p: Plan, settings: Settings, decisions, table) -> str:
+def explain(world, p: Plan, settings: Settings, table) -> str:
     """Text about the strategies in use and those that are skipped.
 
-    ``decisions`` and ``table`` are a pilot's, see `choice.choose`; empty without one.
+    ``table`` is a pilot's, see `choice.choose`; empty without one.
     """
     used = [
         name
@@ -37,4 +37,28 @@ def explain(world, p: Plan, settings: Settings, decisions, table) -> str:
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
             "one kernel"
         )
-    return "\n".join(lines)
+    return "\n".join(lines + _pilot(settings, table))
+
+
+def _pilot(settings: Settings, table) -> list[str]:
+    """What the pilot found: the best of each combination and number of light subpaths."""
+    if not table:
+        return []
+    lines = [
+        "pilot: time to the same error, over that of the best (cost of a sample, its variance as relMSE):"
+    ]
+    shown = set()
+    best = table[0][1] * table[0][2]
+    for candidate, cost, variance in table:
+        key = candidate.combination, candidate.connections, candidate.served
+        if key in shown:
+            continue
+        shown.add(key)
+        light = f"light_paths=1/{candidate.served}" if candidate.light_paths else "light_paths=0"
+        lines.append(
+            f"  {cost * variance / best:8.2f}  {light}, connections={candidate.connections} "
+            f"({cost:.2f}, {variance:.3g})"
+        )
+    if settings.heuristic != "balance":
+        lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
+    return lines

@@ -42,8 +42,14 @@ RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
 
-# Number of the pilot's sequence, see `sequence_seed`.
+# Number of the first pilot's sequence, see `sequence_seed`.
 PILOT_SEQUENCE = 1 << 16
+
+# Number of the sequence after the first change of a decision.
+CHANGED_SEQUENCE = 1 << 17
+
+# Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
+FIRST_REPEAT = 32
 
 # What strategy images may take, in bytes, before the render is refused.
 STRATEGY_MEMORY = 2 << 30
@@ -95,6 +101,10 @@ All of them are combined by multiple importance sampling.
    - |string|
    - ``sobol`` (default): Owen-scrambled Sobol' points for light and BSDF samples; ``sampler``: the
      scene's sampler for the first of them; ``independent``.
+ * - decisions
+   - |string|
+   - JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.
+     (Default: none)
  * - stored_vertices
    - |int|
    - Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. (Default: 64)
@@ -277,35 +287,58 @@ class Render:
         )
         self._samplers, self._running = {}, []
         self.decisions, self._moments, self._mean = [], None, None
-        self._adopt(self.plan)
+        self._pilots, self._changes, self._next_pilot = 0, 0, FIRST_REPEAT
+        self._use(self.plan)
         self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
-
-    def _adopt(self, chosen):
-        """Render with the plan ``chosen`` from now on."""
-        self.plan = chosen
-        self.kernel = Kernel(self.world, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
-        if self._mean is not None and chosen.roulette:
-            self.kernel.set_threshold(dr.opaque(mi.Float64, self._mean))
 
     def decide(self) -> list:
         """Run a pilot and adopt what it chooses, if there is a choice and the render is long enough to pay
         for it; returns all candidates with cost and variance, the best first."""
-        number = len(self.accumulator.passes)
-        count = choice.lanes((self.spp - sum(self.accumulator.passes)) * int(self.camera.region.size.prod()))
+        left = self.spp - sum(self.accumulator.passes)
+        count = choice.lanes(left * int(self.camera.region.size.prod()))
         if not (count and choice.is_open(self._full, self.settings)):
             return []
         started = time.perf_counter()
+        self._pilots += 1
+        seed = sequence_seed(self.seed, PILOT_SEQUENCE + self._pilots)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), step_by_step(self.emitters.evaluated):
-            seed = sequence_seed(self.seed, PILOT_SEQUENCE)
             moments = pilot.measure(self.world, self._full, self.settings, seed, count)
-        possible = choice.candidates(self.world, self._full, self.settings)
-        decision, table = choice.choose(moments, possible, number)
-        self._mean = decision.mean
-        self.decisions.append(decision)
-        self._adopt(table[0][0].plan(self._full))
+        self._moments = moments if self._moments is None else self._moments.joined(moments)
+        table = choice.choose(self._moments, choice.candidates(self.world, self._full, self.settings))
+        candidate, cost, variance = table[0]
+        decision = candidate.decided(len(self.accumulator.passes), cost, variance, self._moments.mean)
+        self._adopt(decision, choice.left_out(table))
         self.pilot_seconds += time.perf_counter() - started
         return table
+
+    def _adopt(self, decision, left_out=()):
+        """Render as decided from now on; if that differs from before, with points of their own, so that they
+        do not depend on those that led to the decision."""
+        adopted = replace(decision.plan(self._full), skipped=(*self._full.skipped, *left_out))
+        if self.decisions and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
+            self._changes += 1
+        self.decisions.append(decision)
+        self._mean = decision.mean
+        self._use(adopted)
+
+    def _use(self, chosen):
+        self.plan = chosen
+        self.kernel = Kernel(self.world, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
+        if self._mean and chosen.roulette:
+            self.kernel.set_threshold(dr.opaque(mi.Float64, self._mean))
+
+    def _decide_before(self, step: Step):
+        """Replay the decision for this pass; or, early in a long render, ask another pilot."""
+        number = len(self.accumulator.passes)
+        if self.settings.decisions:
+            for decision in self.settings.decisions:
+                if decision.first_pass == number:
+                    self._adopt(decision)
+        elif number and step.done >= self._next_pilot and not step.replicate:
+            self._next_pilot *= 4
+            if 2 * step.done <= self.spp and self.settings.points != "sampler":
+                self.decide()
 
     def run(self, on_pass, cancelled=lambda: False):
         """Trace the samples, fewer under ``timeout``, when ``cancelled()`` after a pass or when
@@ -313,8 +346,10 @@ class Render:
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         try:
-            self.decide()
+            if not self.settings.decisions:
+                self.decide()
             for number, step in enumerate(self._steps()):
+                self._decide_before(step)
                 self._pass(step)
                 # The second pass is recorded while the first, a short one, runs.
                 if watched or number > 0:
@@ -334,7 +369,8 @@ class Render:
     def _steps(self):
         """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
         # The first pass gives roulette the scale of the image, if no pilot has.
-        small_first = self.plan.roulette and self.plan.light and self._mean is None
+        known = self._mean is not None or self.settings.decisions
+        small_first = self.plan.roulette and self.plan.light and not known
         for step in schedule(self.camera, self.spp, self.settings, small_first):
             done, end = step.done, step.done + step.size
             while done < end:
@@ -366,8 +402,9 @@ class Render:
 
     def _points(self, step, batch):
         seed = self.seed
-        if step.replicate:
-            seed = sequence_seed(self.seed, step.replicate)
+        number = step.replicate + (CHANGED_SEQUENCE + self._changes if self._changes else 0)
+        if number:
+            seed = sequence_seed(self.seed, number)
         if self.settings.points != "sampler":
             return points.Points(self.settings.points, seed)
         # One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do.
@@ -520,7 +557,7 @@ def _make_class():
                 spp = _samples(sensor, integer(spp, "spp", 0), self.settings)
             render = Render(scene, sensor, self.settings, 0, spp or 1)
             table = render.decide() if spp else []
-            return explain(render.world, render.plan, self.settings, render.decisions, table)
+            return explain(render.world, render.plan, self.settings, table)
 
         def to_string(self):
             values = asdict(self.settings) | {"max_depth": self.max_depth}

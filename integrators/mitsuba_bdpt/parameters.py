@@ -9,7 +9,7 @@ from numbers import Integral, Real
 
 import numpy as np
 
-from . import features, mis, points
+from . import choice, features, mis, points
 from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
 from .strategies import layer_names
 
@@ -69,6 +69,13 @@ def _light_paths(props):
     return number
 
 
+def _decisions(props):
+    value = props.get("decisions", "")
+    if not isinstance(value, str):
+        raise TypeError(f"bdpt: decisions={value!r} must be a string of JSON")
+    return choice.read_decisions(value)
+
+
 def _aovs(props):
     value = props.get("aovs", "")
     if not isinstance(value, str):
@@ -90,13 +97,11 @@ def _check_layers(settings: Settings):
 
 
 def _check_names(props):
-    """Raise ``ValueError`` for parameters that do not exist, ``NotImplementedError`` for some that will."""
+    """Raise ``ValueError`` for parameters that do not exist."""
     known = [f for f in Settings.__dataclass_fields__]
     for name in props.keys():
         if name in known:
             continue
-        if name == "decisions":
-            raise NotImplementedError(f"bdpt: {name} is not supported yet; leave it out")
         remedy = {"samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass"}.get(name)
         if remedy is None:
             near = difflib.get_close_matches(name, known, 1)
@@ -121,6 +126,7 @@ def read_settings(props) -> Settings:
         light_paths=_light_paths(props),
         connections=_choice(props, "connections", CONNECTIONS),
         points=_choice(props, "points", points.POINTS),
+        decisions=_decisions(props),
         stored_vertices=integer(
             props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED
         ),
@@ -134,6 +140,12 @@ def read_settings(props) -> Settings:
         raise ValueError(
             f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
             "set max_depth, for example to 5"
+        )
+    by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
+    if settings.decisions and by_hand:
+        raise ValueError(
+            "bdpt: decisions together with light_paths, connections or skip is contradictory; leave the "
+            "latter at auto"
         )
     _check_layers(settings)
     return settings

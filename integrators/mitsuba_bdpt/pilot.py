@@ -34,8 +34,8 @@ from .points import Points
 # Tiles of the image over which brightness and variance are averaged, in each direction.
 TILES = 8
 
-# Independent parts of the pilot: the median over them is not moved by a single outlier.
-GROUPS = 8
+# Independent parts of the pilot, among which outliers are looked for.
+GROUPS = 16
 
 # Camera samples of a pixel.
 PER_PIXEL = 2
@@ -98,11 +98,25 @@ class Moments:
     draw: np.ndarray
     mean: float
     rays: dict
+    lanes: int
 
-    def variance(self, weighting: int, served: int, drawn: bool) -> np.ndarray:
-        """Relative variance per sample, by group."""
-        extra = self.draw[:, weighting] if drawn else 0
-        return self.base[:, weighting] + served * self.light[:, weighting] + extra
+    def variance(self, drawn: bool) -> np.ndarray:
+        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, and what
+        grows with it."""
+        return np.stack([self.base + (self.draw if drawn else 0), self.light], axis=1)
+
+    def joined(self, other: Moments) -> Moments:
+        """This pilot and another, of which each counts by its number of ``lanes``."""
+        share = self.lanes / (self.lanes + other.lanes)
+
+        def mean(a, b):
+            return share * a + (1 - share) * b
+
+        return Moments(
+            **{n: mean(getattr(self, n), getattr(other, n)) for n in ("base", "light", "draw", "mean")},
+            rays={n: mean(self.rays[n], other.rays[n]) for n in self.rays},
+            lanes=self.lanes + other.lanes,
+        )
 
 
 class Pilot:
@@ -227,6 +241,7 @@ class Pilot:
             draw=summed(draw),
             mean=float(brightness.mean()),
             rays={name: count / lanes for name, count in counts.items()} | {"joined": joined.mean()},
+            lanes=lanes,
         )
 
     def _group(self, lane):
