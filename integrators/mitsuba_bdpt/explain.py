@@ -48,16 +48,16 @@ def _pilot(settings: Settings, table) -> list[str]:
         "pilot: time to the same error, over that of the best (cost of a sample, its variance as relMSE):"
     ]
     shown = set()
-    best = table[0][1] * table[0][2]
-    for candidate, cost, variance in table:
+    for row in table:
+        candidate = row.candidate
         key = candidate.combination, candidate.connections, candidate.served
         if key in shown:
             continue
         shown.add(key)
         light = f"light_paths=1/{candidate.served}" if candidate.light_paths else "light_paths=0"
         lines.append(
-            f"  {cost * variance / best:8.2f}  {light}, connections={candidate.connections} "
-            f"({cost:.2f}, {variance:.3g})"
+            f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections} "
+            f"({row.cost:.2f}, {row.variance:.3g})"
         )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")

@@ -294,7 +294,7 @@ class Render:
 
     def decide(self) -> list:
         """Run a pilot and adopt what it chooses, if there is a choice and the render is long enough to pay
-        for it; returns all candidates with cost and variance, the best first."""
+        for it; returns all candidates, the best first."""
         left = self.spp - sum(self.accumulator.passes)
         count = choice.lanes(left * int(self.camera.region.size.prod()))
         if not (count and choice.is_open(self._full, self.settings)):
@@ -305,9 +305,10 @@ class Render:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), step_by_step(self.emitters.evaluated):
             moments = pilot.measure(self.world, self._full, self.settings, seed, count)
         self._moments = moments if self._moments is None else self._moments.joined(moments)
-        table = choice.choose(self._moments, choice.candidates(self.world, self._full, self.settings))
-        candidate, cost, variance = table[0]
-        decision = candidate.decided(len(self.accumulator.passes), cost, variance, self._moments.mean)
+        possible = choice.candidates(self.world, self._full, self.settings)
+        table = choice.choose(self._moments, possible, self.settings.points != "independent")
+        best, number = table[0], len(self.accumulator.passes)
+        decision = best.candidate.decided(number, best.cost, best.variance, self._moments.mean)
         self._adopt(decision, choice.left_out(table))
         self.pilot_seconds += time.perf_counter() - started
         return table
