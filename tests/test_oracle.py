@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
-from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensor_records, sensors
+from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensor_records, sensors, sinks
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coefficients, Paths
 
 # n c: all classes, kappa different from every count, and classes left out.
@@ -720,12 +720,12 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     def edges(vertex):
         return int(vertex.edges[0])
 
-    def connect_all(kernel_, z, *_):
+    def connect_all(kernel_, z, path, counters, total, add):
         for y in stored:
             # Other pairs are not neighbours on a path of k edges.
             if edges(y) + edges(z) + 1 == k:
                 connect.inner(kernel_, z, y)
-        return mi.Spectrum(0)
+        return total
 
     for function, edges_of in (
         (connect.hit_emitter, lambda z: (0, edges(z))),
@@ -745,13 +745,13 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     scene.begin(from_light=True)
     monkeypatch.setattr(dr, "while_loop", python_loop(k if plan.arrival else k - 1))
-    path, _ = kernel._light_subpath(k_, Nothing(), k_.points.stream(), shared, None)
+    path, _ = kernel._light_subpath(k_, sinks.Image(Nothing()), k_.points.stream(), shared, None)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
     lane = kernel._Lane(place, shared, path)
     counters = dict.fromkeys(kernel.COUNTERS, u32(0))
-    kernel._camera_subpath(k_, Nothing(), lane, u32(0), counters, mi.Bool(True))
+    kernel._camera_subpath(k_, sinks.Image(Nothing()), lane, u32(0), counters, mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
     return columns(result, world.n)

@@ -112,7 +112,6 @@ def image(bdpt, scene, **keywords):
         ({"strategy_images": "yes"}, "strategy_images='yes'"),
         ({"max_deph": 3}, "max_deph=3 is not a parameter; did you mean max_depth.*rr_depth"),
         ({"samples_per_pass": 3}, "samples_per_pass=3.*use spp_per_pass"),
-        ({"decisions": "[]"}, "decisions is not supported yet"),
         ({"light_paths": "1/"}, "light_paths='1/'.*1/16"),
         ({"light_paths": "nan"}, "light_paths='nan'"),
     ],
@@ -562,7 +561,7 @@ scene = mi.load_dict({{
     "lamp": {{"type": "point"}},
     "sensor": {{"type": "perspective", "film": {{
         "type": "hdrfilm", "width": 16, "height": 16, "rfilter": {{"type": "gaussian"}}}}}}}})
-bdpt = mi.load_dict({{"type": "bdpt", "max_depth": 4}})
+bdpt = mi.load_dict({{"type": "bdpt", "max_depth": 4, "skip": "impossible"}})
 params = mi.traverse(scene)
 spp, seed = 4, 1
 bdpt.render(scene, spp=spp, seed=seed)

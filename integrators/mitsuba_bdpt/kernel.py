@@ -295,7 +295,7 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
     start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
     sample = _Sample(start, stream, u_lens, active)
-    active &= kernel.max_depth >= 1
+    active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
     walk = _camera_walk(kernel, start, active)
 
     def visit(z, state, _):

@@ -119,7 +119,7 @@ def plan(world, settings: Settings) -> Plan:
         endpoints=endpoints,
         arrival=arrival,
         connections=connections if inner else "none",
-        served=round(1 / light_paths) if light_paths else 1,
+        served=round(1 / light_paths) if splat or arrival or endpoints or inner else 1,
         splat_coefficient=1.0 if settings.skip == "none" else 0.25,
         direct_coefficient=1.0,
         roulette=settings.skip != "none" and not settings.strategy_images,
