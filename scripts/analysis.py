@@ -31,6 +31,7 @@ OWN = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_tri
 # Names of integrators that the report looks for, as presets/benchmark.toml has them.
 RIVALS = ("path", "path multijitter")
 NONE = "bdpt skip=none"
+IMPOSSIBLE = "bdpt skip=impossible"
 INDEPENDENT = "bdpt points=independent"
 ALONE = "bdpt light_paths=0"
 LIGHT_TRACER = "ptracer"

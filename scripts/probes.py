@@ -9,6 +9,9 @@ import os
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
+
+FLOOR_SCENES = ("cornell_box", "uplight_room", "veach_mis")
 
 COLD = """
 import time; start = time.perf_counter()
@@ -31,13 +34,34 @@ mi.render(mi.load_dict(d), integrator=mi.load_dict({'type': 'bdpt', 'max_depth':
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 """
 
+FLOOR = """
+import sys, floor, mitsuba as mi
+mi.set_variant('llvm_ad_rgb')
+print(*floor.measure(sys.argv[1], int(sys.argv[2])))
+"""
+
 
 def _printed(code, environment=None) -> float:
-    """The number that a new process prints."""
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    """The last number that a new process prints."""
+    return _numbers(code, environment=environment)[-1]
+
+
+def _numbers(code, *arguments, environment=None) -> list[float]:
+    """The numbers that a new process prints."""
+    command = [sys.executable, "-c", code, *arguments]
+    here = str(Path(__file__).parent)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=here)
     if done.returncode:
         raise RuntimeError(f"a probe ended with status {done.returncode}: {done.stderr[-500:]}")
-    return float(done.stdout.split()[-1])
+    return [float(word) for word in done.stdout.split() if _is_number(word)]
+
+
+def _is_number(word) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def coldstart(rounds: int) -> dict:
@@ -58,4 +82,9 @@ def memory(rounds: int) -> dict:
     return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
 
 
-PROBES = {"coldstart": coldstart, "memory": memory}
+def kernel_floor(rounds: int) -> dict:
+    """Kernel time over that of its rays alone, by scene, a value per round."""
+    return {name: _numbers(FLOOR, name, str(rounds)) for name in FLOOR_SCENES}
+
+
+PROBES = {"coldstart": coldstart, "memory": memory, "floor": kernel_floor}

@@ -15,6 +15,7 @@ import argparse
 import json
 import re
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import figures
@@ -23,6 +24,7 @@ import pyarrow.parquet
 import reference
 from analysis import (
     ALONE,
+    IMPOSSIBLE,
     INDEPENDENT,
     LIGHT_TRACER,
     NONE,
@@ -150,8 +152,45 @@ def _slope(results, scene, notes) -> str:
         found = convergence(results.of(scene, results.methods[0]))
     except Refused as why:
         return str(why)
+    if len({_chosen(row) for row in results.of(scene, results.methods[0])}) > 1:
+        return estimate(found) + ", between decisions"
     expected = found.low <= -1 <= found.high or scene in notes
     return estimate(found) + ("" if expected else ", **unexplained**")
+
+
+def _chosen(row) -> str:
+    """What the pilot of a render chose last, as parameters; empty without a pilot."""
+    decisions = json.loads(row["decisions"] or "null") or [None]
+    if decisions[-1] is None:
+        return ""
+    share = decisions[-1]["light_paths"]
+    light_paths = f"1/{round(1 / share)}" if share else "0"
+    return f"light_paths={light_paths}, connections={decisions[-1]['connections']}"
+
+
+def _pilot_share(row) -> float:
+    """Share of a render that its pilots and decisions took."""
+    return json.loads(row["statistics"])["seconds"]["pilot"] / row["seconds"]
+
+
+def choices_table(results: Results) -> str:
+    """What the pilots chose, what they left out and why, and what they cost."""
+    head = ["scene", "chosen (number of renders)", "left out in the first render", "share of the pilot"]
+    lines = []
+    for scene in results.scenes:
+        rows = results.of(scene, results.methods[0], results.deciding)
+        chosen = Counter(_chosen(row) for row in rows).most_common()
+        skipped = json.loads(rows[0]["statistics"])["skipped"]
+        left_out = [s for s in skipped if s["level"] == "not worth its cost"]
+        lines.append(
+            [
+                f"`{scene}`",
+                "; ".join(f"{text or 'no pilot'} ({count})" for text, count in chosen),
+                "; ".join(f"{s['class']}: {s['why']}" for s in left_out) or "–",
+                f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} %",
+            ]
+        )
+    return table(head, lines)
 
 
 def _verdict(check) -> str:
@@ -266,8 +305,23 @@ def _alone(results: Results, scene: str) -> str:
 
 def _cost(results: Results, scene: str) -> str:
     path = results.of(scene, RIVALS[0], results.deciding)
-    sides = [cost(results.of(scene, method, results.deciding), path) for method in (NONE, results.methods[0])]
+    sides = [cost(results.of(scene, method, results.deciding), path) for method in (NONE, IMPOSSIBLE)]
     return " / ".join(ranged(side) for side in sides)
+
+
+def _pilot(results: Results, scene: str) -> str:
+    rows = results.of(scene, results.methods[0], 4 * results.deciding)
+    if not rows:
+        raise Refused(f"no render of {scene} at {4 * results.deciding} spp")
+    return ", ".join(
+        f"{100 * np.median([_pilot_share(row) for row in found]):.1f} % of `{name}`"
+        for name in results.scenes
+        if (found := results.of(name, results.methods[0], 4 * results.deciding))
+    )
+
+
+def _floor(results: Results) -> str:
+    return ", ".join(f"{ranged(spread(v))} `{name}`" for name, v in _values(results, "floor").items())
 
 
 def _values(results, name) -> dict:
@@ -299,6 +353,8 @@ GOALS = {
     "against none": _against_none,
     "alone": _alone,
     "cost": _cost,
+    "pilot": _pilot,
+    "floor": _floor,
     "coldstart": _coldstart,
     "memory": _memory,
 }
@@ -392,9 +448,17 @@ By budget, over the stronger `path` that passes the bias check:
 {budgets_table(results)}"""
     )
     parts.append(
+        f"""## What was skipped
+
+Decided by a pilot in each render, at {results.deciding} samples per pixel:
+
+{choices_table(results)}"""
+    )
+    parts.append(
         f"""## Cost, convergence, bias
 
-Slope: exponent of raw relMSE over samples, −1 for independent samples, with its 95 % interval. Bias
+Slope: exponent of raw relMSE over samples, −1 for independent samples, with its 95 % interval ("between
+decisions": budgets differ in what is skipped, since a short render has no pilot). Bias
 check: Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy,
 and what the reference was made by: where that is `bdpt`, with nothing skipped and other counts, what both
 have in common is tested elsewhere (tests/).

@@ -163,6 +163,16 @@ def test_choice(make, light):
     assert "pilot" not in integrator.explain(target)
 
 
+def test_few_pixels():
+    """Rationale: two samples of one pixel say nothing. Expected: for a film of 2 x 2 pixels the pilot has as
+    many samples as for any other."""
+    target = caustic(2)
+    render = of(target)
+    seed = dr.opaque(mi.UInt32, 3)
+    found = pilot.measure(render.world, render.plan, render.settings, seed, 2048)
+    assert found.lanes == 2048 and (found.base[:, -1] > 0).all()
+
+
 def test_not_asked():
     """Expected: no pilot in short renders, nor where light_paths or connections are given, nor for another
     ``skip``, nor where light subpaths are impossible."""

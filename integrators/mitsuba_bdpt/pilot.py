@@ -37,7 +37,7 @@ TILES = 8
 # Independent parts of the pilot, among which outliers are looked for.
 GROUPS = 16
 
-# Camera samples of a pixel.
+# Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
 PER_PIXEL = 2
 
 
@@ -120,7 +120,8 @@ class Moments:
 
 
 class Pilot:
-    """Sink (see `sinks`) of a pilot's contributions: ``lanes`` samples, `PER_PIXEL` of each pixel in turn."""
+    """Sink (see `sinks`) of a pilot's contributions: ``lanes`` samples, of which each `PER_PIXEL` that follow
+    one another are of the same pixel."""
 
     alpha = False
 
@@ -266,12 +267,13 @@ def measure(world, plan, settings, seed, lanes: int) -> Moments:
     kernel = Kernel(world, everything, settings, mis.ByClass())
     region = world.camera.region
     pixels = int(region.size.prod())
-    chosen = min(lanes // PER_PIXEL, pixels)
+    samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
+    chosen = min(lanes // samples, pixels)
     stride = pixels // chosen
-    batch = Batch(stride // 2, chosen, 0, PER_PIXEL, stride)
-    pilot = Pilot(region, chosen * PER_PIXEL)
+    batch = Batch(stride // 2, chosen, 0, samples, stride)
+    pilot = Pilot(region, chosen * samples)
     # Independent numbers: the squared mean follows from products of samples.
-    counts = trace(kernel, pilot, batch, Points("independent", seed), PER_PIXEL)
+    counts = trace(kernel, pilot, batch, Points("independent", seed), samples)
     pilot.evaluate(counts)
     return pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
 
