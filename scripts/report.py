@@ -181,7 +181,7 @@ def choices_table(results: Results) -> str:
         rows = results.of(scene, results.methods[0], results.deciding)
         chosen = Counter(_chosen(row) for row in rows).most_common()
         skipped = json.loads(rows[0]["statistics"])["skipped"]
-        left_out = [s for s in skipped if s["level"] == "not worth its cost"]
+        left_out = [s for s in skipped if s["level"] == "not worth its cost here"]
         lines.append(
             [
                 f"`{scene}`",

@@ -155,8 +155,8 @@ def test_choice(make, light):
         statistics = integrator.statistics
         (made,) = statistics["decisions"]
         assert (made["light_paths"] > 0) == light == (statistics["rays"]["light"] > 0)
-        reasons = [s for s in statistics["skipped"] if s["level"] == "not worth its cost"]
-        assert bool(reasons) or light
+        reasons = [s for s in statistics["skipped"] if s["level"] == "not worth its cost here"]
+        assert {r["class"] for r in reasons} >= (set() if light else {"t<=1", "inner"})
         assert statistics["seconds"]["pilot"] > 0
     text = integrator.explain(target, spp=32)
     assert "pilot: time to the same error" in text and ("no light subpaths" in text) != light
@@ -173,6 +173,36 @@ def test_few_pixels():
     assert found.lanes == 2048 and (found.base[:, -1] > 0).all()
 
 
+def test_a_pilot_that_sees_nothing():
+    """Expected: nothing is decided from a black pilot, nor where all light is seen directly."""
+    dark = mi.cornell_box()
+    dark["light"]["emitter"]["radiance"] = {"type": "rgb", "value": 0.0}
+    dark["sensor"]["film"] |= {"width": 128, "height": 128}
+    for target, parameters in ((mi.load_dict(dark), {}), (cornell(128), {"max_depth": 1})):
+        integrator = bdpt(**parameters)
+        integrator.render(target, spp=32)
+        assert integrator.statistics["decisions"] == []
+
+
+def test_pixels_of_a_pilot():
+    """Rationale: a stride that divides the width sees the same columns in every row. Expected: the pixels
+    of a pilot are in all eighths of the width, a tenth of them at least, and in the image."""
+    for width, height, chosen in ((4096, 4096, 16384), (128, 128, 1024), (1000, 30, 512), (1920, 1080, 2048)):
+        stride = pilot.pixel_stride(width * height, chosen, width)
+        at = stride // 2 + stride * np.arange(chosen)
+        assert at[-1] < width * height
+        share = np.bincount(at % width * 8 // width, minlength=8) / chosen
+        assert share.min() > 0.1
+        assert np.bincount(at // width * 8 // height, minlength=8).min() > 0
+
+
+def test_decisions_in_explain():
+    """Expected: what is replayed is explained, without a pilot."""
+    target = cornell(128)
+    text = forced(decision(ALONE, 1, "none")).explain(target, spp=64)
+    assert "no light subpaths" in text and "pilot" not in text and "(by hand): t<=1: decisions" in text
+
+
 def test_not_asked():
     """Expected: no pilot in short renders, nor where light_paths or connections are given, nor for another
     ``skip``, nor where light subpaths are impossible."""
@@ -183,6 +213,7 @@ def test_not_asked():
         ({"connections": "one"}, 32),
         ({"skip": "impossible"}, 32),
         ({"max_depth": 0}, 32),
+        ({"strategy_images": True, "max_depth": 3}, 32),
     ):
         integrator = bdpt(**parameters)
         integrator.render(target, spp=spp)
@@ -276,12 +307,17 @@ def test_changed_decisions_change_the_points():
     [
         ("{", "JSONDecodeError"),
         ("[1]", "TypeError"),
+        ("[]", "a list of one decision or more"),
+        ('""', "a list of one decision or more"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 3}]), "passes [3] must start at 0"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 0.5}]), "pass=0.5"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"colour": 0}]), "colour is no part"),
         ("[{}]", "KeyError 'light_paths'"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"light_paths": 0.3}]), "light_paths=0.3"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "some"}]), "connections='some'"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "all"}]), "without light paths"),
         (
-            json.dumps([decision(ALONE, 1, "none").record() | {"coefficients": {"t=1": 1, "s=1": 0}}]),
+            json.dumps([decision(ALONE, 1, "none").record() | {"coefficients": {"t<=1": 1, "s=1": 0}}]),
             "direct_coefficient=0.0",
         ),
     ],
@@ -294,8 +330,10 @@ def test_bad_decisions(text, words):
 
 def test_decisions_by_two_hands():
     text = json.dumps([decision(ALONE, 1, "none").record()])
-    with pytest.raises(RuntimeError, match="decisions together with light_paths, connections or skip"):
+    with pytest.raises(RuntimeError, match="decisions together with light_paths, connections, skip"):
         bdpt(decisions=text, light_paths=1)
+    with pytest.raises(RuntimeError, match="skip or strategy_images is contradictory"):
+        bdpt(decisions=text, strategy_images=True)
     with pytest.raises(RuntimeError, match="decisions=3 must be a string"):
         bdpt(decisions=3)
 

@@ -36,10 +36,10 @@ COSTS = {
 }
 
 
-# The error with stratified points goes with this power of the variance of independent ones: candidates differ
-# less, since what differs is often what the points do not reach. Measured over 13 candidates in 14 scenes:
-# 0.5 to 1.1, mostly above 0.8.
-STRATIFIED_POWER = 0.92
+# Stratified points lower the variance of camera samples more than that of splats, by this factor: to 0.31 to
+# 0.54 of that with independent points against 0.57 to 1.05, ratios of 1.8 to 2.0 in five scenes. This is why
+# t = 1 with its nominal coefficient raises the error: its variance is what the points leave.
+STRATIFIED_SPLATS = 2.0
 
 # Per sample, as relMSE: below it nobody sees noise, and candidates differ by that of the pilot.
 LEAST_VARIANCE = 1e-4
@@ -49,7 +49,7 @@ LEAST_VARIANCE = 1e-4
 class Decision:
     """How to render from the pass number ``first_pass`` on: the parameters ``light_paths`` and
     ``connections``, the coefficients kappa of t <= 1 (over its count) and s = 1, ``cost`` of a sample (path
-    tracing alone: 1), ``variance`` of a sample as relMSE, and the image's ``mean``, the scale of roulette."""
+    tracing alone: 1), its ``variance`` as in `Choice`, and the image's ``mean``, the scale of roulette."""
 
     first_pass: int
     light_paths: float
@@ -66,7 +66,7 @@ class Decision:
             "pass": self.first_pass,
             "light_paths": self.light_paths,
             "connections": self.connections,
-            "coefficients": {"t=1": self.splat_coefficient, "s=1": self.direct_coefficient},
+            "coefficients": {"t<=1": self.splat_coefficient, "s=1": self.direct_coefficient},
             "cost": self.cost,
             "variance": self.variance,
             "mean": self.mean,
@@ -90,8 +90,14 @@ class Decision:
 def read_decisions(text: str) -> tuple[Decision, ...]:
     """The parameter ``decisions``: JSON as in ``statistics``; raises ``ValueError`` saying what is wrong."""
     try:
-        entries = json.loads(text) if text else []
-        return tuple(_read_decision(entry) for entry in entries)
+        entries = json.loads(text)
+        if not isinstance(entries, list) or not entries:
+            raise TypeError("a list of one decision or more is needed")
+        made = tuple(_read_decision(entry) for entry in entries)
+        passes = [decision.first_pass for decision in made]
+        if passes != sorted(set(passes)) or passes[0] != 0:
+            raise ValueError(f"passes {passes} must start at 0 and rise")
+        return made
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
             f"bdpt: decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: "
@@ -105,9 +111,21 @@ def _read_decision(entry: dict) -> Decision:
         raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
     if not light_paths and connections != "none":
         raise ValueError(f"connections={connections!r} without light paths")
+    if unknown := set(entry) - {
+        "pass",
+        "light_paths",
+        "connections",
+        "coefficients",
+        "cost",
+        "variance",
+        "mean",
+    }:
+        raise ValueError(f"{sorted(unknown)[0]} is no part of a decision")
+    if not isinstance(entry["pass"], int):
+        raise TypeError(f"pass={entry['pass']!r}")
     numbers = {
-        "first_pass": int(entry["pass"]),
-        "splat_coefficient": float(entry["coefficients"]["t=1"]),
+        "first_pass": entry["pass"],
+        "splat_coefficient": float(entry["coefficients"]["t<=1"]),
         "direct_coefficient": float(entry["coefficients"]["s=1"]),
         **{name: float(entry[name]) for name in ("cost", "variance", "mean")},
     }
@@ -154,13 +172,17 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Choice:
-    """A candidate with the ``cost`` of a sample (path tracing alone: 1), its ``variance`` as relMSE, and the
-    ``time`` to a certain error, in a unit of its own."""
+    """A candidate with the ``cost`` of a sample (path tracing alone: 1) and its ``variance`` as relMSE,
+    before what points take off that of all candidates."""
 
     candidate: Candidate
     cost: float
     variance: float
-    time: float
+
+    @property
+    def time(self) -> float:
+        """To a certain error, in a unit of its own."""
+        return self.cost * self.variance
 
 
 def lanes(samples: int) -> int:
@@ -171,11 +193,13 @@ def lanes(samples: int) -> int:
 
 
 def is_open(full: Plan, settings: Settings) -> bool:
-    """Whether there is something to choose: nothing is given by hand, and light subpaths are possible."""
+    """Whether there is something to choose: nothing is given by hand, and light subpaths are possible.
+    (Strategy images want all strategies.)"""
     return (
         full.light
         and settings.skip == "auto"
         and settings.light_paths == settings.connections == "auto"
+        and settings.decisions is None
         and not settings.strategy_images
     )
 
@@ -214,8 +238,8 @@ def cost(candidate: Candidate, rays: dict) -> float:
 def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> list[Choice]:
     """All ``possible`` candidates, the best first; ``stratified``: whether points will be better than
     independent ones."""
-    power = STRATIFIED_POWER if stratified else 1.0
-    drawn, every = moments.variance(True), moments.variance(False)
+    factor = STRATIFIED_SPLATS if stratified else 1.0
+    drawn, every = moments.variance(True, factor), moments.variance(False, factor)
     parts = np.stack(
         [(drawn if c.connections == "one" else every)[:, :, c.weighting] for c in possible], axis=1
     )
@@ -224,8 +248,7 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
     table = []
     for c, v in zip(possible, variances.tolist(), strict=True):
         if math.isfinite(v):
-            price, v = cost(c, moments.rays), max(v, LEAST_VARIANCE)
-            table.append(Choice(c, price, v, price * v**power))
+            table.append(Choice(c, cost(c, moments.rays), max(v, LEAST_VARIANCE)))
     return sorted(table, key=lambda row: row.time)
 
 
@@ -233,9 +256,17 @@ def _robust_mean(values):
     """Mean over the groups (rows) without the quarter of them that is worst for all candidates (columns)
     together: an outlier that no candidate does anything about hides how they differ."""
     finite = np.isfinite(values).all(axis=0)
+    if not finite.any():
+        return values.mean(axis=0)
     usual = values[:, finite] / np.maximum(values[:, finite].mean(axis=0), LEAST_VARIANCE)
     order = np.argsort(usual.mean(axis=1))
     return values[order[: len(order) * 3 // 4]].mean(axis=0)
+
+
+def replayed(decision: Decision) -> list[dict]:
+    """What a replayed decision leaves out, as in ``statistics["skipped"]``."""
+    names = ["t<=1"] * (not decision.light_paths) + ["inner"] * (decision.connections == "none")
+    return [{"class": name, "level": "by hand", "why": "decisions"} for name in names]
 
 
 def left_out(table: list[Choice]) -> list[dict]:
@@ -250,5 +281,5 @@ def left_out(table: list[Choice]) -> list[dict]:
         if others and not does(table[0].candidate):
             ratio = others[0].time / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
-            skipped.append({"class": name, "level": "not worth its cost", "why": why})
+            skipped.append({"class": name, "level": "not worth its cost here", "why": why})
     return skipped

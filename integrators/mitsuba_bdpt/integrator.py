@@ -42,11 +42,9 @@ RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
 
-# Number of the first pilot's sequence, see `sequence_seed`.
-PILOT_SEQUENCE = 1 << 16
-
-# Number of the sequence after the first change of a decision.
-CHANGED_SEQUENCE = 1 << 17
+# Pilots have the sequences that follow this number, see `sequence_seed`, and images, after changes of the
+# decision, those that follow the other one.
+PILOT_SEQUENCE, CHANGED_SEQUENCE = 1 << 16, 1 << 17
 
 # Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
 FIRST_REPEAT = 32
@@ -87,16 +85,19 @@ All of them are combined by multiple importance sampling.
    - ``balance`` (default), ``power``, ``maximum`` or ``uniform``.
  * - skip
    - |string|
-   - ``auto`` (default) and ``impossible`` leave out what the scene cannot use, draw one connection
-     per camera vertex and drop small contributions by unbiased roulette; ``none`` does everything.
+   - ``impossible`` leaves out what the scene cannot use, draws one connection per camera vertex and drops
+     small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^19
+     samples or more, asks a pilot what pays (see `choice`); ``none`` does everything.
  * - light_paths
    - |string| or |float|
-   - Light subpaths per camera subpath: ``auto`` (default: 1/4, or 1 with ``skip=none``), 0, 1,
-     1/2, 1/4, 1/8 or 1/16. One light subpath serves camera subpaths of different pixels.
+   - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses, else 1/4, or 1 with
+     ``skip=none``), 0, 1, 1/2, 1/4, 1/8 or 1/16. One light subpath serves camera subpaths of different
+     pixels. Given by hand, there is no pilot.
  * - connections
    - |string|
    - Inner connections per camera vertex: ``all``, ``one`` (drawn by its unshadowed contribution),
-     ``none``, or ``auto`` (default: ``one``, or ``all`` with ``skip=none``).
+     ``none``, or ``auto`` (default: what the pilot chooses, else ``one``, or ``all`` with ``skip=none``).
+     Given by hand, there is no pilot.
  * - points
    - |string|
    - ``sobol`` (default): Owen-scrambled Sobol' points for light and BSDF samples; ``sampler``: the
@@ -299,23 +300,30 @@ class Render:
         count = choice.lanes(left * int(self.camera.region.size.prod()))
         if not (count and choice.is_open(self._full, self.settings)):
             return []
-        started = time.perf_counter()
+        started, compiled = time.perf_counter(), self.compile_seconds
         self._pilots += 1
         seed = sequence_seed(self.seed, PILOT_SEQUENCE + self._pilots)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), step_by_step(self.emitters.evaluated):
             moments = pilot.measure(self.world, self._full, self.settings, seed, count)
+        self._wait()  # for the kernel's entry in the history
         self._moments = moments if self._moments is None else self._moments.joined(moments)
         possible = choice.candidates(self.world, self._full, self.settings)
-        table = choice.choose(self._moments, possible, self.settings.points != "independent")
-        best, number = table[0], len(self.accumulator.passes)
-        decision = best.candidate.decided(number, best.cost, best.variance, self._moments.mean)
-        self._adopt(decision, choice.left_out(table))
-        self.pilot_seconds += time.perf_counter() - started
+        table = choice.choose(self._moments, possible, self._has_stratified_points())
+        if table and self._moments.mean > 0:  # a pilot that sees nothing says nothing
+            best, number = table[0], len(self.accumulator.passes)
+            decision = best.candidate.decided(number, best.cost, best.variance, self._moments.mean)
+            self._adopt(decision, choice.left_out(table))
+        self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
         return table
 
+    def _has_stratified_points(self) -> bool:
+        if self.settings.points == "sampler":
+            return self.sensor.sampler().class_name() != "IndependentSampler"
+        return self.settings.points == "sobol"
+
     def _adopt(self, decision, left_out=()):
-        """Render as decided from now on; if that differs from before, with points of their own, so that they
-        do not depend on those that led to the decision."""
+        """Render as decided from now on; if that differs from before, with points of their own: lanes serve
+        other samples, and what was half done of the old sequence would not be finished."""
         adopted = replace(decision.plan(self._full), skipped=(*self._full.skipped, *left_out))
         if self.decisions and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
             self._changes += 1
@@ -329,15 +337,21 @@ class Render:
         if self._mean and chosen.roulette:
             self.kernel.set_threshold(dr.opaque(mi.Float64, self._mean))
 
+    def replay(self, number: int):
+        """Adopt the decision that is given for the pass of this ``number``, if there is one."""
+        for decision in self.settings.decisions:
+            if decision.first_pass == number:
+                self._adopt(decision, choice.replayed(decision))
+
     def _decide_before(self, step: Step):
         """Replay the decision for this pass; or, early in a long render, ask another pilot."""
         number = len(self.accumulator.passes)
         if self.settings.decisions:
-            for decision in self.settings.decisions:
-                if decision.first_pass == number:
-                    self._adopt(decision)
+            self.replay(number)
         elif number and step.done >= self._next_pilot and not step.replicate:
-            self._next_pilot *= 4
+            while self._next_pilot <= step.done:
+                self._next_pilot *= 4
+            # A scene's sampler cannot start again in the middle of its samples.
             if 2 * step.done <= self.spp and self.settings.points != "sampler":
                 self.decide()
 
@@ -347,8 +361,7 @@ class Render:
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         try:
-            if not self.settings.decisions:
-                self.decide()
+            self.decide()
             for number, step in enumerate(self._steps()):
                 self._decide_before(step)
                 self._pass(step)
@@ -382,7 +395,7 @@ class Render:
     def _affordable(self, size: int) -> int:
         if self.settings.timeout < 0 or self.settings.points == "sampler":
             return size
-        busy = time.perf_counter() - self.started - self.compile_seconds
+        busy = time.perf_counter() - self.started - self.compile_seconds - self.pilot_seconds
         rate = sum(self.accumulator.passes) / max(busy, 1e-3)
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
 
@@ -456,7 +469,7 @@ class Render:
             "seconds": {
                 "compile": self.compile_seconds,
                 "pilot": self.pilot_seconds,
-                "render": total - self.compile_seconds,
+                "render": total - self.compile_seconds - self.pilot_seconds,
                 "total": total,
             },
             "rays": self._rays(),
@@ -558,6 +571,8 @@ def _make_class():
                 spp = _samples(sensor, integer(spp, "spp", 0), self.settings)
             render = Render(scene, sensor, self.settings, 0, spp or 1)
             table = render.decide() if spp else []
+            if self.settings.decisions:
+                render.replay(0)
             return explain(render.world, render.plan, self.settings, table)
 
         def to_string(self):
@@ -621,6 +636,8 @@ def _log(statistics: dict):
         f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
         f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
     )
+    for made in statistics["decisions"]:
+        mi.Log(mi.LogLevel.Info, f"bdpt: decided by a pilot: {json.dumps(made)}")
     if statistics.get("error") == math.inf:
         mi.Log(
             mi.LogLevel.Warn,

@@ -73,7 +73,7 @@ def _decisions(props):
     value = props.get("decisions", "")
     if not isinstance(value, str):
         raise TypeError(f"bdpt: decisions={value!r} must be a string of JSON")
-    return choice.read_decisions(value)
+    return choice.read_decisions(value) if value else None
 
 
 def _aovs(props):
@@ -142,10 +142,10 @@ def read_settings(props) -> Settings:
             "set max_depth, for example to 5"
         )
     by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
-    if settings.decisions and by_hand:
+    if settings.decisions and (by_hand or settings.strategy_images):
         raise ValueError(
-            "bdpt: decisions together with light_paths, connections or skip is contradictory; leave the "
-            "latter at auto"
+            "bdpt: decisions together with light_paths, connections, skip or strategy_images is "
+            "contradictory; leave out one or the other"
         )
     _check_layers(settings)
     return settings

@@ -21,6 +21,7 @@ candidates; how much is not asked.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -90,7 +91,8 @@ class Moments:
 
     ``base``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): variance is ``base`` + S
     ``light``, plus ``draw`` where one inner connection is drawn. ``mean`` of the image (mean of the
-    colours); ``rays`` per camera sample and kind, one light subpath each.
+    colours, emitters seen directly left out); ``rays`` and connections per camera sample and kind, with one
+    light subpath each; ``lanes``: number of camera samples.
     """
 
     base: np.ndarray
@@ -100,10 +102,10 @@ class Moments:
     rays: dict
     lanes: int
 
-    def variance(self, drawn: bool) -> np.ndarray:
+    def variance(self, drawn: bool, factor: float = 1.0) -> np.ndarray:
         """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, and what
-        grows with it."""
-        return np.stack([self.base + (self.draw if drawn else 0), self.light], axis=1)
+        grows with it, that of splats. The latter counts by ``factor``, for points that lower it less."""
+        return np.stack([self.base + (self.draw if drawn else 0), factor * self.light], axis=1)
 
     def joined(self, other: Moments) -> Moments:
         """This pilot and another, of which each counts by its number of ``lanes``."""
@@ -221,9 +223,10 @@ class Pilot:
         with np.errstate(invalid="ignore"):
             base = square - estimate * other
         group = self._group(np.arange(lanes))
-        per_tile = lanes / TILES**2
-        whole = np.bincount(tiles, estimate[:, -1], TILES**2) + splats[:, :, 0].sum(axis=0)
-        brightness = whole / per_tile
+        # Camera samples over those of the tile, splats over the samples of an average tile.
+        in_tile = np.maximum(np.bincount(tiles, minlength=TILES**2), 1)
+        brightness = np.bincount(tiles, estimate[:, -1], TILES**2) / in_tile
+        brightness += splats[:, :, 0].sum(axis=0) * (TILES**2 / lanes)
         norm = brightness**2 + 0.01 * brightness.mean() ** 2
         norm = np.where(norm > 0, norm, np.inf)
 
@@ -254,6 +257,15 @@ class Pilot:
         return xy.y * TILES + xy.x
 
 
+def pixel_stride(pixels: int, chosen: int, width: int) -> int:
+    """Distance between ``chosen`` of the image's ``pixels``, counted row by row, so that all columns have their
+    turn."""
+    stride = pixels // chosen
+    while math.gcd(stride, width) > 1:
+        stride -= 1
+    return stride
+
+
 def measure(world, plan, settings, seed, lanes: int) -> Moments:
     """Run a pilot of about ``lanes`` camera samples, spread over the image."""
     everything = replace(
@@ -269,7 +281,7 @@ def measure(world, plan, settings, seed, lanes: int) -> Moments:
     pixels = int(region.size.prod())
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
-    stride = pixels // chosen
+    stride = pixel_stride(pixels, chosen, int(region.size[0]))
     batch = Batch(stride // 2, chosen, 0, samples, stride)
     pilot = Pilot(region, chosen * samples)
     # Independent numbers: the squared mean follows from products of samples.

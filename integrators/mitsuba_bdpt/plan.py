@@ -28,7 +28,7 @@ class Settings:
     light_paths: float | str
     connections: str
     points: str
-    decisions: tuple
+    decisions: tuple | None
     stored_vertices: int
     strategy_images: bool
     variance: bool

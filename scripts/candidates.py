@@ -1,0 +1,128 @@
+"""What the pilot predicts of each way to render, beside what renders show.
+
+    python scripts/candidates.py cornell_box uplight_room glass_caustics
+
+For each scene (128^2, as in the benchmark) and a selection of candidates: the predicted variance of a sample,
+split into that of camera samples and that of splats, and cost; the relMSE of renders of 64 samples per pixel
+times 64, trimmed of its worst 0.1 %, with the default points, and their time over that of path tracing alone.
+Renders of a given candidate come from the parameter ``decisions``. The ratio of the variances is what points
+gain.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+
+import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
+import numpy as np
+from report import table
+
+import mitsuba as mi  # isort: skip
+import drjit as dr
+import metrics
+import reference
+from mitsuba_bdpt import choice, pilot
+from mitsuba_bdpt import integrator as bdpt
+
+RESOLUTION, SPP, LANES, ROUNDS = 128, 64, 1 << 15, 4
+
+# (share of a light subpath, connections, kappa of t = 1 over its count)
+SELECTION = (
+    (0, "none", 1),
+    (1, "none", 1 / 4),
+    (1 / 4, "none", 1 / 4),
+    (1, "one", 1),
+    (1, "one", 1 / 4),
+    (1 / 4, "one", 1),
+    (1 / 4, "one", 1 / 4),
+    (1 / 16, "one", 1 / 4),
+    (1 / 4, "all", 1 / 4),
+)
+
+
+def decision(share: float, connections: str, splat: float, mean: float) -> choice.Decision:
+    """The decision for an entry of `SELECTION`."""
+    return choice.Decision(0, share, connections, splat, 1.0, 1.0, 1.0, mean)
+
+
+def candidate(share: float, connections: str, splat: float) -> choice.Candidate:
+    """The same as one of the pilot's."""
+    inner = float(connections != "none")
+    weighting = pilot.Weighting(1, 1, splat * share, inner)
+    return choice.Candidate(pilot.WEIGHTINGS.index(weighting), round(1 / share) if share else 1, connections)
+
+
+def predicted(scene, settings) -> pilot.Moments:
+    """What several pilots of the scene find."""
+    render = bdpt.Render(scene, scene.sensors()[0], settings, 1, SPP)
+    found = None
+    for number in range(ROUNDS):
+        seed = dr.opaque(mi.UInt32, number)
+        new = pilot.measure(render.world, render.plan, settings, seed, LANES)
+        found = new if found is None else found.joined(new)
+    return found
+
+
+def rendered(scene, depth: int, entry, mean: float, expected) -> tuple[float, float]:
+    """Median of relMSE times samples, and of seconds per render, over `ROUNDS` renders after a first one."""
+    made = [decision(*entry, mean).record()]
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": json.dumps(made)})
+    errors, seconds = [], []
+    for seed in range(ROUNDS + 1):
+        started = time.perf_counter()
+        image = np.array(integrator.render(scene, seed=seed, spp=SPP))[..., :3]
+        seconds.append(time.perf_counter() - started)
+        errors.append(metrics.rel_mse(image, expected, metrics.TRIM) * SPP)
+    return statistics.median(errors[1:]), statistics.median(seconds[1:])
+
+
+def lines(name: str, depth: int) -> list:
+    """Rows of a scene's table."""
+    scene = reference.load_scene(name, resolution=RESOLUTION)
+    expected = reference.load_reference(name, RESOLUTION, depth).image
+    settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
+    moments = predicted(scene, settings)
+    rows, alone = [], None
+    for entry in SELECTION:
+        share, connections, splat = entry
+        way = candidate(*entry)
+        base, light = moments.variance(connections == "one")[:, :, way.weighting].mean(axis=0)
+        error, seconds = rendered(scene, depth, entry, moments.mean, expected)
+        alone = alone or seconds
+        light *= way.served
+        name_of_share = f"1/{way.served}" if share else "0"
+        rows.append(
+            [
+                f"`{name}`",
+                f"{name_of_share}, {connections}, {splat if share else '–'}",
+                f"{base:.3g} + {light:.3g}",
+                f"{error:.3g}",
+                f"{(base + light) / error:.2f}",
+                f"{choice.cost(way, moments.rays):.2f}",
+                f"{seconds / alone:.2f}",
+            ]
+        )
+    return rows
+
+
+def main(arguments=None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("scene", nargs="+")
+    options = parser.parse_args(arguments)
+    mi.set_variant("llvm_ad_rgb")
+    head = ["scene", "light_paths, connections, kappa of t=1 over its count", "predicted: camera + splats"]
+    head += ["relMSE · spp", "ratio", "predicted cost", "time"]
+    rows = []
+    for name in options.scene:
+        rows += lines(name, 6 if name == "cornell_box" else reference.default_depth(name))
+    print(table(head, rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
