@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import choice, mis, pilot
 from mitsuba_bdpt import integrator as module
+from mitsuba_bdpt.kernel import Batch, _Places
 
 T = mi.ScalarTransform4f
 
@@ -185,15 +186,16 @@ def test_a_pilot_that_sees_nothing():
 
 
 def test_pixels_of_a_pilot():
-    """Rationale: a stride that divides the width sees the same columns in every row. Expected: the pixels
-    of a pilot are in all eighths of the width, a tenth of them at least, and in the image."""
-    for width, height, chosen in ((4096, 4096, 16384), (128, 128, 1024), (1000, 30, 512), (1920, 1080, 2048)):
-        stride = pilot.pixel_stride(width * height, chosen, width)
-        at = stride // 2 + stride * np.arange(chosen)
-        assert at[-1] < width * height
-        share = np.bincount(at % width * 8 // width, minlength=8) / chosen
-        assert share.min() > 0.1
-        assert np.bincount(at // width * 8 // height, minlength=8).min() > 0
+    """Rationale: every 16th pixel of a wide film is in the same columns. Expected: the pixels of a batch
+    with a stride are one of each 16 in turn, and a tenth of them at least in each eighth of the width."""
+    target = sky(128)
+    kernel = of(target).kernel
+    place = _Places(kernel, Batch(0, 1024, 0, 2, 16), 2)
+    slot = dr.arange(mi.UInt32, 2048)
+    pixel, sample = (np.array(x) for x in place._split(slot))
+    np.testing.assert_array_equal(pixel // 16, np.arange(2048) // 2)
+    np.testing.assert_array_equal(sample, np.arange(2048) % 2)
+    assert (np.bincount(pixel % 128 // 16, minlength=8) / 2048).min() > 0.1
 
 
 def test_decisions_in_explain():
@@ -352,3 +354,35 @@ def test_weights_by_class():
     assert dr.allclose(weight, expected, rtol=1e-5)
     assert dr.allclose(dr.sum(shares), 1, rtol=1e-5)
     assert dr.all(shares.z >= weight * (1 - 1e-5))
+
+
+def test_outliers_of_all_do_not_count_and_of_one_do():
+    """Rationale: what a few light subpaths find can decide. Expected: a group in which all candidates are far
+    off is left out; one in which path tracing alone is, is not."""
+    values = np.ones((16, 45))
+    values[3] = 1000
+    assert choice._robust_mean(values) == pytest.approx(np.ones(45))
+    values = np.ones((16, 45))
+    values[5, :4] = 1000
+    assert choice._robust_mean(values)[0] > 50 and choice._robust_mean(values)[9] == 1
+
+
+def test_small_lamps_in_sight():
+    """Rationale: (1,1) keeps lamps smaller than a pixel free of noise, path tracing alone hardly hits them.
+
+    Expected: with a hundred such lamps before a dark wall there are light subpaths.
+    """
+    lamps = {
+        f"lamp{i}": {
+            "type": "sphere",
+            "center": [0.2 * (i % 10) - 0.9, 0.15 * (i // 10) - 0.3, 0],
+            "radius": 0.0004,
+            "emitter": {"type": "area", "radiance": 1e5},
+        }
+        for i in range(100)
+    }
+    target = mi.load_dict({"type": "scene", "sensor": camera(128), **lamps})
+    integrator = bdpt(max_depth=2)
+    integrator.render(target, spp=32)
+    (made,) = integrator.statistics["decisions"]
+    assert made["light_paths"] > 0

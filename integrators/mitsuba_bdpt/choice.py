@@ -41,6 +41,9 @@ COSTS = {
 # t = 1 with its nominal coefficient raises the error: its variance is what the points leave.
 STRATIFIED_SPLATS = 2.0
 
+# Films of fewer pixels have a light subpath for each camera subpath.
+FEW_PIXELS = 64
+
 # Per sample, as relMSE: below it nobody sees noise, and candidates differ by that of the pilot.
 LEAST_VARIANCE = 1e-4
 
@@ -75,16 +78,16 @@ class Decision:
     def plan(self, full: Plan) -> Plan:
         """``full`` with what is not done left out."""
         light = self.light_paths > 0
-        return replace(
+        adopted = replace(
             full,
             splat=full.splat and light,
             endpoints=full.endpoints and light,
             arrival=full.arrival and light,
             connections=self.connections if full.connections != "none" and light else "none",
-            served=round(1 / self.light_paths) if light else 1,
             splat_coefficient=self.splat_coefficient,
             direct_coefficient=self.direct_coefficient,
         )
+        return replace(adopted, served=round(1 / self.light_paths) if adopted.light else 1)
 
 
 def read_decisions(text: str) -> tuple[Decision, ...]:
@@ -206,8 +209,13 @@ def is_open(full: Plan, settings: Settings) -> bool:
 
 def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
     """All ways to render that lose no light which ``full`` finds."""
+
+    def lost_without_arrival(plan):
+        """A small lens is a poor finder of what t = 0 alone finds: it does not stand for connections."""
+        return lost_paths(world, replace(plan, arrival=False), settings)
+
     found = []
-    lost = lost_paths(world, full, settings)
+    lost = lost_without_arrival(full)
     # A sensor with area sees delta emitters by light subpaths alone.
     tied = world.emitters.unhittable and not world.camera.delta and (full.endpoints or full.arrival)
     for number, weighting in enumerate(WEIGHTINGS):
@@ -215,10 +223,13 @@ def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
             continue
         kinds = ("one", "all") if weighting.inner else ("none",)
         example = Candidate(number, 1, kinds[0]).decided(0, 1, 0, 0)
-        if lost_paths(world, example.plan(full), settings) != lost:
+        if lost_without_arrival(example.plan(full)) != lost:
             continue
-        # A coefficient beyond the count is of no use.
-        counts = [n for n in SERVED if weighting.light * n <= 1] if weighting.light else [1]
+        # A coefficient beyond the count is of no use; where there are few pixels, the camera subpaths that a
+        # light subpath serves are correlated.
+        most = 1 / weighting.light if weighting.light else 1
+        few = world.camera.region.size.prod() < FEW_PIXELS
+        counts = [n for n in SERVED if n <= (1 if few else most)]
         found += [Candidate(number, served, kind) for served in counts for kind in kinds]
     return found
 
@@ -253,13 +264,14 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
 
 
 def _robust_mean(values):
-    """Mean over the groups (rows) without the quarter of them that is worst for all candidates (columns)
-    together: an outlier that no candidate does anything about hides how they differ."""
+    """Mean over the groups (rows) without the quarter of them that is worst even for the candidate (column)
+    that suffers least there: an outlier that no candidate does anything about hides how they differ. (What
+    only some suffer from, such as path tracing from a caustic, has to count.)"""
     finite = np.isfinite(values).all(axis=0)
     if not finite.any():
         return values.mean(axis=0)
-    usual = values[:, finite] / np.maximum(values[:, finite].mean(axis=0), LEAST_VARIANCE)
-    order = np.argsort(usual.mean(axis=1))
+    usual = values[:, finite] / np.maximum(np.median(values[:, finite], axis=0), LEAST_VARIANCE)
+    order = np.argsort(usual.min(axis=1), kind="stable")
     return values[order[: len(order) * 3 // 4]].mean(axis=0)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from . import bsdf, connect, mis, rays
+from . import bsdf, connect, mis, rays, sobol
 from .plan import MAX_STORED, UNLIMITED
 from .points import Points, Purpose
 from .subpath import Side, Walk, random_walk
@@ -65,7 +65,8 @@ class Shared:
 @dataclass(frozen=True)
 class Batch:
     """The samples of one pass: pixels ``first_pixel`` and on, ``pixels`` of them (row by row in
-    the film region, each ``stride``-th), samples ``first_sample`` and on, ``samples`` of each pixel."""
+    the film region, one by chance of each ``stride``), samples ``first_sample`` and on, ``samples`` of
+    each pixel."""
 
     first_pixel: int
     pixels: int
@@ -180,14 +181,17 @@ class _Places:
     def __init__(self, kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
-        self._stride = dr.opaque(mi.UInt32, batch.stride)
+        self._stride = dr.opaque(mi.UInt32, batch.stride) if batch.stride > 1 else None
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
         self._spp = dr.opaque(mi.UInt64, spp)
 
     def _split(self, slot):
         pixel = slot // self._samples
-        return pixel * self._stride + self._first_pixel, slot - pixel * self._samples + self._first_sample
+        sample = slot - pixel * self._samples + self._first_sample
+        if self._stride is not None:  # not the same one of each: strides that divide the width miss columns
+            pixel = pixel * self._stride + sobol.mix(pixel + 1) % self._stride
+        return pixel + self._first_pixel, sample
 
     def index(self, slot):
         pixel, sample = self._split(slot)

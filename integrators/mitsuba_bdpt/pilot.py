@@ -21,7 +21,6 @@ candidates; how much is not asked.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -37,6 +36,9 @@ TILES = 8
 
 # Independent parts of the pilot, among which outliers are looked for.
 GROUPS = 16
+
+# Emitters count where they are seen directly if they are smaller than so many pixels over their probability.
+SMALL = 0.25
 
 # Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
 PER_PIXEL = 2
@@ -91,8 +93,9 @@ class Moments:
 
     ``base``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): variance is ``base`` + S
     ``light``, plus ``draw`` where one inner connection is drawn. ``mean`` of the image (mean of the
-    colours, emitters seen directly left out); ``rays`` and connections per camera sample and kind, with one
-    light subpath each; ``lanes``: number of camera samples.
+    colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
+    ``rays`` and connections per camera sample and kind, with one light subpath each; ``lanes``: number of
+    camera samples.
     """
 
     base: np.ndarray
@@ -129,6 +132,7 @@ class Pilot:
 
     def __init__(self, region, lanes: int):
         self._region, self._lanes = region, lanes
+        self._pixels = dr.opaque(mi.Float, float(region.size.prod()))
         self._samples = dr.zeros(mi.Float, lanes * _COLUMNS)
         self._splats = dr.zeros(mi.Float, GROUPS * TILES**2 * _SPLAT_COLUMNS)
         dr.make_opaque(self._samples, self._splats)
@@ -145,7 +149,7 @@ class Pilot:
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2."""
-        size = _size(c)
+        size = self._size(c)
         parts = _parts(size, c.shares)
         own = c.kind
         estimates = [
@@ -165,7 +169,7 @@ class Pilot:
         def body(slot, total, before, after, nonzero):
             y = connect.read_light_vertex(kernel, lane.path, slot)
             c = connect.inner(kernel, z, y)
-            size = _size(c)
+            size = self._size(c)
             nonzero = nonzero + dr.select(c.active, mi.UInt32(1), 0)
             ray = rays.segment(z.anchor, y.anchor, z.si)
             c.active = c.active & ~rays.occluded(kernel.scene, ray, c.active)
@@ -191,7 +195,7 @@ class Pilot:
 
     def splat(self, kernel, c, position, shared, counters):
         """Add a contribution with t <= 1."""
-        size = _size(c)
+        size = self._size(c)
         row = self._group(dr.arange(mi.UInt32, self._lanes)) * TILES**2 + self._tile(position)
         values = [size]
         for part in _parts(size, c.shares):
@@ -227,6 +231,8 @@ class Pilot:
         in_tile = np.maximum(np.bincount(tiles, minlength=TILES**2), 1)
         brightness = np.bincount(tiles, estimate[:, -1], TILES**2) / in_tile
         brightness += splats[:, :, 0].sum(axis=0) * (TILES**2 / lanes)
+        by_group = np.stack([estimate[group == g, -1].sum() + splats[g, :, 0].sum() for g in range(GROUPS)])
+        by_group *= GROUPS / lanes
         norm = brightness**2 + 0.01 * brightness.mean() ** 2
         norm = np.where(norm > 0, norm, np.inf)
 
@@ -243,10 +249,22 @@ class Pilot:
             base=summed(base, splat_base),
             light=summed(light, splat_light),
             draw=summed(draw),
-            mean=float(brightness.mean()),
+            mean=float(np.median(by_group)),
             rays={name: count / lanes for name, count in counts.items()} | {"joined": joined.mean()},
             lanes=lanes,
         )
+
+    def _size(self, c):
+        """Weighted size of a contribution: the mean of its colours, which adds up unlike the largest.
+
+        Emitters seen directly do not count, since they are bright and only their edges are noisy; but those
+        much smaller than a pixel do, which a camera subpath hardly hits and (1,1) always finds: the densities
+        of the two are as the emitter's pixels to those of the image times its probability.
+        """
+        directly = c.s + c.t == 2
+        counted = ~directly | (c.shares.x * self._pixels < SMALL)
+        size = dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
+        return dr.select(c.active & counted & dr.isfinite(size), size, 0)
 
     def _group(self, lane):
         return lane // PER_PIXEL % GROUPS
@@ -255,15 +273,6 @@ class Pilot:
         uv = dr.clip(self._region.to_uv(position), 0, 1)
         xy = dr.minimum(mi.Point2u(uv * TILES), TILES - 1)
         return xy.y * TILES + xy.x
-
-
-def pixel_stride(pixels: int, chosen: int, width: int) -> int:
-    """Distance between ``chosen`` of the image's ``pixels``, counted row by row, so that all columns have their
-    turn."""
-    stride = pixels // chosen
-    while math.gcd(stride, width) > 1:
-        stride -= 1
-    return stride
 
 
 def measure(world, plan, settings, seed, lanes: int) -> Moments:
@@ -281,8 +290,8 @@ def measure(world, plan, settings, seed, lanes: int) -> Moments:
     pixels = int(region.size.prod())
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
-    stride = pixel_stride(pixels, chosen, int(region.size[0]))
-    batch = Batch(stride // 2, chosen, 0, samples, stride)
+    stride = pixels // chosen
+    batch = Batch(0, chosen, 0, samples, stride)
     pilot = Pilot(region, chosen * samples)
     # Independent numbers: the squared mean follows from products of samples.
     counts = trace(kernel, pilot, batch, Points("independent", seed), samples)
@@ -305,13 +314,6 @@ class _Part:
     scale: object
     moment: object
     light: object
-
-
-def _size(c):
-    """Weighted size of a contribution: the mean of its colours, which adds up unlike the largest. Emitters
-    seen directly do not count: they are bright, and their edges as noisy in any way of rendering."""
-    size = dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
-    return dr.select(c.active & (c.s + c.t > 2) & dr.isfinite(size), size, 0)
 
 
 def _parts(size, shares):
