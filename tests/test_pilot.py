@@ -365,24 +365,3 @@ def test_outliers_of_all_do_not_count_and_of_one_do():
     values = np.ones((16, 45))
     values[5, :4] = 1000
     assert choice._robust_mean(values)[0] > 50 and choice._robust_mean(values)[9] == 1
-
-
-def test_small_lamps_in_sight():
-    """Rationale: (1,1) keeps lamps smaller than a pixel free of noise, path tracing alone hardly hits them.
-
-    Expected: with a hundred such lamps before a dark wall there are light subpaths.
-    """
-    lamps = {
-        f"lamp{i}": {
-            "type": "sphere",
-            "center": [0.2 * (i % 10) - 0.9, 0.15 * (i // 10) - 0.3, 0],
-            "radius": 0.0004,
-            "emitter": {"type": "area", "radiance": 1e5},
-        }
-        for i in range(100)
-    }
-    target = mi.load_dict({"type": "scene", "sensor": camera(128), **lamps})
-    integrator = bdpt(max_depth=2)
-    integrator.render(target, spp=32)
-    (made,) = integrator.statistics["decisions"]
-    assert made["light_paths"] > 0

@@ -37,9 +37,6 @@ TILES = 8
 # Independent parts of the pilot, among which outliers are looked for.
 GROUPS = 16
 
-# Emitters count where they are seen directly if they are smaller than so many pixels over their probability.
-SMALL = 0.25
-
 # Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
 PER_PIXEL = 2
 
@@ -132,7 +129,6 @@ class Pilot:
 
     def __init__(self, region, lanes: int):
         self._region, self._lanes = region, lanes
-        self._pixels = dr.opaque(mi.Float, float(region.size.prod()))
         self._samples = dr.zeros(mi.Float, lanes * _COLUMNS)
         self._splats = dr.zeros(mi.Float, GROUPS * TILES**2 * _SPLAT_COLUMNS)
         dr.make_opaque(self._samples, self._splats)
@@ -257,14 +253,12 @@ class Pilot:
     def _size(self, c):
         """Weighted size of a contribution: the mean of its colours, which adds up unlike the largest.
 
-        Emitters seen directly do not count, since they are bright and only their edges are noisy; but those
-        much smaller than a pixel do, which a camera subpath hardly hits and (1,1) always finds: the densities
-        of the two are as the emitter's pixels to those of the image times its probability.
+        Emitters seen directly do not count: relative to what is around them their edges would outweigh all
+        else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
+        (1,1) finds and path tracing alone hardly.
         """
-        directly = c.s + c.t == 2
-        counted = ~directly | (c.shares.x * self._pixels < SMALL)
         size = dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
-        return dr.select(c.active & counted & dr.isfinite(size), size, 0)
+        return dr.select(c.active & (c.s + c.t > 2) & dr.isfinite(size), size, 0)
 
     def _group(self, lane):
         return lane // PER_PIXEL % GROUPS
