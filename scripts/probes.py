@@ -43,10 +43,10 @@ print(*floor.measure(sys.argv[1], int(sys.argv[2])))
 
 def _printed(code, environment=None) -> float:
     """The last number that a new process prints."""
-    return _numbers(code, environment=environment)[-1]
+    return numbers(code, environment=environment)[-1]
 
 
-def _numbers(code, *arguments, environment=None) -> list[float]:
+def numbers(code, *arguments, environment=None) -> list[float]:
     """The numbers that a new process prints."""
     command = [sys.executable, "-c", code, *arguments]
     here = str(Path(__file__).parent)
@@ -84,7 +84,7 @@ def memory(rounds: int) -> dict:
 
 def kernel_floor(rounds: int) -> dict:
     """Kernel time over that of its rays alone, by scene, a value per round."""
-    return {name: _numbers(FLOOR, name, str(rounds)) for name in FLOOR_SCENES}
+    return {name: numbers(FLOOR, name, str(rounds)) for name in FLOOR_SCENES}
 
 
 PROBES = {"coldstart": coldstart, "memory": memory, "floor": kernel_floor}
