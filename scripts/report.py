@@ -173,9 +173,21 @@ def _pilot_share(row) -> float:
     return json.loads(row["statistics"])["seconds"]["pilot"] / row["seconds"]
 
 
+def _rays_per_sample(rows) -> str:
+    """Of the first render: closest hits, camera and light; shadow rays of s = 1, t = 1, inner connections."""
+    if not rows:
+        return "–"
+    samples = rows[0]["spp"] * rows[0]["width"] * rows[0]["height"]
+    kinds = (("camera", "light"), ("shadow_s1", "shadow_t1", "shadow_inner"))
+    return "; ".join(
+        " + ".join(f"{rows[0][f'rays_{kind}'] / samples:.2f}" for kind in group) for group in kinds
+    )
+
+
 def choices_table(results: Results) -> str:
-    """What the pilots chose, what they left out and why, and what they cost."""
+    """What the pilots chose, what they left out and why, and what they cost; rays per sample."""
     head = ["scene", "chosen (number of renders)", "left out in the first render", "share of the pilot"]
+    head += ["closest hits and shadow rays per sample", f"the same, {NONE}"]
     lines = []
     for scene in results.scenes:
         rows = results.of(scene, results.methods[0], results.deciding)
@@ -188,6 +200,8 @@ def choices_table(results: Results) -> str:
                 "; ".join(f"{text or 'no pilot'} ({count})" for text, count in chosen),
                 "; ".join(f"{s['class']}: {s['why']}" for s in left_out) or "–",
                 f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} %",
+                _rays_per_sample(rows),
+                _rays_per_sample(results.of(scene, NONE, results.deciding)),
             ]
         )
     return table(head, lines)

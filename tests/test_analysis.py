@@ -45,6 +45,10 @@ def row(method="bdpt", seed=1, **values):
         "first": "bdpt",
         "reference_sha256": "",
         "tile_means": list(TRUE),
+        "decisions": json.dumps([{"pass": 0, "light_paths": 0.25, "connections": "one"}]),
+        "statistics": json.dumps(
+            {"seconds": {"pilot": 0.02}, "skipped": [{"class": "t=0", "level": "impossible", "why": "x"}]}
+        ),
     }
     rays = {f"rays_{kind}": 640 for kind in ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")}
     return plain | rays | values
@@ -141,11 +145,13 @@ def results():
     rows = noisy("bdpt", 16) + noisy("path", 16, rel_mse=0.04, rel_mse_trimmed=0.04)
     rows += noisy("path multijitter", 16, rel_mse=0.016, rel_mse_trimmed=0.016)
     rows += noisy("bdpt skip=none", 16, seconds=3.0) + noisy("ptracer", 16, 0.5)
+    rows += noisy("bdpt skip=impossible", 16, seconds=1.5)
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
     values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}
     kept = {"mitsuba": "3.9.1", "source": "s", "machine": "a machine"}
     probes = {"coldstart": {"versions": kept, "values": values}}
+    probes["floor"] = {"versions": kept, "values": {"box": [1.4, 1.2, 1.3]}}
     return Results(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes)
 
 
@@ -217,7 +223,8 @@ def test_goals_stand_beside_what_is_measured(results):
         {"what": "none", "at_least": "2x", "measure": "against none"},
         {"what": "cold", "at_least": "4x", "measure": "coldstart"},
         {"what": "memory", "at_least": "1 GiB", "measure": "memory"},
-        {"what": "floor", "at_least": "1x"},
+        {"what": "floor", "at_least": "1x", "measure": "floor"},
+        {"what": "nothing", "at_least": "1x"},
         {"what": "dark", "at_least": "1x", "measure": "efficiency", "scene": "dark"},
     ]
     text = report.goals_table(results, goals)
@@ -228,7 +235,7 @@ def test_goals_stand_beside_what_is_measured(results):
         "0.96x",
         f"{near.replace('0.8', '2.0')} over path; {near} over path multijitter",
     ]
-    assert cells(text, "cost") == ["3x", "3x (3–3) / 1x (1–1)"]
+    assert cells(text, "cost") == ["3x", "3x (3–3) / 1.5x (1.5–1.5)"]
     assert cells(text, "alone") == [
         "1x",
         "fewer than two renders at 64 spp, fewer than two renders at 256 spp",
@@ -236,7 +243,8 @@ def test_goals_stand_beside_what_is_measured(results):
     assert cells(text, "none") == ["2x", "3x, 2 of 2 scenes"]
     assert cells(text, "cold") == ["4x", "4.00 s, 2x (2–2) `path`'s"]
     assert cells(text, "memory") == ["1 GiB", "not measured"]
-    assert cells(text, "floor") == ["1x", "not measured yet"]
+    assert cells(text, "floor") == ["1x", "1.3x (1.2–1.4) `box`"]
+    assert cells(text, "nothing") == ["1x", "not measured yet"]
     dark = cells(text, "dark")[1]
     assert dark.startswith("path: 9.8 % of the energy is missing")
     assert dark.endswith("(against their error all the same: 2x (2–2), 0.8x (0.8–0.8))")
@@ -251,6 +259,30 @@ def test_slopes_need_an_explanation():
             cells(report.checks_table(results, MADE, notes), "`box`")[2]
             == "-2.00 (-2.00 to -2.00)" + expected
         )
+
+
+def test_slopes_between_decisions():
+    """Rationale: budgets at which something else is skipped are not one method. Expected: said so."""
+    rows = runs("bdpt", 2, budget=4, spp=4, decisions="[]") + runs("bdpt", 2, rel_mse=0.02 / 256)
+    text = report.checks_table(Results(rows, {"box": KNOWN}, {}), MADE, {})
+    assert cells(text, "`box`")[2].endswith("(-2.00 to -2.00), between decisions")
+
+
+def test_choices_and_the_cost_of_the_pilot():
+    """Two renders chose light subpaths, one path tracing alone, which says why; 0.02 of 1 second."""
+    reason = {"class": "t<=1", "level": "not worth its cost here", "why": "1.5 times"}
+    alone = {
+        "decisions": json.dumps([{"light_paths": 0, "connections": "none"}]),
+        "statistics": json.dumps({"seconds": {"pilot": 0.02}, "skipped": [reason]}),
+    }
+    rows = [row(seed=1, **alone), row(seed=2), row(seed=3)]
+    results = Results(rows, {"box": KNOWN}, {})
+    found = cells(report.choices_table(results), "`box`")
+    assert found[0] == "light_paths=1/4, connections=one (2); light_paths=0, connections=none (1)"
+    assert found[1] == "t<=1: 1.5 times" and found[2] == "2.0 %"
+    assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and found[4] == "–"
+    rows = [row(), row(budget=256)]
+    assert report.GOALS["pilot"](Results(rows, {"box": KNOWN}, {}), "box") == "2.0 % of `box`"
 
 
 def test_what_a_biased_integrator_lacks_is_said():
@@ -273,6 +305,7 @@ def test_names_are_those_of_the_preset():
     assert names >= {
         *analysis.RIVALS,
         analysis.NONE,
+        analysis.IMPOSSIBLE,
         analysis.INDEPENDENT,
         analysis.ALONE,
         analysis.LIGHT_TRACER,
