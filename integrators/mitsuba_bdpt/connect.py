@@ -5,8 +5,8 @@ class's count, with the weight beside it; the two are multiplied in `Contributio
 Densities and cosines are geometric, throughputs contain everything up to and including the edge to
 the vertex. Equation numbers: Georgiev 2012, see `mis`.
 
-What a lane accumulates (``counters``, ``path``) is changed in place: these records are state of the
-loops around, and each statement binds a new array to a field.
+What a lane accumulates (``counters``, a dictionary, and ``path``) is changed in place: these are state of the
+loops around, and each statement binds a new array to a name.
 """
 
 from __future__ import annotations

@@ -300,6 +300,7 @@ class Render:
         count = choice.lanes(left * int(self.camera.region.size.prod()))
         if not (count and choice.is_open(self._full, self.settings)):
             return []
+        self._wait()  # earlier passes are not the pilot's time
         started, compiled = time.perf_counter(), self.compile_seconds
         self._pilots += 1
         seed = sequence_seed(self.seed, PILOT_SEQUENCE + self._pilots)

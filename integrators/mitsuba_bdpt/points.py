@@ -51,7 +51,8 @@ _SECOND = 0x85EBCA6B  # tells the second number of a pair from the first
 _KEY = 0x27D4EB2F  # keeps the key of sample 0 from being 0
 
 # Measured on a Cornell box: gains come from film, emission, first light sample and the first bounces;
-# beyond the third there are none, but telling these vertices apart would cost more.
+# beyond the third there are none, but telling these vertices apart would cost more. Roulette and the draw of
+# connections gain nothing there, and a factor of 4 in a closed room where they are all the noise there is.
 STRATIFIED = {
     "camera": {
         Purpose.FILM,
