@@ -1,12 +1,11 @@
 """Kernel time over its floor: the very rays of a pass, replayed by themselves.
 
-    python scripts/floor.py cornell_box many_lights veach_mis
+    python scripts/floor.py cornell_box uplight_room veach_mis
 
 The loops of a pass are run step by step, and every call that traces rays is kept: one per kind and bounce
 (and camera subpath of a light subpath), with the lanes' masks. Each is then replayed as a kernel of its own,
 closest hits with ``compute_surface_interaction``. The floor is the time of these kernels; the pass is
-measured as it is, one kernel, with the same plan and seed. Both sides alternate. (Scenes with `plastic` fail:
-its calls from Python cannot be run step by step.)
+measured as it is, one kernel, with the same plan and seed. Both sides alternate.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-FLOOR_SCENES = ("cornell_box", "many_lights", "veach_mis")
+FLOOR_SCENES = ("cornell_box", "uplight_room", "veach_mis")
 
 COLD = """
 import time; start = time.perf_counter()

@@ -834,3 +834,28 @@ def test_component_formats(component, tmp_path):
             rtol=1e-3,
             atol=1e-3,
         )
+
+
+@pytest.mark.parametrize("bsdf", ["plastic", "dielectric", "roughconductor"])
+def test_a_timed_sky_with_other_surfaces(bsdf):
+    """Rationale: step by step, calls of functions written in Python fail for `plastic` (its arrays have the
+    width of the lanes that meet it). Expected: the same brightness as path tracing alone, 5 %, and no error.
+    """
+    target = mi.load_dict(
+        {
+            "type": "scene",
+            "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(3)},
+            "ball": {"type": "sphere", "center": [0, 0.5, 0], "radius": 0.5, "bsdf": {"type": bsdf}},
+            "sky": {"type": "timed_sunsky", "to_world": T().rotate([1, 0, 0], -90)},
+            "sensor": {
+                "type": "perspective",
+                "to_world": T().look_at([0, 2, 4], [0, 0.3, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 16, "height": 16},
+            },
+        }
+    )
+    both, alone = (
+        np.array(mi.load_dict({"type": "bdpt", "max_depth": 4, **keys}).render(target, spp=256)).mean()
+        for keys in ({}, {"light_paths": 0})
+    )
+    assert both == pytest.approx(alone, rel=0.05)

@@ -24,9 +24,9 @@ LEAST_SAMPLES = 1 << 19
 
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
-# What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
-# it). Fitted to ten scenes on two cores: off by 17 % (root mean square) for the ratio of a candidate's time to
-# that of path tracing alone, which scripts/candidates.py shows.
+# What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs
+# to it). Fitted to ten scenes on two cores: off by 17 % (root mean square) for the ratio of a candidate's
+# time to that of path tracing alone, which scripts/candidates.py shows.
 COSTS = {
     "light_path": 1.0,  # to start a light subpath
     "light": 0.95,  # each of its rays

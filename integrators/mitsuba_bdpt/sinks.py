@@ -1,8 +1,8 @@
 """Where a kernel puts its contributions: into the image. (A pilot has another sink, see `pilot`.)
 
-A sink has ``alpha``, whether the last event of a camera subpath matters, and the methods of `Image`: ``begin``
-and ``add`` for what a camera subpath finds, ``connect`` for its inner connections, ``end`` when it is done,
-``splat`` for contributions with t <= 1.
+A sink has ``alpha``, whether the last event of a camera subpath matters, and the methods of `Image`:
+``begin`` and ``add`` for what a camera subpath finds, ``connect`` for its inner connections, ``end`` when it
+is done, ``splat`` for contributions with t <= 1.
 """
 
 from __future__ import annotations
