@@ -324,14 +324,11 @@ def _cost(results: Results, scene: str) -> str:
 
 
 def _pilot(results: Results, scene: str) -> str:
-    rows = results.of(scene, results.methods[0], 4 * results.deciding)
+    """At the deciding budget: in the committed rows of larger ones a second pilot waits for the pass before."""
+    rows = results.of(scene, results.methods[0], results.deciding)
     if not rows:
-        raise Refused(f"no render of {scene} at {4 * results.deciding} spp")
-    return ", ".join(
-        f"{100 * np.median([_pilot_share(row) for row in found]):.1f} % of `{name}`"
-        for name in results.scenes
-        if (found := results.of(name, results.methods[0], 4 * results.deciding))
-    )
+        raise Refused(f"no render of {scene} at {results.deciding} spp")
+    return f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} % at {results.deciding} spp"
 
 
 def _floor(results: Results) -> str:

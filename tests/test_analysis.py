@@ -281,8 +281,7 @@ def test_choices_and_the_cost_of_the_pilot():
     assert found[0] == "light_paths=1/4, connections=one (2); light_paths=0, connections=none (1)"
     assert found[1] == "t<=1: 1.5 times" and found[2] == "2.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and found[4] == "–"
-    rows = [row(), row(budget=256)]
-    assert report.GOALS["pilot"](Results(rows, {"box": KNOWN}, {}), "box") == "2.0 % of `box`"
+    assert report.GOALS["pilot"](results, "box") == "2.0 % at 64 spp"
 
 
 def test_what_a_biased_integrator_lacks_is_said():
