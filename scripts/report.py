@@ -324,7 +324,7 @@ def _cost(results: Results, scene: str) -> str:
 
 
 def _pilot(results: Results, scene: str) -> str:
-    """At the deciding budget: in the committed rows of larger ones a second pilot waits for the pass before."""
+    """At the deciding budget: in the committed rows of larger ones a second pilot waited for another pass."""
     rows = results.of(scene, results.methods[0], results.deciding)
     if not rows:
         raise Refused(f"no render of {scene} at {results.deciding} spp")

@@ -151,7 +151,7 @@ def test_an_arrival_is_a_start_in_reverse(name):
     if lens:  # nothing in between: what is there does not matter to the question
         pi = dr.zeros(mi.PreliminaryIntersection3f, COUNT)
         pi.t = mi.Float(dr.inf)
-    walk = SimpleNamespace(previous=p, ray=ray, pi=pi, active=mi.Bool(True))
+    walk = SimpleNamespace(previous=p, d=ray.d, pi=pi, active=mi.Bool(True))
     vertex = SimpleNamespace(si=si, cos=dr.abs(dr.dot(si.n, ray.d)), hit=si.is_valid())
     arrival = camera.arrive(walk, vertex, mi.Bool(False))
     active = column(dr.select(arrival.active, 1.0, 0.0)) > 0
