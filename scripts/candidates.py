@@ -44,13 +44,8 @@ SELECTION = (
 )
 
 
-def decision(share: float, connections: str, splat: float, mean: float) -> choice.Decision:
-    """The decision for an entry of `SELECTION`."""
-    return choice.Decision(0, share, connections, splat, 1.0, 1.0, 1.0, mean)
-
-
 def candidate(share: float, connections: str, splat: float) -> choice.Candidate:
-    """The same as one of the pilot's."""
+    """An entry of `SELECTION` as one of the pilot's."""
     inner = float(connections != "none")
     weighting = pilot.Weighting(1, 1, splat * share, inner)
     return choice.Candidate(pilot.WEIGHTINGS.index(weighting), round(1 / share) if share else 1, connections)
@@ -67,9 +62,9 @@ def predicted(scene, settings) -> pilot.Moments:
     return found
 
 
-def rendered(scene, depth: int, entry, mean: float, expected) -> tuple[float, float]:
+def rendered(scene, depth: int, way: choice.Candidate, mean: float, expected) -> tuple[float, float]:
     """Median of relMSE times samples, and of seconds per render, over `ROUNDS` renders after a first one."""
-    made = [decision(*entry, mean).record()]
+    made = [way.decided(0, 1.0, 1.0, mean).record()]
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": json.dumps(made)})
     errors, seconds = [], []
     for seed in range(ROUNDS + 1):
@@ -91,7 +86,7 @@ def lines(name: str, depth: int) -> list:
         share, connections, splat = entry
         way = candidate(*entry)
         base, light = moments.variance(connections == "one")[:, :, way.weighting].mean(axis=0)
-        error, seconds = rendered(scene, depth, entry, moments.mean, expected)
+        error, seconds = rendered(scene, depth, way, moments.mean, expected)
         alone = alone or seconds
         light *= way.served
         name_of_share = f"1/{way.served}" if share else "0"

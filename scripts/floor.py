@@ -66,7 +66,7 @@ def kernel_seconds(work) -> float:
 
 
 class Pass:
-    """One pass of a scene at 128^2, as a render of ``spp`` samples per pixel decides it."""
+    """One pass of a scene at 128^2, as a render of 64 samples per pixel decides it."""
 
     def __init__(self, name: str, parameters: dict):
         self._scene = reference.load_scene(name, resolution=128)
@@ -74,7 +74,6 @@ class Pass:
         integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
         self._render = bdpt.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
         self._render.decide()
-        self.plan = self._render.plan
         self._batch = bdpt.batches(self._render.camera, 0, SPP, integrator.settings)[0]
 
     def trace(self):

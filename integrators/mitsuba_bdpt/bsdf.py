@@ -62,9 +62,8 @@ def _ask(bsdf, question, *args):
     """All questions to a BSDF in one virtual call: its arguments go through memory."""
     if isinstance(bsdf, mi.BSDF):
         return question(bsdf, *args)
-    if not dr.flag(
-        dr.JitFlag.SymbolicCalls
-    ):  # run step by step, calls of functions of ours fail for `plastic`
+    # Run step by step, calls of functions of ours fail for `plastic`; its own methods do not.
+    if not dr.flag(dr.JitFlag.SymbolicCalls):
         return question(bsdf, *args)
     return dr.dispatch(bsdf, question, *args)
 

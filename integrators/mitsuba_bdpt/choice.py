@@ -284,13 +284,10 @@ def replayed(decision: Decision) -> list[dict]:
 def left_out(table: list[Choice]) -> list[dict]:
     """What the best of `choose` does without, and why, as in ``statistics["skipped"]``."""
     skipped = []
-    for name, has in (("t<=1", "light_paths"), ("inner", "inner")):
-
-        def does(candidate, has=has):
-            return candidate.light_paths > 0 if has == "light_paths" else candidate.connections != "none"
-
-        others = [row for row in table if does(row.candidate)]
-        if others and not does(table[0].candidate):
+    without = {"t<=1": lambda c: not c.light_paths, "inner": lambda c: c.connections == "none"}
+    for name, lacks in without.items():
+        others = [row for row in table if not lacks(row.candidate)]
+        if others and lacks(table[0].candidate):
             ratio = others[0].time / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
             skipped.append({"class": name, "level": "not worth its cost here", "why": why})

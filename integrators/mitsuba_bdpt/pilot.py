@@ -16,7 +16,7 @@ To the second moments come the products of different contributions within a came
 squared mean of the pixel, estimated without bias from two independent samples of it. The samples use
 neither roulette on connections nor the draw of one connection; what the draw adds to the variance is known
 from the unshadowed contributions. Points that are better than independent ones lower the variance of all
-candidates; how much is not asked.
+candidates; see `choice.STRATIFIED_SPLATS` for what that leaves to ask.
 """
 
 from __future__ import annotations
@@ -145,12 +145,11 @@ class Pilot:
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2."""
-        size = self._size(c)
-        parts = _parts(size, c.shares)
-        own = c.kind
-        estimates = [
-            dr.select(size > 0, w.of(own) * p.scale, 0) for w, p in zip(WEIGHTINGS, parts, strict=True)
-        ]
+        return self._added(c.kind, _parts(self._size(c), c.shares), total)
+
+    def _added(self, kind: str, parts, total):
+        """``total`` with the `_parts` of a contribution of a class of camera samples."""
+        estimates = [w.of(kind) * p.scale for w, p in zip(WEIGHTINGS, parts, strict=True)]
         return total | {
             "estimate": [a + b for a, b in zip(total["estimate"], estimates, strict=True)],
             "moment": [
@@ -168,11 +167,13 @@ class Pilot:
             size = self._size(c)
             nonzero = nonzero + dr.select(c.active, mi.UInt32(1), 0)
             ray = rays.segment(z.anchor, y.anchor, z.si)
-            c.active = c.active & ~rays.occluded(kernel.scene, ray, c.active)
-            drawn = [dr.select(size > 0, WEIGHTINGS[i].inner * p.scale, 0) for i, p in _inner_parts(size, c)]
+            visible = c.active & ~rays.occluded(kernel.scene, ray, c.active)
+            parts = _parts(size, c.shares)
+            drawn = [WEIGHTINGS[i].inner * parts[i].scale for i in _INNER]
             before = [a + b for a, b in zip(before, drawn, strict=True)]
-            after = [a + dr.select(c.active, b, 0) for a, b in zip(after, drawn, strict=True)]
-            return slot + 1, self.add(kernel, c, total, start, lane.shared), before, after, nonzero
+            after = [a + dr.select(visible, b, 0) for a, b in zip(after, drawn, strict=True)]
+            total = self._added(c.kind, [p.where(visible) for p in parts], total)
+            return slot + 1, total, before, after, nonzero
 
         candidates = connect.candidate_count(kernel, z, lane.path)
         none = [mi.Float(0) for _ in _INNER]
@@ -309,13 +310,13 @@ class _Part:
     moment: object
     light: object
 
+    def where(self, mask) -> _Part:
+        """The same where ``mask``, else nothing."""
+        return _Part(*(dr.select(mask, value, 0) for value in (self.scale, self.moment, self.light)))
+
 
 def _parts(size, shares):
     return [_part(w, size, shares) for w in WEIGHTINGS]
-
-
-def _inner_parts(size, c):
-    return [(i, _part(WEIGHTINGS[i], size, c.shares)) for i in _INNER]
 
 
 def _part(w: Weighting, size, shares) -> _Part:
@@ -327,7 +328,7 @@ def _part(w: Weighting, size, shares) -> _Part:
     # A path that the candidate cannot make at all rules it out.
     possible = total > 0
     return _Part(
-        scale=dr.select(possible, scale, 0),
+        scale=dr.select((size > 0) & possible, scale, 0),
         moment=dr.select(size > 0, dr.select(possible, dr.square(scale) * camera, dr.inf), 0),
         light=dr.select((size > 0) & possible, dr.square(scale) * _dot([0, 0, squares[2], 0], shares), 0),
     )

@@ -31,7 +31,7 @@ class Image:
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2 to the ``total`` of a camera subpath."""
         if kernel.strategy_images:
-            self._put_strategy(c, start.counted, c.weighted(), shared)
+            self._put_strategy(c, start.counted, shared)
         return total + c.weighted()
 
     def connect(self, kernel, z, lane, stream, counters, total, start):
@@ -51,7 +51,7 @@ class Image:
         counters["non_finite"] += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
         self._film.put_light(position, value, c.active & finite)
         if kernel.strategy_images:
-            self._put_strategy(c, position, c.weighted(), shared)
+            self._put_strategy(c, position, shared)
 
     def end(self, kernel, lane, sample, total, seen, counters):
         """Add a camera sample; without finite value it counts as zero."""
@@ -67,8 +67,8 @@ class Image:
         film.put_camera(start.counted, dr.select(finite, colours, 0), alpha, features, sample.covered)
         counters["non_finite"] += dr.select(sample.covered & ~finite, mi.UInt32(1), mi.UInt32(0))
 
-    def _put_strategy(self, c, position, weighted, shared):
-        weighted = self._film.colour(weighted * shared.weight, shared.wavelengths)
+    def _put_strategy(self, c, position, shared):
+        weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
         unweighted = self._film.colour(c.value * shared.weight, shared.wavelengths)
         finite = dr.all(dr.isfinite(weighted))
         self._film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
