@@ -331,7 +331,8 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
 def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
-    ``add(contribution, total)`` adds a contribution to the running ``total`` and returns it.
+    ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
+    ``visible``: it is active and nothing is in between.
     """
 
     def body(slot, total, nonzero):
@@ -339,8 +340,8 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
         c = inner(kernel, z, y)
         nonzero = nonzero + _one(c.active)
         ray = rays.segment(z.anchor, y.anchor, z.si)
-        c.active = c.active & ~rays.occluded(kernel.scene, ray, c.active)
-        return slot + 1, add(c, total), nonzero
+        visible = c.active & ~rays.occluded(kernel.scene, ray, c.active)
+        return slot + 1, add(c, visible, total), nonzero
 
     candidates = candidate_count(kernel, z, path)
     _, total, nonzero = dr.while_loop(

@@ -27,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import connect, mis, rays
+from . import connect, mis
 from .kernel import COUNTERS, Batch, Kernel, trace
 from .points import Points
 
@@ -65,23 +65,31 @@ class Weighting:
         return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
 
 
+# In this order: each class is in use from some weighting on.
 WEIGHTINGS = (
-    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 4, 1, 4)),
+    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 4, 1)),
     *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
     *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
 )
-_INNER = tuple(i for i, w in enumerate(WEIGHTINGS) if w.inner)
+_USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
 
 
 def _even(n: int) -> int:
     return n + n % 2
 
 
-# What a lane keeps: its estimate by each weighting; the estimate's square, less the squares of single
-# contributions, plus their second moments without t <= 1; those of t <= 1; and for each weighting with inner
-# connections what drawing one of them adds; then the number of its vertices that were joined, and its tile.
-_COLUMNS = _even(3 * len(WEIGHTINGS) + len(_INNER) + 2)
-_SPLAT_COLUMNS = _even(2 * len(WEIGHTINGS) + 1)
+# What a lane keeps: for each weighting its estimate, and the second moments of its contributions without
+# t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
+# with inner connections what drawing one adds; then the number of its vertices that were joined; its tile.
+_PARTS = {
+    "estimate": len(WEIGHTINGS),
+    "moment": len(WEIGHTINGS),
+    "light": _USERS["light"],
+    "draw": _USERS["inner"],
+}
+_COLUMNS = _even(sum(_PARTS.values()) + 2)
+# The size of splats, and their second moments without and by t <= 1.
+_SPLAT_COLUMNS = _even(1 + _PARTS["moment"] + _PARTS["light"])
 
 
 @dataclass(frozen=True)
@@ -135,77 +143,49 @@ class Pilot:
 
     def begin(self):
         """Nothing found yet."""
-        return {
-            "estimate": [mi.Float(0) for _ in WEIGHTINGS],
-            "moment": [mi.Float(0) for _ in WEIGHTINGS],
-            "light": [mi.Float(0) for _ in WEIGHTINGS],
-            "draw": [mi.Float(0) for _ in _INNER],
-            "joined": mi.UInt32(0),
-        }
+        return {name: _none(n) for name, n in _PARTS.items()} | {"joined": mi.UInt32(0)}
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2."""
-        return self._added(c.kind, _parts(self._size(c), c.shares), total)
-
-    def _added(self, kind: str, parts, total):
-        """``total`` with the `_parts` of a contribution of a class of camera samples."""
-        estimates = [w.of(kind) * p.scale for w, p in zip(WEIGHTINGS, parts, strict=True)]
-        return total | {
-            "estimate": [a + b for a, b in zip(total["estimate"], estimates, strict=True)],
-            "moment": [
-                a + p.moment - dr.square(b) for a, p, b in zip(total["moment"], parts, estimates, strict=True)
-            ],
-            "light": [a + p.light for a, p in zip(total["light"], parts, strict=True)],
-        }
+        own, moments = _parts(self._size(c), c)
+        new = {"estimate": own, **moments}
+        return total | {name: _sums(total[name], more) for name, more in new.items()}
 
     def connect(self, kernel, z, lane, stream, counters, total, start):
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
-        def body(slot, total, before, after, nonzero):
-            y = connect.read_light_vertex(kernel, lane.path, slot)
-            c = connect.inner(kernel, z, y)
+        def add(c, visible, total):
             size = self._size(c)
-            nonzero = nonzero + dr.select(c.active, mi.UInt32(1), 0)
-            ray = rays.segment(z.anchor, y.anchor, z.si)
-            visible = c.active & ~rays.occluded(kernel.scene, ray, c.active)
-            parts = _parts(size, c.shares)
-            drawn = [WEIGHTINGS[i].inner * parts[i].scale for i in _INNER]
-            before = [a + b for a, b in zip(before, drawn, strict=True)]
-            after = [a + dr.select(visible, b, 0) for a, b in zip(after, drawn, strict=True)]
-            total = self._added(c.kind, [p.where(visible) for p in parts], total)
-            return slot + 1, total, before, after, nonzero
+            own, _ = _parts(size, c)
+            own_visible, moments = _parts(dr.select(visible, size, 0), c)
+            new = {"before": own, "after": own_visible, **moments}
+            return {name: _sums(total[name], more) for name, more in new.items()}
 
-        candidates = connect.candidate_count(kernel, z, lane.path)
-        none = [mi.Float(0) for _ in _INNER]
-        _, total, before, after, nonzero = dr.while_loop(
-            (mi.UInt32(0), total, none, list(none), mi.UInt32(0)),
-            lambda slot, *_: slot < candidates,
-            body,
-            label="inner connections of a pilot",
-        )
-        counters["evaluated"] += candidates
-        counters["zero"] += candidates - nonzero
-        counters["shadow_inner"] += nonzero
-        draw = [d + a * (b - a) for d, b, a in zip(total["draw"], before, after, strict=True)]
-        joined = total["joined"] + dr.select(nonzero > 0, mi.UInt32(1), 0)
-        return total | {"draw": draw, "joined": joined}
+        before = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
+        found = {"before": _none(_PARTS["draw"]), "after": _none(_PARTS["draw"])}
+        found |= {name: total[name] for name in ("moment", "light")}
+        found = connect.connect_all(kernel, z, lane.path, counters, found, add)
+        shadowed, seen = found.pop("before"), found.pop("after")
+        # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
+        # sizes times that of the visible ones, where that of all connections is the square of the latter.
+        draw = [d + a * (b - a) for d, b, a in zip(total["draw"], shadowed, seen, strict=True)]
+        joined = total["joined"] + dr.select(counters["shadow_inner"] > before, mi.UInt32(1), 0)
+        # In the order of `begin`, as a loop's state has to be.
+        return total | found | {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
 
     def splat(self, kernel, c, position, shared, counters):
         """Add a contribution with t <= 1."""
         size = self._size(c)
         row = self._group(dr.arange(mi.UInt32, self._lanes)) * TILES**2 + self._tile(position)
-        values = [size]
-        for part in _parts(size, c.shares):
-            values += [part.moment, part.light]
-        _add(self._splats, _SPLAT_COLUMNS, values, row, size > 0)
+        _, moments = _parts(size, c)
+        _add(self._splats, _SPLAT_COLUMNS, [size, *moments["moment"], *moments["light"]], row, size > 0)
+        counters["non_finite"] += dr.select(c.active & ~dr.isfinite(_size(c)), mi.UInt32(1), 0)
 
     def end(self, kernel, lane, sample, total, seen, counters):
         """Add a camera sample."""
-        columns = []
-        for estimate, moment, light in zip(total["estimate"], total["moment"], total["light"], strict=True):
-            columns += [estimate, dr.square(estimate) + moment, light]
+        columns = [x for name in _PARTS for x in total[name]]
         slot = dr.arange(mi.UInt32, self._lanes)
-        columns += [*total["draw"], mi.Float(total["joined"]), mi.Float(self._tile(sample.start.position))]
+        columns += [mi.Float(total["joined"]), mi.Float(self._tile(sample.start.position))]
         _add(self._samples, _COLUMNS, columns, slot, sample.covered)
 
     def evaluate(self, counts):
@@ -216,49 +196,47 @@ class Pilot:
         """What was found; ``counts`` what the lanes counted."""
         lanes = self._lanes
         samples = np.array(self._samples, dtype=np.float64).reshape(lanes, _COLUMNS)
-        n = 3 * len(WEIGHTINGS)
-        joined, tiles = samples[:, n + len(_INNER)], samples[:, n + len(_INNER) + 1].astype(int)
         splats = np.array(self._splats, dtype=np.float64).reshape(GROUPS, TILES**2, _SPLAT_COLUMNS)
-        estimate, square, light = samples[:, :n:3], samples[:, 1:n:3], samples[:, 2:n:3]
+        ends = np.cumsum([*_PARTS.values(), 2]).tolist()
+        estimate, moment, light, draw, rest = np.split(samples[:, : ends[-1]], ends[:-1], axis=1)
+        joined, tiles = rest[:, 0], rest[:, 1].astype(int)
         other = estimate.reshape(-1, PER_PIXEL, len(WEIGHTINGS))[:, ::-1].reshape(lanes, -1)
-        with np.errstate(invalid="ignore"):
-            base = square - estimate * other
         group = self._group(np.arange(lanes))
         # Camera samples over those of the tile, splats over the samples of an average tile.
         in_tile = np.maximum(np.bincount(tiles, minlength=TILES**2), 1)
         brightness = np.bincount(tiles, estimate[:, -1], TILES**2) / in_tile
         brightness += splats[:, :, 0].sum(axis=0) * (TILES**2 / lanes)
-        by_group = np.stack([estimate[group == g, -1].sum() + splats[g, :, 0].sum() for g in range(GROUPS)])
-        by_group *= GROUPS / lanes
+        by_group = np.bincount(group, estimate[:, -1], GROUPS) + splats[:, :, 0].sum(axis=1)
         norm = brightness**2 + 0.01 * brightness.mean() ** 2
         norm = np.where(norm > 0, norm, np.inf)
 
-        def summed(values, of_splats=0):
+        def summed(values, of_splats=None):
+            """By group, one column per weighting: those that have no use for ``values`` come first."""
             weighted = values / norm[tiles][:, None]
+            # Lanes of a group lie `GROUPS` pixels apart.
             total = np.stack([weighted[group == g].sum(axis=0) for g in range(GROUPS)])
-            return (total + of_splats) * (GROUPS / lanes)
+            if of_splats is not None:
+                total += (of_splats / norm[:, None]).sum(axis=1)
+            return np.pad(total, ((0, 0), (len(WEIGHTINGS) - total.shape[1], 0))) * (GROUPS / lanes)
 
-        splat_base = (splats[:, :, 1 : 2 * len(WEIGHTINGS) : 2] / norm[:, None]).sum(axis=1)
-        splat_light = (splats[:, :, 2 : 2 * len(WEIGHTINGS) + 1 : 2] / norm[:, None]).sum(axis=1)
-        draw = np.zeros_like(estimate)
-        draw[:, _INNER] = samples[:, n : n + len(_INNER)]
+        end = 1 + _PARTS["moment"]
         return Moments(
-            base=summed(base, splat_base),
-            light=summed(light, splat_light),
+            base=summed(estimate**2 + moment - estimate * other, splats[:, :, 1:end]),
+            light=summed(light, splats[:, :, end : end + _PARTS["light"]]),
             draw=summed(draw),
-            mean=float(np.median(by_group)),
+            mean=float(np.median(by_group) * GROUPS / lanes),
             rays={name: count / lanes for name, count in counts.items()} | {"joined": joined.mean()},
             lanes=lanes,
         )
 
     def _size(self, c):
-        """Weighted size of a contribution: the mean of its colours, which adds up unlike the largest.
+        """Weighted size of a contribution that counts.
 
         Emitters seen directly do not count: relative to what is around them their edges would outweigh all
         else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
         (1,1) finds and path tracing alone hardly.
         """
-        size = dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
+        size = _size(c)
         return dr.select(c.active & (c.s + c.t > 2) & dr.isfinite(size), size, 0)
 
     def _group(self, lane):
@@ -301,43 +279,53 @@ def _add(target, columns: int, values, row, active):
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
 
 
-@dataclass
-class _Part:
-    """A contribution under a weighting: ``scale`` times the coefficient of its class is its estimate;
-    ``moment`` and ``light`` its second moment without and by t <= 1."""
-
-    scale: object
-    moment: object
-    light: object
-
-    def where(self, mask) -> _Part:
-        """The same where ``mask``, else nothing."""
-        return _Part(*(dr.select(mask, value, 0) for value in (self.scale, self.moment, self.light)))
+def _size(c):
+    """Mean of the colours of a contribution, which adds up unlike the largest."""
+    return dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
 
 
-def _parts(size, shares):
-    return [_part(w, size, shares) for w in WEIGHTINGS]
+def _none(n: int) -> list:
+    return [mi.Float(0) for _ in range(n)]
 
 
-def _part(w: Weighting, size, shares) -> _Part:
-    kappas = w.kappas
-    total = _dot(kappas, shares)
-    scale = size / total
-    squares = [k**2 for k in kappas]
-    camera = _dot([*squares[:2], 0, squares[3]], shares)
-    # A path that the candidate cannot make at all rules it out.
-    possible = total > 0
-    return _Part(
-        scale=dr.select((size > 0) & possible, scale, 0),
-        moment=dr.select(size > 0, dr.select(possible, dr.square(scale) * camera, dr.inf), 0),
-        light=dr.select((size > 0) & possible, dr.square(scale) * _dot([0, 0, squares[2], 0], shares), 0),
-    )
+def _sums(total: list, more: list) -> list:
+    """``total`` with ``more``, which has an entry for the last weightings only, added to these. What gets
+    nothing is left as it is: loops do not hold it, see `subpath.Walk`."""
+    first = len(total) - len(more)
+    return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 
 
-def _dot(weights, shares):
-    """sum_i weights_i shares_i."""
-    total = mi.Float(0)
-    for weight, share in zip(weights, shares, strict=True):
-        if weight:
-            total += weight * share
-    return total
+def _parts(size, c):
+    """A contribution ``c`` of this weighted ``size``: its estimates, of the weightings that have its class,
+    and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
+    # Where there is nothing, shares may be 0 / 0.
+    shares = dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
+    square, lost = dr.square(size), dr.select(size > 0, mi.Float(dr.inf), 0)
+    own, moments, lights = [], [], []
+    for w in WEIGHTINGS:
+        total = _dot(w, shares, 1)
+        # Whose class has a share of its own can make the path; a weighting that cannot is ruled out.
+        possible = mi.Bool(True) if w.inner else total > 0
+        scale = dr.rcp(total)
+        by_square = square * dr.square(scale)
+        moment = dr.select(possible, by_square * _dot(w, shares | {"light": 0}, 2), lost)
+        if w.of(c.kind):
+            estimate = size * scale * w.of(c.kind)
+            own.append(estimate)
+            if c.kind != "light":
+                moment -= dr.square(estimate)
+        moments.append(moment)
+        if w.light:
+            lights.append(dr.select(possible, by_square * (w.light**2 * shares["light"]), 0))
+    return own, {"moment": moments, "light": lights}
+
+
+def _dot(w: Weighting, shares, power: int):
+    """sum_i kappa_i^power share_i."""
+    terms = [(w.of(kind) ** power, share) for kind, share in shares.items()]
+    used = [
+        share if factor == 1 else factor * share
+        for factor, share in terms
+        if factor and not mis.is_absent(share)
+    ]
+    return sum(used[1:], used[0])

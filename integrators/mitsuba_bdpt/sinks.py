@@ -38,7 +38,8 @@ class Image:
         """Join the camera vertex ``z`` with the light vertices of its lane."""
         if kernel.plan.connections == "all":
 
-            def add(c, total):
+            def add(c, visible, total):
+                c.active = visible
                 return self.add(kernel, c, total, start, lane.shared)
 
             return connect.connect_all(kernel, z, lane.path, counters, total, add)
