@@ -153,8 +153,8 @@ def surface(draw, n: int, tilt: float = 0.0):
 
 def take_step(take, plugin, draw, si):
     """``take`` as a subpath calls it: `bsdf.sample` or `bsdf.sample_adjoint`."""
-    full, round_trip = bsdf.needs_full_pdf([plugin]), bsdf.needs_round_trip([plugin])
-    return take(plugin, si, draw.one(), draw.two(), mi.Bool(True), full, round_trip)
+    step, _ = take(plugin, si, draw.one(), draw.two(), mi.Bool(True), bsdf.Traits.of([plugin]))
+    return step
 
 
 def in_numpy(n, *values):

@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
-from mitsuba_bdpt import connect, emitters, kernel, mis, rays, sensor_records, sensors, sinks
+from mitsuba_bdpt import bsdf, connect, emitters, kernel, mis, rays, sensor_records, sensors, sinks
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coefficients, Paths
 
 # n c: all classes, kappa different from every count, and classes left out.
@@ -676,8 +676,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         emitters=Lights(world),
         plan=plan,
         heuristic=mis.Heuristic(name),
-        full_pdf=False,
-        round_trip=False,
+        traits=bsdf.Traits(full_pdf=False, round_trip=False),
         strategy_images=False,
         store_size=64,
         surfaces=True,

@@ -51,6 +51,29 @@ class Step:
     eta: object
 
 
+@dataclass(frozen=True)
+class Traits:
+    """What the BSDFs of a scene demand: `needs_full_pdf` and `needs_round_trip`."""
+
+    full_pdf: bool
+    round_trip: bool
+
+    @staticmethod
+    def of(bsdfs) -> Traits:
+        """Of BSDFs that one virtual call may visit."""
+        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs))
+
+
+@dataclass
+class Target:
+    """A local direction ``wo`` in which a BSDF is evaluated where ``active``; ``cos_ratio``, for light
+    vertices, |n.wo| / |n.wi| with the geometric normal."""
+
+    wo: object
+    active: object
+    cos_ratio: object = None
+
+
 def with_wi(si, wi):
     """A copy of ``si`` that is seen from ``wi``. (Assigning to ``si.wi`` changes aliases.)"""
     other = mi.SurfaceInteraction3f(si)
@@ -68,6 +91,18 @@ def _ask(bsdf, question, *args):
     return dr.dispatch(bsdf, question, *args)
 
 
+def _ask_both(bsdf, sampling, arguments, evaluating, target):
+    """Answers to ``sampling(bsdf, *arguments)`` and, if there is a ``target``, to ``evaluating``."""
+    if target is None:
+        return _ask(bsdf, sampling, *arguments), None
+    *_, active = arguments
+
+    def ask(self, wo, joined, si, u1, u2, sampled, _):
+        return sampling(self, si, u1, u2, sampled), evaluating(self, si, wo, joined)
+
+    return _ask(bsdf, ask, target.wo, target.active, *arguments, active | target.active)
+
+
 def connectible(bsdf):
     """Mask: the BSDF has a lobe that is not delta."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
@@ -75,13 +110,13 @@ def connectible(bsdf):
 
 def evaluate(bsdf, si, wo, active) -> Evaluation:
     """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
+    return Evaluation(*_ask(bsdf, _evaluated, si, wo, active))
 
-    def ask(self, si, wo, active):
-        ctx = mi.BSDFContext()
-        value, pdf_fwd_w = self.eval_pdf(ctx, si, wo, active)
-        return value, pdf_fwd_w, self.pdf(ctx, with_wi(si, wo), si.wi, active)
 
-    return Evaluation(*_ask(bsdf, ask, si, wo, active))
+def _evaluated(self, si, wo, active):
+    ctx = mi.BSDFContext()
+    value, pdf_fwd_w = self.eval_pdf(ctx, si, wo, active)
+    return value, pdf_fwd_w, self.pdf(ctx, with_wi(si, wo), si.wi, active)
 
 
 def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
@@ -90,16 +125,16 @@ def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
     ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal,
     which is computed unless given.
     """
-
-    def ask(self, si, wo, active):
-        ctx = mi.BSDFContext()
-        value, pdf_rev_w = self.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
-        return value, self.pdf(ctx, si, wo, active), pdf_rev_w
-
-    value, pdf_fwd_w, pdf_rev_w = _ask(bsdf, ask, si, wo, active)
+    value, pdf_fwd_w, pdf_rev_w = _ask(bsdf, _evaluated_adjoint, si, wo, active)
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
     return Evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
+
+
+def _evaluated_adjoint(self, si, wo, active):
+    ctx = mi.BSDFContext()
+    value, pdf_rev_w = self.eval_pdf(ctx, with_wi(si, wo), si.wi, active)
+    return value, self.pdf(ctx, si, wo, active), pdf_rev_w
 
 
 def geometric_cos(si, w):
@@ -107,11 +142,11 @@ def geometric_cos(si, w):
     return dr.abs(dr.dot(si.n, si.to_world(w)))
 
 
-def sample(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -> Step:
-    """Continue a camera subpath. ``u1`` picks the lobe, ``u2`` the direction.
+def sample(bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None):
+    """Continue a camera subpath where ``active``: the `Step`. ``u1`` picks the lobe, ``u2`` the direction.
 
-    ``full_pdf`` asks pdf() instead of trusting sample(), see `needs_full_pdf`; ``round_trip`` see
-    `needs_round_trip`.
+    With a ``target`` also its `Evaluation`, in the same virtual call: what a call takes is mostly to hand
+    over the interaction. Returns both, None for the latter without a target.
     """
 
     def ask(self, si, u1, u2, active):
@@ -119,23 +154,25 @@ def sample(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -
         bs, weight = self.sample(ctx, si, u1, u2, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         smooth = active & ~delta
-        pdf_fwd_w = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
+        pdf_fwd_w = self.pdf(ctx, si, bs.wo, smooth) if traits.full_pdf else bs.pdf
         pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
         reversible = mi.Bool(True)
-        if round_trip:
+        if traits.round_trip:
             back, _ = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Importance)
             reversible = ~delta | back
         return bs, weight, pdf_fwd_w, pdf_rev_w, reversible
 
-    bs, weight, pdf_fwd_w, pdf_rev_w, reversible = _ask(bsdf, ask, si, u1, u2, active)
+    sampled, evaluated = _ask_both(bsdf, ask, (si, u1, u2, active), _evaluated, target)
+    bs, weight, pdf_fwd_w, pdf_rev_w, reversible = sampled
     step = _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
-    if round_trip:  # no alternative that would have to make this event from the other side
+    if traits.round_trip:  # no alternative that would have to make this event from the other side
         step.cos_out = dr.select(reversible, step.cos_out, 0)
-    return step
+    return step, Evaluation(*evaluated) if target else None
 
 
-def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = False) -> Step:
-    """Continue a light subpath; the adjoint factor is part of ``weight``. Arguments as `sample`."""
+def sample_adjoint(bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None):
+    """Continue a light subpath; the adjoint factor is part of ``weight``, and of the evaluation's ``value``.
+    Arguments and results as of `sample`."""
 
     def ask(self, si, u1, u2, active):
         bs, mitsuba_weight = self.sample(mi.BSDFContext(mi.TransportMode.Importance), si, u1, u2, active)
@@ -143,9 +180,9 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
         smooth = active & ~delta
         ctx = mi.BSDFContext()
         value, pdf_rev_w = self.eval_pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
-        pdf_fwd_w = self.pdf(ctx, si, bs.wo, smooth) if full_pdf else bs.pdf
+        pdf_fwd_w = self.pdf(ctx, si, bs.wo, smooth) if traits.full_pdf else bs.pdf
         delta_weight = mitsuba_weight
-        if round_trip:  # the radiance that a camera subpath carries, without its factor eta^-2
+        if traits.round_trip:  # the radiance that a camera subpath carries, without its factor eta^-2
             back, weight = _back(self, si, bs, u1, u2, active & delta, mi.TransportMode.Radiance)
             delta_weight = dr.select(back, weight / dr.square(bs.eta), 0)
         # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
@@ -153,10 +190,15 @@ def sample_adjoint(bsdf, si, u1, u2, active, full_pdf: bool, round_trip: bool = 
         weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd_w)
         return bs, dr.select(rejected, 0, weight), pdf_fwd_w, pdf_rev_w
 
-    bs, weight, pdf_fwd_w, pdf_rev_w = _ask(bsdf, ask, si, u1, u2, active)
+    sampled, evaluated = _ask_both(bsdf, ask, (si, u1, u2, active), _evaluated_adjoint, target)
+    bs, weight, pdf_fwd_w, pdf_rev_w = sampled
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
     weight = dr.select(is_zero(weight), 0, weight * cos_ratio)
-    return _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
+    step = _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
+    if target is None:
+        return step, None
+    value, pdf_fwd_w, pdf_rev_w = evaluated
+    return step, Evaluation(value * target.cos_ratio, pdf_fwd_w, pdf_rev_w)
 
 
 def brightest(value):

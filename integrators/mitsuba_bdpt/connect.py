@@ -141,18 +141,21 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active, shares, "hit")
 
 
-def next_event(kernel, z: Vertex, stream, counters) -> Contribution:
-    """s = 1: an emitter is sampled for the camera vertex (eqs. 44, 45)."""
-    h = kernel.heuristic
-    k = z.edges + 1
-    active = z.hit & (k <= kernel.max_depth) & bsdf.connectible(z.bsdf)
+def choose_emitter(kernel, z: Vertex, stream):
+    """Sample an emitter for the camera vertex ``z``: an `emitters.Direct` and the `bsdf.Target` in which it
+    lies."""
+    active = z.hit & (z.edges + 1 <= kernel.max_depth) & bsdf.connectible(z.bsdf)
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
     e = kernel.emitters.sample_direct(z.si, u, active)
-    active &= e.pdf_w > 0
-    wo = z.si.to_local(e.d)
-    f = bsdf.evaluate(z.bsdf, z.si, wo, active)
+    return e, bsdf.Target(z.si.to_local(e.d), active & (e.pdf_w > 0))
+
+
+def next_event(kernel, z: Vertex, counters) -> Contribution:
+    """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
+    h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.joinable
+    k = z.edges + 1
     value = z.throughput * f.value * e.weight
-    active &= ~bsdf.is_zero(value)
+    active = active & ~bsdf.is_zero(value)
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
     older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
@@ -218,24 +221,28 @@ def join_endpoints(kernel, emission, stream, counters, active):
     return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active, shares, "light"), join.position
 
 
-def splat(kernel, y: Vertex, stream, counters):
-    """t = 1: a light vertex seen by the sensor (eqs. 46, 47).
-
-    Returns the `Contribution` and the film position.
-    """
-    h, scene = kernel.heuristic, kernel.scene
+def look_at_sensor(kernel, y: Vertex, stream):
+    """Join the light vertex ``y`` with the sensor: what `Sensor.join` returns, and the `bsdf.Target` in which
+    that lies."""
     active = y.hit & bsdf.connectible(y.bsdf) & (y.edges <= kernel.last_splat)
     join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.edges))
     active &= join.valid
     if kernel.plan.hide_emitters:
         active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)
-    wo = y.si.to_local(join.d)
-    cos = dr.abs(dr.dot(y.si.n, join.d))
-    f = bsdf.evaluate_adjoint(y.bsdf, y.si, wo, active, cos / y.cos)
-    to_area = cos / join.dist2
+    cos_ratio = dr.abs(dr.dot(y.si.n, join.d)) / y.cos
+    return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
+
+
+def splat(kernel, y: Vertex, stream, counters):
+    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47).
+
+    Returns the `Contribution` and the film position.
+    """
+    h, scene, join, f = kernel.heuristic, kernel.scene, y.endpoint, y.f
+    to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
-    active &= ~bsdf.is_zero(value)
+    active = y.joinable & ~bsdf.is_zero(value)
 
     newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)

@@ -83,7 +83,7 @@ class Kernel:
         self.plan, self.heuristic = plan, heuristic
         self.quadrics = world.emitters.quadrics
         self.surfaces, self.refracts = world.surfaces, world.refracts
-        self.full_pdf, self.round_trip = world.full_pdf, world.round_trip
+        self.traits = world.traits
         depth = min(settings.max_depth, UNLIMITED)
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
@@ -258,6 +258,7 @@ def _light_subpath(kernel, sink, stream, shared, path):
         kernel.last_light,
         kernel.kappa.direct,
         complete=lambda si, first: emitters.connection_density(e, si, first),
+        join=(lambda y: connect.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
     )
 
     def visit(vertex, state, walk):
@@ -314,7 +315,7 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
                 label="s = 0",
             )
         if plan.direct:
-            c = connect.next_event(kernel, z, stream, counters)
+            c = connect.next_event(kernel, z, counters)
             total = sink.add(kernel, c, total, start, shared)
         if plan.connections != "none":
             total = sink.connect(kernel, z, lane, stream, counters, total, start)
@@ -329,6 +330,7 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
         kernel.kappa.splat,
         alpha=sink.alpha,
         parallel=kernel.camera.parallel,
+        join=(lambda z: connect.choose_emitter(kernel, z, stream)) if plan.direct else None,
     )
     state = (sink.begin(), _zeros(*_counted_by_camera(plan)))
     (total, counted), walk = random_walk(kernel, side, walk, stream, visit, state)

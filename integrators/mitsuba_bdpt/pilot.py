@@ -300,23 +300,23 @@ def _parts(size, c):
     and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
     # Where there is nothing, shares may be 0 / 0.
     shares = dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
-    square, lost = dr.square(size), dr.select(size > 0, mi.Float(dr.inf), 0)
+    lost = dr.select(size > 0, mi.Float(dr.inf), 0)
     own, moments, lights = [], [], []
     for w in WEIGHTINGS:
         total = _dot(w, shares, 1)
         # Whose class has a share of its own can make the path; a weighting that cannot is ruled out.
         possible = mi.Bool(True) if w.inner else total > 0
-        scale = dr.rcp(total)
-        by_square = square * dr.square(scale)
-        moment = dr.select(possible, by_square * _dot(w, shares | {"light": 0}, 2), lost)
+        scale = size / total
+        square = dr.square(scale)
+        moment = dr.select(possible, square * _dot(w, shares | {"light": 0}, 2), lost)
         if w.of(c.kind):
-            estimate = size * scale * w.of(c.kind)
+            estimate = scale if w.of(c.kind) == 1 else w.of(c.kind) * scale
             own.append(estimate)
             if c.kind != "light":
                 moment -= dr.square(estimate)
         moments.append(moment)
         if w.light:
-            lights.append(dr.select(possible, by_square * (w.light**2 * shares["light"]), 0))
+            lights.append(dr.select(possible, square * (w.light**2 * shares["light"]), 0))
     return own, {"moment": moments, "light": lights}
 
 

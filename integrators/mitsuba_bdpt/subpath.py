@@ -68,7 +68,8 @@ class Walk:
 class Vertex:
     """A vertex that a walk has reached; ``partial`` is in the area measure (camera subpaths that
     left the scene: solid angle). ``cos`` absolute geometric cosine of the edge to it; ``anchor``
-    starts rays; ``hit`` is false in the surroundings."""
+    starts rays; ``hit`` is false in the surroundings; ``endpoint`` with which it is to be joined and ``f``
+    the BSDF towards it (a `bsdf.Evaluation`), where ``joinable``, see `Side`."""
 
     si: object
     bsdf: object
@@ -81,6 +82,9 @@ class Vertex:
     seen: object
     hit: object
     active: object
+    endpoint: object = None
+    joinable: object = None
+    f: object = None
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,7 @@ class Side:
     complete: object = None
     alpha: bool = False
     parallel: bool = False
+    join: object = None
 
 
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
@@ -114,8 +119,9 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
 
     def body(walk, state):
         vertex = _arrive(kernel, side, walk)
+        step = _interact(kernel, side, walk, vertex, stream)
         state = visit(vertex, state, walk)
-        return _leave(kernel, side, walk, vertex, stream), state
+        return _leave(kernel, side, walk, vertex, step, stream), state
 
     walk, state = dr.while_loop(
         (walk, state),
@@ -168,19 +174,38 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
     )
 
 
-def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
-    """Sample the next edge and trace it."""
+def _interact(kernel, side: Side, walk: Walk, vertex: Vertex, stream):
+    """Sample the direction of the next edge, and put into ``vertex`` what joins it with an endpoint."""
     if not kernel.surfaces:  # a virtual call needs somebody to call
-        return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
-    points, h = kernel.points, kernel.heuristic
-    si = vertex.si
-    active = vertex.hit & (walk.edges < side.last_edge)
-    # `path` samples at the last vertex too: alpha is 1 unless that event is null.
-    sampled = vertex.hit if side.alpha else active
+        return None
+    points, si = kernel.points, vertex.si
+    target = None
+    if side.join is not None:
+        vertex.endpoint, target = side.join(vertex)
+        vertex.joinable = target.active
     u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
     take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
-    step = take(vertex.bsdf, si, u1, u2, sampled, kernel.full_pdf, kernel.round_trip)
+    sampled = _is_sampled(side, walk, vertex)
+    step, vertex.f = take(vertex.bsdf, si, u1, u2, sampled, kernel.traits, target)
+    return step
+
+
+def _goes_on(side: Side, walk: Walk, vertex: Vertex):
+    return vertex.hit & (walk.edges < side.last_edge)
+
+
+def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
+    """`path` samples at the last vertex too: alpha is 1 unless that event is null."""
+    return vertex.hit if side.alpha else _goes_on(side, walk, vertex)
+
+
+def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
+    """Take the sampled ``step`` and trace the next edge."""
+    if step is None:
+        return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
+    points, h, si = kernel.points, kernel.heuristic, vertex.si
+    active = _goes_on(side, walk, vertex)
     coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
@@ -196,7 +221,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, stream) -> Walk:
     throughput = dr.select(playing, throughput / survive, throughput)
     active &= ~playing | (u < survive)
 
-    seen = walk.seen | (sampled & ~step.null)
+    seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.like)
     return Walk(
         pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),

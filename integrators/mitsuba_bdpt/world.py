@@ -14,7 +14,7 @@ class World:
     """A scene seen by one of its sensors; lives for one render.
 
     ``emitters`` and ``camera`` are the two kinds of endpoints, ``smooth``, ``delta`` and ``refracts``:
-    whether some BSDF has such a lobe; ``full_pdf`` and ``round_trip`` see `bsdf.sample`.
+    whether some BSDF has such a lobe; ``traits`` see `bsdf.Traits`.
     """
 
     def __init__(self, scene, sensor):
@@ -26,8 +26,7 @@ class World:
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
         self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
-        self.full_pdf = bsdf.needs_full_pdf(found)
-        self.round_trip = bsdf.needs_round_trip(found)
+        self.traits = bsdf.Traits.of(found)
 
 
 def _bsdfs(scene):
