@@ -210,11 +210,13 @@ class Pilot:
         norm = brightness**2 + 0.01 * brightness.mean() ** 2
         norm = np.where(norm > 0, norm, np.inf)
 
+        whole = -(-lanes // (GROUPS * PER_PIXEL)) * GROUPS * PER_PIXEL
+
         def summed(values, of_splats=None):
             """By group, one column per weighting: those that have no use for ``values`` come first."""
-            weighted = values / norm[tiles][:, None]
-            # Lanes of a group lie `GROUPS` pixels apart.
-            total = np.stack([weighted[group == g].sum(axis=0) for g in range(GROUPS)])
+            weighted = np.zeros((whole, values.shape[1]))
+            weighted[:lanes] = values / norm[tiles][:, None]
+            total = weighted.reshape(-1, GROUPS, PER_PIXEL, values.shape[1]).sum(axis=(0, 2))  # see `_group`
             if of_splats is not None:
                 total += (of_splats / norm[:, None]).sum(axis=1)
             return np.pad(total, ((0, 0), (len(WEIGHTINGS) - total.shape[1], 0))) * (GROUPS / lanes)
