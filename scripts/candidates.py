@@ -85,7 +85,9 @@ def lines(name: str, depth: int) -> list:
     for entry in SELECTION:
         share, connections, splat = entry
         way = candidate(*entry)
-        base, light = moments.variance(connections == "one")[:, :, way.weighting].mean(axis=0)
+        base, light = moments.variance(moments.draw if connections == "one" else 0)[:, :, way.weighting].mean(
+            axis=0
+        )
         error, seconds = rendered(scene, depth, way, moments.mean, expected)
         alone = alone or seconds
         light *= way.served

@@ -132,7 +132,7 @@ def test_predicted_variance(make, name):
     hidden = {"hide_emitters": True, "points": "independent"}
     found = moments_of(target, 1 << 14, rounds=8, **hidden)
     number = pilot.WEIGHTINGS.index(weighting)
-    base, light = found.variance(connections == "one")[:, :, number].mean(axis=0)
+    base, light = found.variance(found.draw if connections == "one" else 0)[:, :, number].mean(axis=0)
     predicted = base + served * light
     integrator = forced(decision(weighting, served, connections), **hidden)
     images = np.stack(

@@ -110,11 +110,11 @@ class Kernel:
         """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
         return k <= self._reach
 
-    def set_threshold(self, mean):
-        """Contributions below a tenth of the image's mean play roulette (a power of two, so that
-        the order of atomic sums rarely changes a decision). ``mean``: ``Float64`` of width 1."""
-        rounded = dr.exp2(dr.round(dr.log2(0.1 * mean)))
-        self.inverse_threshold = mi.Float(dr.select(mean > 0, dr.rcp(rounded), dr.inf))
+    def set_threshold(self, size):
+        """Contributions below this size play roulette (a power of two near it, so that the order of atomic
+        sums rarely changes a decision), none if it is 0. ``size``: ``Float64`` of width 1."""
+        rounded = dr.exp2(dr.round(dr.log2(size)))
+        self.inverse_threshold = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
         dr.eval(self.inverse_threshold)
 
 

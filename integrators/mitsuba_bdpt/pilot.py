@@ -110,10 +110,11 @@ class Moments:
     rays: dict
     lanes: int
 
-    def variance(self, drawn: bool, factor: float = 1.0) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, and what
-        grows with it, that of splats. The latter counts by ``factor``, for points that lower it less."""
-        return np.stack([self.base + (self.draw if drawn else 0), factor * self.light], axis=1)
+    def variance(self, draw, factor: float = 1.0) -> np.ndarray:
+        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, ``draw``
+        (`Moments.draw`, or 0 for all connections) included, and what grows with it, that of splats. This
+        counts by ``factor``, for points that lower it less."""
+        return np.stack([self.base + draw, factor * self.light], axis=1)
 
     def joined(self, other: Moments) -> Moments:
         """This pilot and another, of which each counts by its number of ``lanes``."""
