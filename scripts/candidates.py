@@ -25,8 +25,7 @@ import mitsuba as mi  # isort: skip
 import drjit as dr
 import metrics
 import reference
-from mitsuba_bdpt import choice, pilot
-from mitsuba_bdpt import integrator as bdpt
+from mitsuba_bdpt import choice, pilot, rendering
 
 RESOLUTION, SPP, LANES, ROUNDS = 128, 64, 1 << 15, 4
 
@@ -53,7 +52,7 @@ def candidate(share: float, connections: str, splat: float) -> choice.Candidate:
 
 def predicted(scene, settings) -> pilot.Moments:
     """What several pilots of the scene find."""
-    render = bdpt.Render(scene, scene.sensors()[0], settings, 1, SPP)
+    render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     found = None
     for number in range(ROUNDS):
         seed = dr.opaque(mi.UInt32, number)

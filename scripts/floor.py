@@ -21,8 +21,7 @@ import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
 import drjit as dr
 import reference
-from mitsuba_bdpt import integrator as bdpt
-from mitsuba_bdpt import points, sinks
+from mitsuba_bdpt import passes, points, rendering, sinks
 from mitsuba_bdpt.kernel import trace
 from mitsuba_bdpt.objects import step_by_step
 
@@ -72,9 +71,9 @@ class Pass:
         self._scene = reference.load_scene(name, resolution=128)
         depth = reference.default_depth(name)
         integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
-        self._render = bdpt.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
+        self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
         self._render.decide()
-        self._batch = bdpt.batches(self._render.camera, 0, SPP, integrator.settings)[0]
+        self._batch = passes.batches(self._render.world.camera, 0, SPP, integrator.settings)[0]
 
     def trace(self):
         """Trace the pass as one kernel."""

@@ -16,7 +16,7 @@ import mitsuba as mi
 import mitsuba_bdpt
 import numpy as np
 import pytest
-from mitsuba_bdpt import integrator as module
+from mitsuba_bdpt import passes, rendering
 
 T = mi.ScalarTransform4f
 
@@ -312,11 +312,10 @@ def test_passes_do_not_change_the_image(parameters):
     """
     scene = lamp_in_a_sphere()
     images = []
-    for size, passes in ((0, [12]), (1, [1] * 12), (5, [5, 5, 2]), (12, [12]), (99, [12])):
+    for size, expected in ((0, [12]), (1, [1] * 12), (5, [5, 5, 2]), (12, [12]), (99, [12])):
         bdpt = integrator(max_depth=4, spp_per_pass=size, **parameters)
         images.append(image(bdpt, scene, spp=12))
-        print("XX", size, images[-1][0, 0, 0], images[-1].mean(), bdpt.statistics)
-        assert bdpt.statistics["passes"] == passes
+        assert bdpt.statistics["passes"] == expected
     for other in images[1:]:
         np.testing.assert_allclose(other, images[0], rtol=1e-4)
 
@@ -342,7 +341,7 @@ def test_row_bands_equal_one_launch(monkeypatch):
     scene = lamp_in_a_sphere()
     bdpt = integrator(max_depth=3, skip="none", light_paths=0)
     whole = image(bdpt, scene, spp=4)
-    monkeypatch.setattr(module, "PASS_SAMPLES", 16 * 3)
+    monkeypatch.setattr(passes, "PASS_SAMPLES", 16 * 3)
     np.testing.assert_allclose(image(bdpt, scene, spp=4), whole, rtol=1e-4)
 
 
@@ -361,8 +360,8 @@ def test_timeout_stops_after_a_pass(monkeypatch):
     normalised by what was done (0.5 exactly, without light subpaths), and timeout=0 does one pass.
     """
     clock = Clock()
-    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=clock.perf_counter))
-    for timeout, passes in ((2.5, 3), (0, 1), (-1, 10), (100, 10)):
+    monkeypatch.setattr(rendering, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+    for timeout, count in ((2.5, 3), (0, 1), (-1, 10), (100, 10)):
         bdpt = integrator(max_depth=1, light_paths=0, skip="none", spp_per_pass=1, timeout=timeout)
 
         def tick(report):
@@ -370,7 +369,7 @@ def test_timeout_stops_after_a_pass(monkeypatch):
 
         bdpt.on_pass = tick
         result = image(bdpt, glowing_sphere(), spp=10)
-        assert bdpt.statistics["passes"] == [1] * passes
+        assert bdpt.statistics["passes"] == [1] * count
         np.testing.assert_allclose(result, 0.5, rtol=1e-5)
 
 
@@ -942,7 +941,7 @@ def test_passes_are_short_under_a_timeout(monkeypatch):
     compilation = [
         {"type": dr.KernelType.JIT, "cache_hit": False, "codegen_time": 50.0, "backend_time": 150.0}
     ]
-    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(rendering.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(dr, "kernel_history", lambda: [compilation.pop()] if compilation else [])
     bdpt.on_pass = lambda report: clock.__setitem__(0, float(report.spp_done))
     bdpt.render(lamp_in_a_sphere(), spp=1000)

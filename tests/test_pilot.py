@@ -12,8 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import choice, mis, pilot
-from mitsuba_bdpt import integrator as module
+from mitsuba_bdpt import choice, mis, passes, pilot, rendering
 from mitsuba_bdpt.kernel import Batch, _Places
 
 T = mi.ScalarTransform4f
@@ -77,7 +76,7 @@ def bdpt(**parameters):
 
 def of(target, **parameters):
     """A render's state before its first pass."""
-    return module.Render(target, target.sensors()[0], bdpt(**parameters).settings, 1, 64)
+    return rendering.Render(target, target.sensors()[0], bdpt(**parameters).settings, 1, 64)
 
 
 def moments_of(target, lanes, rounds=1, **parameters):
@@ -321,8 +320,8 @@ def test_changed_decisions_change_the_points():
         render._adopt(made)
         changes.append(render._changes)
     assert changes == [0, 0, 1, 1, 2]
-    step = module.Step(0, 0, 1, 64, False)
-    batch = module.batches(render.camera, 0, 1, render.settings)[0]
+    step = passes.Step(0, 0, 1, 64, False)
+    batch = passes.batches(render.world.camera, 0, 1, render.settings)[0]
     seeds = {int(render._points(step, batch).seed[0])}
     render._changes = 0
     assert render._points(step, batch).seed[0] == 1 and seeds.isdisjoint({1})

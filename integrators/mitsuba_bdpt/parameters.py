@@ -7,9 +7,11 @@ import math
 from fractions import Fraction
 from numbers import Integral, Real
 
+import mitsuba as mi
 import numpy as np
 
 from . import choice, features, mis, points
+from .colour import Bands, film_colours
 from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
 from .strategies import layer_names
 
@@ -149,3 +151,54 @@ def read_settings(props) -> Settings:
         )
     _check_layers(settings)
     return settings
+
+
+def check_variant():
+    """Raise ``NotImplementedError`` for variants that the method cannot serve."""
+    variant = mi.variant()
+    if not variant.startswith(("llvm", "cuda")):
+        raise NotImplementedError(
+            f"bdpt: the variant {variant} is scalar; use a vectorised one, for example "
+            "mi.set_variant('llvm_ad_rgb')"
+        )
+    if mi.is_polarized:
+        raise NotImplementedError(
+            f"bdpt: the variant {variant} is polarized, which is not supported; use "
+            f"{variant.replace('_polarized', '')}"
+        )
+
+
+def check_made_for(integrator, scene):
+    """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
+    for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
+        if not isinstance(thing, kind):
+            raise TypeError(
+                f"bdpt: {name}={type(thing).__name__} was not loaded under the present variant "
+                f"{mi.variant()}; load it again after mi.set_variant"
+            )
+
+
+def check_scene(scene, sensor):
+    """Raise ``NotImplementedError`` for what the method cannot render."""
+    if sensor.get_medium() is not None:
+        raise NotImplementedError(
+            f"bdpt: sensor '{sensor.id()}' lies in a participating medium, which is not supported; "
+            "use integrator type 'volpath'"
+        )
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            raise NotImplementedError(
+                f"bdpt: shape '{shape.id()}' bounds a participating medium, which is not supported; "
+                "use integrator type 'volpath'"
+            )
+
+
+def check_film(sensor, settings: Settings):
+    """Raise ``NotImplementedError`` for layers that the film cannot have; returns its colours."""
+    colour = film_colours(sensor)
+    if settings.strategy_images and isinstance(colour, Bands):
+        raise NotImplementedError(
+            f"bdpt: strategy_images=True is not possible with film '{sensor.film().id()}' of class SpecFilm: "
+            "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
+        )
+    return colour

@@ -1,0 +1,283 @@
+"""One render from its first sample to the film: pilots, passes, progress, statistics."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from . import choice, mis, pilot, points
+from .features import FeatureLayers, feature_names
+from .film import Accumulator
+from .kernel import COUNTERS, Kernel, trace
+from .objects import step_by_step
+from .parameters import check_film, check_scene, check_variant, integer
+from .passes import Step, batches, schedule
+from .plan import Settings, plan
+from .sinks import Image
+from .strategies import strategy_count
+from .world import World
+
+# Kinds of rays in the statistics, of what the kernel counts.
+RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
+
+# Pilots have the sequences that follow this number, see `sequence_seed`, and images, after changes of the
+# decision, those that follow the other one.
+PILOT_SEQUENCE, CHANGED_SEQUENCE = 1 << 16, 1 << 17
+
+# Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
+FIRST_REPEAT = 32
+
+# What strategy images may take, in bytes, before the render is refused.
+STRATEGY_MEMORY = 2 << 30
+
+
+@dataclass(frozen=True)
+class PassReport:
+    """Progress after a pass: samples per pixel, seconds and rays so far."""
+
+    spp_done: int
+    spp_total: int
+    seconds: float
+    rays: int
+
+
+def sequence_seed(seed, number: int):
+    """Seed of a point sequence besides the image's own: numbers 1 to 7 are the replicates of `variance`."""
+    other = mi.sample_tea_32(seed, mi.UInt32(number))[1]
+    dr.make_opaque(other)
+    return other
+
+
+class Render:
+    """One render of ``spp`` samples per pixel: its scene, plan, accumulators and progress. Lives for one
+    call."""
+
+    def __init__(self, scene, sensor, settings: Settings, seed, spp: int):
+        check_variant()
+        check_scene(scene, sensor)
+        colour = check_film(sensor, settings)
+        self.started = time.perf_counter()
+        self.sensor, self.settings, self.spp = sensor, settings, spp
+        self.world = World(scene, sensor)
+        self._full = self.plan = plan(self.world, settings)
+        if not isinstance(seed, mi.UInt32):
+            seed = integer(seed, "seed", 0)
+        self.seed = mi.UInt32(seed)
+        dr.make_opaque(self.seed)
+        depth = settings.strategy_depth
+        _check_strategy_memory(depth, sensor.film())
+        features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
+        border = self.world.camera.region.border
+        self.accumulator = Accumulator(sensor.film(), colour, border, depth, settings.variance, features)
+        self._samplers, self._running = {}, []
+        self.decisions, self._moments, self._small = [], None, None
+        self._pilots, self._changes, self._next_pilot = 0, 0, FIRST_REPEAT
+        self._use(self.plan)
+        self._counts = dict.fromkeys(COUNTERS, 0)
+        self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
+
+    def decide(self) -> list:
+        """Run a pilot and adopt what it chooses, if there is a choice and the render is long enough to pay
+        for it; returns all candidates, the best first."""
+        left = self.spp - sum(self.accumulator.passes)
+        count = choice.lanes(left * int(self.world.camera.region.size.prod()))
+        if not (count and choice.is_open(self._full, self.settings)):
+            return []
+        self._wait()  # earlier passes are not the pilot's time
+        started, compiled = time.perf_counter(), self.compile_seconds
+        self._pilots += 1
+        seed = sequence_seed(self.seed, PILOT_SEQUENCE + self._pilots)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), step_by_step(self.world.emitters.evaluated):
+            moments = pilot.measure(self.world, self._full, self.settings, seed, count)
+        self._wait()  # for the kernel's entry in the history
+        self._moments = moments if self._moments is None else self._moments.joined(moments)
+        possible = choice.candidates(self.world, self._full, self.settings)
+        table = choice.choose(self._moments, possible, self._has_stratified_points())
+        if table and self._moments.mean > 0:  # a pilot that sees nothing says nothing
+            best, number = table[0], len(self.accumulator.passes)
+            decision = best.candidate.decided(number, best.cost, best.variance, self._moments.mean)
+            self._adopt(decision, choice.left_out(table))
+        self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
+        return table
+
+    def _has_stratified_points(self) -> bool:
+        if self.settings.points == "sampler":
+            return self.sensor.sampler().class_name() != "IndependentSampler"
+        return self.settings.points == "sobol"
+
+    def _adopt(self, decision, left_out=()):
+        """Render as decided from now on; if that differs from before, with points of their own: lanes serve
+        other samples, and what was half done of the old sequence would not be finished."""
+        adopted = replace(decision.plan(self._full), skipped=(*self._full.skipped, *left_out))
+        if self.decisions and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
+            self._changes += 1
+        self.decisions.append(decision)
+        self._small = decision.small
+        self._use(adopted)
+
+    def _use(self, chosen):
+        self.plan = chosen
+        self.kernel = Kernel(self.world, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
+        if self._small and chosen.roulette:
+            self.kernel.set_threshold(dr.opaque(mi.Float64, self._small))
+
+    def replay(self, number: int):
+        """Adopt the decision that is given for the pass of this ``number``, if there is one."""
+        for decision in self.settings.decisions:
+            if decision.first_pass == number:
+                self._adopt(decision, choice.replayed(decision))
+
+    def _decide_before(self, step: Step):
+        """Replay the decision for this pass; or, early in a long render, ask another pilot."""
+        number = len(self.accumulator.passes)
+        if self.settings.decisions:
+            self.replay(number)
+        elif number and step.done >= self._next_pilot and not step.replicate:
+            while self._next_pilot <= step.done:
+                self._next_pilot *= 4
+            # A scene's sampler cannot start again in the middle of its samples.
+            if 2 * step.done <= self.spp and self.settings.points != "sampler":
+                self.decide()
+
+    def run(self, on_pass, cancelled=lambda: False):
+        """Trace the samples, fewer under ``timeout``, when ``cancelled()`` after a pass or when
+        interrupted."""
+        timeout = self.settings.timeout
+        watched = on_pass is not None or timeout >= 0
+        try:
+            self.decide()
+            for number, step in enumerate(self._steps()):
+                self._decide_before(step)
+                self._pass(step)
+                # The second pass is recorded while the first, a short one, runs.
+                if watched or number > 0:
+                    self._wait()
+                if step.last and self.settings.variance:
+                    self.accumulator.close_replicate()
+                if on_pass is not None:
+                    on_pass(self.report())
+                if 0 <= timeout <= time.perf_counter() - self.started or cancelled():
+                    break
+        finally:
+            try:
+                self._wait()
+            finally:
+                self.accumulator.finish()
+
+    def _steps(self):
+        """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
+        # The first pass gives roulette the scale of the image, if no pilot has.
+        known = self._small is not None or self.settings.decisions
+        small_first = self.plan.roulette and self.plan.light and not known
+        for step in schedule(self.world.camera, self.spp, self.settings, small_first):
+            done, end = step.done, step.done + step.size
+            while done < end:
+                size = min(end - done, self._affordable(step.size))
+                yield replace(step, done=done, size=size, last=step.last and done + size == end)
+                done += size
+
+    def _affordable(self, size: int) -> int:
+        if self.settings.timeout < 0 or self.settings.points == "sampler":
+            return size
+        busy = time.perf_counter() - self.started - self.compile_seconds - self.pilot_seconds
+        rate = sum(self.accumulator.passes) / max(busy, 1e-3)
+        return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
+
+    def _pass(self, step: Step):
+        first = not self.accumulator.passes and self._small is None
+        for launch, batch in enumerate(batches(self.world.camera, step.done, step.size, self.settings)):
+            if launch:
+                self._wait()
+            drawn = self._points(step, batch)
+            with step_by_step(self.world.emitters.evaluated):
+                counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                self.accumulator.evaluate(counts)
+            self._running.append(counts)
+        self.accumulator.close_pass(step.size)
+        if first and self.plan.roulette:
+            self.kernel.set_threshold(choice.MOST_ROULETTE * self.accumulator.mean())
+
+    def _points(self, step, batch):
+        seed = self.seed
+        number = step.replicate + (CHANGED_SEQUENCE + self._changes if self._changes else 0)
+        if number:
+            seed = sequence_seed(self.seed, number)
+        if self.settings.points != "sampler":
+            return points.Points(self.settings.points, seed)
+        # One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do.
+        sampler = self._samplers.get(batch.first_pixel)
+        if sampler is None or step.done == 0:
+            sampler = self.sensor.sampler().clone()
+            sampler.set_sample_count(step.of)
+            sampler.set_samples_per_wavefront(batch.samples)
+            band = mi.sample_tea_32(seed, mi.UInt32(batch.first_pixel))[0]
+            sampler.seed(band, points.Points.sequences(batch.pixels) * batch.samples)
+            self._samplers[batch.first_pixel] = sampler
+        else:
+            sampler.advance()
+        drawn = points.Points("sampler", seed, sampler, batch.samples)
+        sampler.schedule_state()
+        dr.eval()
+        return drawn
+
+    def _wait(self):
+        """Wait for what was launched, and note what it did and how it was compiled."""
+        dr.sync_thread()
+        while self._running:
+            batch = self._running.pop().numpy().tolist()
+            self._counts = {name: self._counts[name] + n for name, n in zip(self._counts, batch, strict=True)}
+        for entry in dr.kernel_history():
+            if entry["type"] == dr.KernelType.JIT:
+                self.cached += bool(entry["cache_hit"])
+                self.compiled += not entry["cache_hit"]
+                self.compile_seconds += (entry["codegen_time"] + entry["backend_time"]) / 1000
+
+    def report(self) -> PassReport:
+        """Progress so far, for ``on_pass``."""
+        seconds = time.perf_counter() - self.started
+        return PassReport(sum(self.accumulator.passes), self.spp, seconds, sum(self._rays().values()))
+
+    def _rays(self):
+        rays = {name: self._counts[name] for name in RAYS}
+        if self.accumulator.features is not None:  # one per camera sample
+            rays["features"] = sum(self.accumulator.passes) * int(self.world.camera.region.size.prod())
+        return rays
+
+    def statistics(self) -> dict:
+        """The render in numbers; plain values only."""
+        connections = {name: self._counts[name] for name in ("evaluated", "zero", "rouletted")}
+        connections["traced"] = self._counts["shadow_inner"]
+        total = time.perf_counter() - self.started
+        return {
+            "seconds": {
+                "compile": self.compile_seconds,
+                "pilot": self.pilot_seconds,
+                "render": total - self.compile_seconds - self.pilot_seconds,
+                "total": total,
+            },
+            "rays": self._rays(),
+            "connections": connections,
+            "skipped": list(self.plan.skipped),
+            "decisions": [d.record() for d in self.decisions],
+            "passes": list(self.accumulator.passes),
+            "non_finite": self._counts["non_finite"],
+            "kernels": {"compiled": self.compiled, "cached": self.cached},
+            **({"error": self.accumulator.error()} if self.settings.variance else {}),
+            "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
+        }
+
+
+def _check_strategy_memory(depth: int, film):
+    w, h = (int(x) for x in film.crop_size())
+    # Six channels in double precision: those of a pass, of all passes and, while they are added, of both.
+    needed = strategy_count(depth) * w * h * 6 * (8 + 16)
+    if needed > STRATEGY_MEMORY:
+        raise ValueError(
+            f"bdpt: strategy_images at {w}x{h} with max_depth={depth} needs about "
+            f"{needed / 2**30:.1f} GiB, more than {STRATEGY_MEMORY / 2**30:.0f} GiB; use a smaller "
+            "film or max_depth"
+        )
