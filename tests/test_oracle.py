@@ -514,7 +514,7 @@ class Lights:
     def covers(self, p, d):
         return mi.Bool(True)
 
-    def direction_density(self, emission, d, active):
+    def direction_density(self, emission, p, d, active):
         return self.second
 
     def radiance_towards(self, emission, d, active):

@@ -204,7 +204,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
     camera_side = 0
     if kernel.plan.arrival:
-        towards = kernel.emitters.direction_density(emission, join.d, active)
+        towards = kernel.emitters.direction_density(emission, join.p, join.d, active)
         covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
         towards = dr.select(covered, towards, 0)
         camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
