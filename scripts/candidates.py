@@ -1,12 +1,14 @@
 """What the pilot predicts of each way to render, beside what renders show.
 
     python scripts/candidates.py cornell_box uplight_room glass_caustics
+    python scripts/candidates.py --seeds 12 cornell_box ajar_door   # what the pilots of 12 renders choose
 
 For each scene (128^2, as in the benchmark) and a selection of candidates: the predicted variance of a sample,
 split into that of camera samples and that of splats, and cost; the relMSE of renders of 64 samples per pixel
 times 64, trimmed of its worst 0.1 %, with the default points, and their time over that of path tracing alone.
 Renders of a given candidate come from the parameter ``decisions``. The ratio of the variances is what points
-gain.
+gain. With ``--seeds``, instead: how far the cost times variance of what renders' own pilots choose is above
+the least of all candidates, both judged by 2^17 samples.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import json
 import statistics
 import sys
 import time
+from collections import Counter
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
@@ -84,9 +87,8 @@ def lines(name: str, depth: int) -> list:
     for entry in SELECTION:
         share, connections, splat = entry
         way = candidate(*entry)
-        base, light = moments.variance(moments.draw if connections == "one" else 0)[:, :, way.weighting].mean(
-            axis=0
-        )
+        draw = moments.draw if connections == "one" else 0
+        base, light = moments.variance(draw)[:, :, way.weighting].mean(axis=0)
         error, seconds = rendered(scene, depth, way, moments.mean, expected)
         alone = alone or seconds
         light *= way.served
@@ -105,17 +107,43 @@ def lines(name: str, depth: int) -> list:
     return rows
 
 
+def stability(name: str, depth: int, seeds: int) -> list:
+    """A row about what ``seeds`` renders choose."""
+    scene = reference.load_scene(name, resolution=RESOLUTION)
+    settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
+    judge = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
+    possible = choice.candidates(judge.world, judge.plan, settings)
+    table_of_judge = choice.choose(predicted(scene, settings), possible, True)
+    times = {row.candidate: row.time for row in table_of_judge}
+    chosen = [
+        rendering.Render(scene, scene.sensors()[0], settings, seed, SPP).decide()[0].candidate
+        for seed in range(seeds)
+    ]
+    above = [times[c] / table_of_judge[0].time - 1 for c in chosen]
+    counts = Counter(f"1/{c.served} {c.connections}" if c.light_paths else "0" for c in chosen)
+    texts = ", ".join(f"{text} ({n})" for text, n in counts.most_common())
+    return [f"`{name}`", texts, f"{100 * statistics.median(above):.0f} %", f"{100 * max(above):.0f} %"]
+
+
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
+    parser.add_argument(
+        "--seeds", type=int, default=0, help="compare what the pilots of so many renders choose"
+    )
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
+    depths = {n: 6 if n == "cornell_box" else reference.default_depth(n) for n in options.scene}
+    if options.seeds:
+        rows = [stability(name, depth, options.seeds) for name, depth in depths.items()]
+        print(table(["scene", "chosen (seeds)", "above the best: median", "worst"], rows))
+        return 0
     head = ["scene", "light_paths, connections, kappa of t=1 over its count", "predicted: camera + splats"]
     head += ["relMSE · spp", "ratio", "predicted cost", "time"]
     rows = []
-    for name in options.scene:
-        rows += lines(name, 6 if name == "cornell_box" else reference.default_depth(name))
+    for name, depth in depths.items():
+        rows += lines(name, depth)
     print(table(head, rows))
     return 0
 

@@ -304,8 +304,8 @@ def test_aimed_light_subpaths(name):
     these have vertices.
 
     Expected: next-event estimation (1, 2) and light tracing (2, 1) alone each give the image of light that
-    is reflected once, and so do all together. Statistic: t test (23 degrees of freedom, at least) of each pixel
-    and of the whole over 24 renders, Sidak, at 1e-4; the whole is known to 2 % or better.
+    is reflected once, and so do all together. Statistic: t test (23 degrees of freedom, at least) of each
+    pixel and of the whole over 24 renders, Sidak, at 1e-4; the whole is known to 2 % or better.
     """
     scene, images = meadow(FROM_INFINITY[name]), {}
     integrator = mi.load_dict(

@@ -296,15 +296,15 @@ def test_replay():
 def test_asked_again_in_long_renders():
     """Rationale: a short pilot may miss what a long render suffers from.
 
-    Expected: pilots before the first pass, after 32 samples per pixel and after 128, of which each knows what
-    the ones before found; the replay is the same image.
+    Expected: pilots before the first pass, after 32 samples per pixel and after 128, a quarter of the render,
+    of which each knows what the ones before found; the replay is the same image.
     """
     target = cornell(128)
     integrator = bdpt(spp_per_pass=16)
-    image = np.array(integrator.render(target, seed=2, spp=272))
+    image = np.array(integrator.render(target, seed=2, spp=512))
     made = integrator.statistics["decisions"]
     assert [d["pass"] for d in made] == [0, 2, 8]
-    again = bdpt(spp_per_pass=16, decisions=json.dumps(made)).render(target, seed=2, spp=272)
+    again = bdpt(spp_per_pass=16, decisions=json.dumps(made)).render(target, seed=2, spp=512)
     np.testing.assert_allclose(np.array(again), image, rtol=1e-3, atol=1e-4)
 
 

@@ -30,6 +30,9 @@ PILOT_SEQUENCE, CHANGED_SEQUENCE = 1 << 16, 1 << 17
 # Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
 FIRST_REPEAT = 32
 
+# Share of a render after which none is asked any more.
+LATEST_REPEAT = 1 / 4
+
 # What strategy images may take, in bytes, before the render is refused.
 STRATEGY_MEMORY = 2 << 30
 
@@ -139,7 +142,7 @@ class Render:
             while self._next_pilot <= step.done:
                 self._next_pilot *= 4
             # A scene's sampler cannot start again in the middle of its samples.
-            if 2 * step.done <= self.spp and self.settings.points != "sampler":
+            if step.done <= LATEST_REPEAT * self.spp and self.settings.points != "sampler":
                 self.decide()
 
     def run(self, on_pass, cancelled=lambda: False):

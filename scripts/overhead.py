@@ -1,0 +1,89 @@
+"""What a render takes besides its samples, and what a sample takes.
+
+    python scripts/overhead.py cornell_box veach_mis open_sky
+
+Medians over rounds in which all of them alternate, at 128^2. The cost of a sample: seconds of a whole render
+of 64 samples per pixel less those of 4, so that what is fixed cancels. Beside `path`: path tracing alone
+(light_paths=0) with its points and with independent numbers. The pilot: its seconds, of the statistics, in
+renders of 64 and 256 samples per pixel, and its share of these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+
+import mitsuba as mi  # isort: skip
+import drjit as dr
+import reference
+from report import table
+
+ROUNDS, SHORT, LONG = 7, 4, 64
+
+ALONE = {"type": "bdpt", "light_paths": 0}
+METHODS = {
+    "path": ({"type": "path"}, "independent"),
+    "path multijitter": ({"type": "path"}, "multijitter"),
+    "path tracing alone": (ALONE, "independent"),
+    "with independent numbers": (ALONE | {"points": "independent"}, "independent"),
+}
+
+
+def seconds(integrator, scene, spp: int, seed: int) -> float:
+    """Of a whole render."""
+    dr.sync_thread()
+    start = time.perf_counter()
+    dr.eval(integrator.render(scene, seed=seed, spp=spp))
+    dr.sync_thread()
+    return time.perf_counter() - start
+
+
+def measure(name: str) -> list[str]:
+    """A row of the table."""
+    depth = 6 if name == "cornell_box" else reference.default_depth(name)
+    scenes = {
+        s: reference.load_scene(name, resolution=128, sampler=s) for s in ("independent", "multijitter")
+    }
+    made = {k: (mi.load_dict(d | {"max_depth": depth}), scenes[s]) for k, (d, s) in METHODS.items()}
+    chosen = mi.load_dict({"type": "bdpt", "max_depth": depth})
+    cost = {k: [] for k in made}
+    first = []
+    pilot = {LONG: [], 4 * LONG: []}
+    for seed in range(ROUNDS + 1):
+        for k, (integrator, scene) in made.items():
+            short, long = (seconds(integrator, scene, spp, seed) for spp in (SHORT, LONG))
+            cost[k].append((long - short) / (LONG - SHORT))
+        first.append(seconds(made["path tracing alone"][0], scenes["independent"], 1, seed))
+        for spp, found in pilot.items():
+            chosen.render(scenes["independent"], seed=seed, spp=spp)
+            spent = chosen.statistics["seconds"]
+            found.append((1e3 * spent["pilot"], 100 * spent["pilot"] / spent["total"]))
+    # The first round compiles.
+    base = statistics.median(cost["path"][1:])
+    row = [f"`{name}`", f"{1e3 * base:.2f} ms"]
+    row += [f"{statistics.median(v[1:]) / base:.2f}" for k, v in cost.items() if k != "path"]
+    row.append(f"{1e3 * statistics.median(first[1:]):.0f} ms")
+    for found in pilot.values():
+        spent, share = (statistics.median(column) for column in zip(*found[1:], strict=True))
+        row.append(f"{spent:.0f} ms, {share:.1f} %")
+    return row
+
+
+def main(arguments=None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("scenes", nargs="+", help="names in scenes/")
+    names = parser.parse_args(arguments).scenes
+    mi.set_variant("llvm_ad_rgb")
+    head = ["scene", "`path`, per sample and pixel", *list(METHODS)[1:], "a render of 1 sample"]
+    head += [f"pilot at {spp}" for spp in (LONG, 4 * LONG)]
+    print(table(head, [measure(name) for name in names]))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
