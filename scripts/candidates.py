@@ -64,10 +64,10 @@ def predicted(scene, settings) -> pilot.Moments:
     return found
 
 
-def rendered(scene, depth: int, way: choice.Candidate, mean: float, expected) -> tuple[float, float]:
+def rendered(scene, depth: int, made: choice.Decision, expected) -> tuple[float, float]:
     """Median of relMSE times samples, and of seconds per render, over `ROUNDS` renders after a first one."""
-    made = [way.decided(0, 1.0, 1.0, mean).record()]
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": json.dumps(made)})
+    decisions = json.dumps([made.record()])
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": decisions})
     errors, seconds = [], []
     for seed in range(ROUNDS + 1):
         started = time.perf_counter()
@@ -89,9 +89,10 @@ def lines(name: str, depth: int) -> list:
         way = candidate(*entry)
         draw = moments.draw if connections == "one" else 0
         base, light = moments.variance(draw)[:, :, way.weighting].mean(axis=0)
-        error, seconds = rendered(scene, depth, way, moments.mean, expected)
-        alone = alone or seconds
         light *= way.served
+        made = way.decided(0, choice.cost(way, moments.rays), base + light, moments.mean)
+        error, seconds = rendered(scene, depth, made, expected)
+        alone = alone or seconds
         name_of_share = f"1/{way.served}" if share else "0"
         rows.append(
             [

@@ -239,7 +239,7 @@ class Halves:
         self.sums = np.stack([stored.image + stored.difference, stored.image - stored.difference])
         self.sums *= self.counts
         self.rounds = math.ceil((1 + len(windows)) * most)  # no less than were rendered
-        self.sources |= set(stored.provenance.get("sources", ()))
+        self.sources |= set(stored.provenance.get("sources", ()))  # older ones do not say
         self.earlier = stored.means
 
     def means(self) -> Means | None:

@@ -308,6 +308,34 @@ def test_step_is_evaluation_over_density(name, direct_calls):
             assert (error <= 1e-3 * own.max(0))[use].all()
 
 
+@pytest.mark.parametrize("name", PLUGINS)
+def test_evaluation_beside_a_step(name, direct_calls):
+    """Rationale: one call serves the sampled direction and the one in which an endpoint lies.
+
+    Expected: the same step as without the endpoint where it is asked for, and the same evaluation as
+    alone where that is, in lanes that want one, the other or both; equal up to rounding.
+    """
+    n = 3000
+    plugin, traits = mi.load_dict(PLUGINS[name]()), bsdf.Traits.of([mi.load_dict(PLUGINS[name]())])
+    draw = Draw(n, 8)
+    si = surface(draw, n, tilt=0.4)
+    u1, u2, wo = draw.one(), draw.two(), mi.warp.square_to_uniform_sphere(draw.two())
+    third = dr.arange(mi.UInt32, n) % 3
+    sampled, joined = third != 0, third != 1
+    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)):
+        target = bsdf.Target(wo, joined, mi.Float(0.7))
+        step, f = take(plugin, si, u1, u2, sampled, traits, target)
+        alone, nothing = take(plugin, si, u1, u2, sampled, traits)
+        expected = evaluate(plugin, si, wo, joined, *([0.7] if take is bsdf.sample_adjoint else []))
+        assert nothing is None
+        for ours, theirs, where in (
+            *((getattr(step, k), getattr(alone, k), sampled) for k in ("wo", "weight", "pdf_fwd_w")),
+            *((getattr(f, k), getattr(expected, k), joined) for k in ("value", "pdf_fwd_w", "pdf_rev_w")),
+        ):
+            ours, theirs = (dr.select(where, x, 0) for x in (ours, theirs))
+            assert dr.all(dr.allclose(ours, theirs, rtol=1e-4, equal_nan=True), axis=None)
+
+
 # Smooth positive functions of a direction, without symmetry: what leaves to the camera's side is
 # weighted with one, what arrives from the light's side with the other.
 def _towards_camera(w, cut):

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
+from mitsuba_bdpt import infinity
 from mitsuba_bdpt.emitters import Emitters
 from mitsuba_bdpt.objects import step_by_step
 from scipy import stats
@@ -123,10 +124,11 @@ def test_directions_from_infinity(name):
     uniform = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
 
     def density(outward):
-        si = scene.ray_intersect(mi.Ray3f(emitters.center + outward * (3 * emitters.radius), outward))
+        around = emitters.disks.scene
+        si = scene.ray_intersect(mi.Ray3f(around.center + outward * (3 * around.radius), outward))
         si.time = mi.Float(0.3)
         with step_by_step(name == "timed_sunsky"):
-            return column(emitters.hit_densities(si, mi.Point3f(emitters.center), mi.Bool(True))[1])
+            return column(emitters.hit_densities(si, mi.Point3f(around.center), mi.Bool(True))[1])
 
     stated, own = column(e.pdf_first), density(-e.d)
     assert np.mean(np.abs(own - stated) > 2e-3 * stated) < 0.01  # borders of pixels and of the sun
@@ -144,8 +146,9 @@ def test_light_from_infinity_covers_the_scene_evenly(name):
     angle. Statistic: Kolmogorov-Smirnov at 1e-4, within 1e-4 of the radius for the plane.
     """
     _, emitters, e = emission(name)
-    d, radius = column(e.d), float(emitters.radius[0])
-    start = (column(e.anchor.p) - np.array(emitters.center, dtype=np.float64).reshape(3, 1)) / radius
+    d, around = column(e.d), emitters.disks.scene
+    radius = float(around.radius[0])
+    start = (column(e.anchor.p) - np.array(around.center, dtype=np.float64).reshape(3, 1)) / radius
     along = np.sum(start * d, axis=0)
     np.testing.assert_allclose(along, -1, atol=1e-4)
     flat = start - along * d
@@ -234,7 +237,7 @@ def test_selection_beside_what_cannot_be_traced():
     assert abs(weight.mean() - power) < 5 * weight.std() / np.sqrt(COUNT)
 
 
-def meadow(emitter, **sensor):
+def meadow(emitter):
     """A block on a large ground."""
     transform = mi.ScalarTransform4f()
     return mi.load_dict(
@@ -281,21 +284,84 @@ def test_aimed_emission(name):
     stated = column(e.pdf_second)
     for distance in (0.0, 7.0):
         again = column(emitters.direction_density(e, e.si.p + distance * e.d, e.d, mi.Bool(True)))
-        # On the rim of a disk, by rounding.
-        assert np.mean(np.abs(again - stated) > 1e-3 * stated) < 1e-3
-    block = emitters._details
-    assert block.radius < 0.1 * emitters.radius[0]
-    for center, radius, least in (
-        (emitters.center, emitters.radius[0], 1),
-        (block.center, block.radius, 0.5),
-    ):
-        offset = column(e.si.p) - np.array(center, dtype=float).reshape(3, 1)
+        # Rounding decides on the rim of a disk, for a share of the points of its size over the radius.
+        assert np.mean(np.abs(again - stated) > 1e-3 * stated) < 1e-4
+    assert np.isfinite(column(e.weight)).all()
+    everything, block = emitters.disks.scene, emitters.disks.details
+    assert block.radius[0] < 0.1 * everything.radius[0]
+    for sphere, least in ((everything, 1), (block, infinity.AIMED)):
+        radius = float(sphere.radius[0])
+        offset = column(e.si.p) - np.array(sphere.center, dtype=float).reshape(3, 1)
         d = column(e.d)
         aside2 = (offset**2).sum(0) - (offset * d).sum(0) ** 2
         inside = aside2 < radius**2 * (1 + 1e-4)
         value = inside / stated / (np.pi * radius**2)
+        # The spheres' margins and the rim: 1e-4 of the radius.
         assert abs(value.mean() - 1) < 5 * value.std() / np.sqrt(COUNT) + 1e-3
-        assert inside.mean() > least - 1e-3
+        assert inside.mean() > least - 5 / np.sqrt(COUNT)
+
+
+def test_details():
+    """Expected: small shapes that lie together are details; not those spread over the scene, nor a scene of
+    one shape, nor shapes without extent, nor, since rounding decides, those tiny beside the scene or far
+    from the origin."""
+    box = mi.ScalarBoundingBox3f
+
+    def found(*small, at=0.0):
+        whole = box([at - 10] * 3, [at + 10] * 3)
+        sphere = infinity.details([whole, *small], whole)
+        return None if sphere is None else (list(sphere.center), sphere.radius)
+
+    center, radius = found(box([1, 1, 1], [2, 2, 2]), box([2, 2, 2], [3, 3, 3]))
+    assert center == pytest.approx([2, 2, 2]) and radius == pytest.approx(np.sqrt(3))
+    assert found() is None
+    assert found(box([-9, -9, -9], [-8, -8, -8]), box([8, 8, 8], [9, 9, 9])) is None
+    assert found(box([1, 1, 1], [7, 2, 2])) is None
+    assert found(box([1, 1, 1], [1, 1, 1])) is None
+    assert found(box([1, 1, 1], [1.002, 1.002, 1.002])) is None
+    assert found(box([1e5] * 3, [1e5 + 2] * 3), at=1e5) is None
+
+
+@pytest.mark.parametrize("scale", [8, 1000])
+def test_aimed_points_know_that_they_are(scale):
+    """Rationale: a point on the rim of the details' disk may be outside of it by rounding; without the aimed
+    part in its density it would weigh (R / r)^2 times too much.
+
+    Expected: no start that was aimed has less than that part, and none has none.
+    """
+    transform = mi.ScalarTransform4f()
+    disks = infinity.Disks(
+        mi.load_dict(
+            {
+                "type": "scene",
+                "ground": {"type": "rectangle", "to_world": transform.scale(scale)},
+                "ball": {"type": "sphere", "center": [0.3, 0.2, 1], "radius": 1.0},
+            }
+        ),
+        aimed=True,
+    )
+    u = [mi.Float(v) for v in numbers(4)]
+    d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[2], u[3]))
+    _, density = disks.start(d, mi.Point2f(u[0], u[1]))
+    density, aimed = column(density), column(u[0]) < infinity.AIMED
+    part = infinity.AIMED / (np.pi * float(disks.details.radius[0]) ** 2)
+    assert density.min() > 0 and density[aimed].min() >= part * (1 - 1e-6)
+
+
+def test_a_vertex_that_is_not_finite():
+    """Rationale: the box of a mesh with such a vertex is not valid, yet rays meet its other triangles.
+
+    Expected: the scene's disk covers what is finite.
+    """
+    mesh = mi.Mesh("broken", 4, 2)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [0, 0, 0, 2, 0, 0, 0, 2, 0, np.nan, 0, 0]
+    params["faces"] = [0, 1, 2, 1, 2, 3]
+    params.update()
+    scene = mi.load_dict({"type": "scene", "mesh": mesh, "sky": {"type": "constant"}})
+    sphere = infinity.Disks(scene, aimed=True).scene
+    np.testing.assert_allclose(np.array(sphere.center).ravel(), [1, 1, 0], atol=1e-6)
+    assert float(sphere.radius[0]) == pytest.approx(np.sqrt(2), rel=1e-3)
 
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
@@ -311,7 +377,7 @@ def test_aimed_light_subpaths(name):
     integrator = mi.load_dict(
         {"type": "bdpt", "max_depth": 2, "light_paths": 1, "strategy_images": True, "hide_emitters": True}
     )
-    assert Emitters(scene)._details is not None
+    assert Emitters(scene).disks.details is not None
     renders = np.array([np.array(integrator.render(scene, seed=s, spp=1024)) for s in range(24)], dtype=float)
     layers = integrator.aov_names()
     first = renders.shape[-1] - len(layers)
@@ -325,3 +391,34 @@ def test_aimed_light_subpaths(name):
         error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 24) + 1e-5
         p = 2 * stats.t.sf(np.abs(a.mean(axis=0) - b.mean(axis=0)) / error, 23)
         assert -np.expm1(p.size * np.log1p(-p.min())) > LEVEL
+
+
+def test_aimed_light_subpaths_that_reach_a_lens():
+    """Rationale: for (1, 1) and t = 0 the density is asked for at the sensor, which may lie outside the
+    scene.
+
+    Expected: with all strategies, the sky that a wide lens far outside sees directly past the scene, and
+    beside it, is that of `path`. Statistic: as above, against the mean of a long render (1e-3 for its error).
+    """
+    transform = mi.ScalarTransform4f()
+    scene = meadow(FROM_INFINITY["sky"])
+    sensor = mi.load_dict(
+        {
+            "type": "thinlens",
+            "fov": 60,
+            "aperture_radius": 3.0,
+            "focus_distance": 20.0,
+            "to_world": transform.look_at([0, 5, 25], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 6, "height": 6, "rfilter": {"type": "box"}},
+        }
+    )
+    assert Emitters(scene).disks.details is not None
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 1, "skip": "none"})
+    path = mi.load_dict({"type": "path", "max_depth": 1})
+    images = [np.array(integrator.render(scene, sensor, seed=s, spp=512))[..., 0] for s in range(24)]
+    expected = np.array(mi.render(scene, sensor=sensor, integrator=path, spp=1 << 14))[..., 0].ravel()
+    ours = np.array(images, dtype=float).reshape(24, -1)
+    assert "used: t=0" in integrator.explain(scene, sensor) and 0.3 < expected.mean() < 0.99
+    error = stats.sem(ours, axis=0) + 1e-3
+    p = 2 * stats.t.sf(np.abs(ours.mean(axis=0) - expected) / error, 23)
+    assert -np.expm1(p.size * np.log1p(-p.min())) > LEVEL

@@ -22,7 +22,7 @@ ORDER = (
     ("world",),
     ("plan", "emitters", "sensors", "points", "strategies"),
     ("cameras", "other_sensors"),
-    ("emitter_tables", "sensor_records"),
+    ("emitter_tables", "infinity", "sensor_records"),
     ("emitter_kinds",),
     ("bsdf", "rays", "mis", "sobol"),
     ("objects",),

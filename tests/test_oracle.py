@@ -510,9 +510,7 @@ class Lights:
         )
 
     at_infinity = True
-
-    def covers(self, p, d):
-        return mi.Bool(True)
+    disks = SimpleNamespace(covers=lambda p, d: mi.Bool(True))
 
     def direction_density(self, emission, p, d, active):
         return self.second

@@ -92,7 +92,8 @@ def _ask(bsdf, question, *args):
 
 
 def _ask_both(bsdf, sampling, arguments, evaluating, target):
-    """Answers to ``sampling(bsdf, *arguments)`` and, if there is a ``target``, to ``evaluating``."""
+    """Answers to ``sampling(bsdf, si, u1, u2, active)``, these are the ``arguments``, and, if there is a
+    ``target``, to ``evaluating(bsdf, si, wo, active)`` with its own."""
     if target is None:
         return _ask(bsdf, sampling, *arguments), None
     *_, active = arguments
@@ -100,6 +101,7 @@ def _ask_both(bsdf, sampling, arguments, evaluating, target):
     def ask(self, wo, joined, si, u1, u2, sampled, _):
         return sampling(self, si, u1, u2, sampled), evaluating(self, si, wo, joined)
 
+    # The last argument is the call's mask.
     return _ask(bsdf, ask, target.wo, target.active, *arguments, active | target.active)
 
 
@@ -125,9 +127,12 @@ def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
     ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal,
     which is computed unless given.
     """
-    value, pdf_fwd_w, pdf_rev_w = _ask(bsdf, _evaluated_adjoint, si, wo, active)
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
+    return _adjoint(cos_ratio, *_ask(bsdf, _evaluated_adjoint, si, wo, active))
+
+
+def _adjoint(cos_ratio, value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
     return Evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
 
 
@@ -142,7 +147,9 @@ def geometric_cos(si, w):
     return dr.abs(dr.dot(si.n, si.to_world(w)))
 
 
-def sample(bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None):
+def sample(
+    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
+) -> tuple[Step, Evaluation | None]:
     """Continue a camera subpath where ``active``: the `Step`. ``u1`` picks the lobe, ``u2`` the direction.
 
     With a ``target`` also its `Evaluation`, in the same virtual call: what a call takes is mostly to hand
@@ -170,7 +177,9 @@ def sample(bsdf, si, u1, u2, active, traits: Traits, target: Target | None = Non
     return step, Evaluation(*evaluated) if target else None
 
 
-def sample_adjoint(bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None):
+def sample_adjoint(
+    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
+) -> tuple[Step, Evaluation | None]:
     """Continue a light subpath; the adjoint factor is part of ``weight``, and of the evaluation's ``value``.
     Arguments and results as of `sample`."""
 
@@ -195,10 +204,7 @@ def sample_adjoint(bsdf, si, u1, u2, active, traits: Traits, target: Target | No
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
     weight = dr.select(is_zero(weight), 0, weight * cos_ratio)
     step = _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
-    if target is None:
-        return step, None
-    value, pdf_fwd_w, pdf_rev_w = evaluated
-    return step, Evaluation(value * target.cos_ratio, pdf_fwd_w, pdf_rev_w)
+    return step, _adjoint(target.cos_ratio, *evaluated) if target else None
 
 
 def brightest(value):

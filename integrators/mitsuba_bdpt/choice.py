@@ -69,7 +69,7 @@ class Decision:
     mean: float
 
     @property
-    def small(self) -> float:
+    def threshold(self) -> float:
         """The size below which contributions play roulette."""
         return self.mean * min(MOST_ROULETTE, ROULETTE_PER_VARIANCE * self.variance)
 
@@ -101,14 +101,15 @@ class Decision:
 
 
 def read_decisions(text: str) -> tuple[Decision, ...]:
-    """The parameter ``decisions``: JSON as in ``statistics``; raises ``ValueError`` saying what is wrong."""
+    """The parameter ``decisions``: JSON as in ``statistics``, an empty list for a render without a pilot;
+    raises ``ValueError`` saying what is wrong."""
     try:
         entries = json.loads(text)
-        if not isinstance(entries, list) or not entries:
-            raise TypeError("a list of one decision or more is needed")
+        if not isinstance(entries, list):
+            raise TypeError("a list of decisions is needed")
         made = tuple(_read_decision(entry) for entry in entries)
         passes = [decision.first_pass for decision in made]
-        if passes != sorted(set(passes)) or passes[0] != 0:
+        if passes != sorted(set(passes)) or passes[:1] not in ([], [0]):
             raise ValueError(f"passes {passes} must start at 0 and rise")
         return made
     except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -260,7 +261,7 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
     """All ``possible`` candidates, the best first; ``stratified``: whether points will be better than
     independent ones."""
     factor = STRATIFIED_SPLATS if stratified else 1.0
-    drawn, every = moments.variance(_usual(moments.draw), factor), moments.variance(0, factor)
+    drawn, every = moments.variance(_trimmed_mean(moments.draw), factor), moments.variance(0, factor)
     parts = np.stack(
         [(drawn if c.connections == "one" else every)[:, :, c.weighting] for c in possible], axis=1
     )
@@ -273,7 +274,7 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
     return sorted(table, key=lambda row: row.time)
 
 
-def _usual(draw):
+def _trimmed_mean(draw):
     """What the draw of a connection adds: the mean of the groups but for the largest quarter. Few samples
     show its outliers (the unshadowed 1 / dist^2), but not yet those of all else, beside which they are small:
     in `ajar_door`, 60 % of the variance in 2^11 samples, 10 % in 2^17."""

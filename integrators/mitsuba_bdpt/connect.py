@@ -132,7 +132,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, connect))
     older = dr.select(kernel.within_store(z.edges), first * second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
-        older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
+        older = dr.select(z.hit | ~directly | emitters.disks.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
@@ -176,7 +176,7 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     ray = dr.select(e.infinite, to_infinity, to_point)
     counters["shadow_s1"] += _one(active)
     active &= ~rays.occluded(kernel.scene, ray, active)
-    return Contribution(value, weight, mi.UInt32(1), z.edges + 1, active, shares, "direct")
+    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct")
 
 
 def join_endpoints(kernel, emission, stream, counters, active):
@@ -205,7 +205,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     camera_side = 0
     if kernel.plan.arrival:
         towards = kernel.emitters.direction_density(emission, join.p, join.d, active)
-        covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
+        covered = ~emission.infinite | kernel.emitters.disks.covers(join.p, join.d)
         towards = dr.select(covered, towards, 0)
         camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)

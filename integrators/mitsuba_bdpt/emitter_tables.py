@@ -232,40 +232,6 @@ def _curved_faces(shape):
     return None if flat.all() else cross
 
 
-def boxes(scene) -> list:
-    """Bounding box of each shape. (Of meshes that Mitsuba merges when it loads a scene, ``bbox`` is that of
-    one part.)"""
-    found = []
-    for shape in scene.shapes():
-        box = mi.ScalarBoundingBox3f(shape.bbox())
-        params = mi.traverse(shape) if shape.is_mesh() else {}
-        if "vertex_positions" in params:
-            vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
-            box.expand(mi.ScalarPoint3f(vertices.min(axis=0).tolist()))
-            box.expand(mi.ScalarPoint3f(vertices.max(axis=0).tolist()))
-        found.append(box)
-    return found
-
-
-# A shape is a detail if it is not larger than this, relative to the scene; details are aimed at if the sphere
-# about them is not larger than that.
-DETAIL, NARROW = 0.25, 0.5
-
-
-def details(boxes: list, whole):
-    """Bounding sphere of the shapes that are small beside the scene, whose box is ``whole``; None if there
-    are none, or if they are spread over it."""
-    size = max(whole.extents())
-    small = mi.ScalarBoundingBox3f()
-    for box in boxes:
-        if box.valid() and max(box.extents()) <= DETAIL * size:
-            small.expand(box)
-    if not small.valid():
-        return None
-    sphere = small.bounding_sphere()
-    return sphere if 0 < sphere.radius <= NARROW * whole.bounding_sphere().radius else None
-
-
 def inverse_table(pointers):
     """Emitter index by the number that Dr.Jit gives to a pointer."""
     ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()

@@ -49,15 +49,11 @@ from .emitter_tables import (
     Placement,
     Projectors,
     SmoothMeshes,
-    boxes,
-    details,
     inverse_table,
     placement,
 )
+from .infinity import Disks
 from .objects import children, living_emitters, number
-
-# Share of the light subpaths from infinity that are aimed at the scene's details, where it has some.
-AIMED = 0.5
 
 
 @dataclass
@@ -118,7 +114,7 @@ class Emitters:
     is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: one can be reached only
     by the light subpaths that it starts; ``evaluated``: one that lives, be it in another scene, makes it
     necessary to record kernels without symbolic loops, calls and branches. ``left_out``: what single ones
-    cannot take part in, and why. ``center`` and ``radius`` of a sphere about all shapes; ``quadrics`` of the
+    cannot take part in, and why. ``disks`` where light subpaths from infinity start; ``quadrics`` of the
     scene, for rays.
     """
 
@@ -154,20 +150,8 @@ class Emitters:
         self._inward_spheres = any(p.radius > 0 for p in placements)
         self._projectors = Projectors.of(emitters, kinds)
         self._inverse = inverse_table(self._pointers)
-        each, box = boxes(scene), mi.ScalarBoundingBox3f(scene.bbox())
-        for one in each:
-            box.expand(one)
-        sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
-        self._details = details(each, box) if self.at_infinity and box.valid() else None
-        self.center = mi.Point3f(sphere.center)
-        # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
-        self.radius = mi.Float(max(float(sphere.radius) * (1 + 1e-4), 1e-30))
-        dr.make_opaque(
-            self._kind, self._pmf, self._inv_area, self._placements, self._inverse, self.center, self.radius
-        )
-        if self._details is not None:
-            self._aim, self._aim_radius = mi.Point3f(self._details.center), mi.Float(self._details.radius)
-            dr.make_opaque(self._aim, self._aim_radius)
+        self.disks = Disks(scene, aimed=self.at_infinity)
+        dr.make_opaque(self._kind, self._pmf, self._inv_area, self._placements, self._inverse)
 
     def _read_shapes(self, scene, emitters, kinds):
         """Areas of the emitting shapes, how their points are chosen, and their geometric normals."""
@@ -224,19 +208,6 @@ class Emitters:
             return mi.UInt32(0), mi.Float(1), u
         index, _, u = self.scene.sample_emitter(u, active)
         return index, dr.gather(mi.Float, self._pmf, index, active), u
-
-    def _disk_density(self, p, d):
-        """Density, per area across ``d``, of the subpaths from infinity along ``d`` at the point ``p``."""
-        everywhere = dr.rcp(dr.pi * dr.square(self.radius))
-        if self._details is None:
-            return everywhere
-        aside2 = _aside2(p - self.center, d)
-        density = dr.select(aside2 <= dr.square(self.radius), (1 - AIMED) * everywhere, 0)
-        aimed = AIMED * dr.rcp(dr.pi * dr.square(self._aim_radius))
-        return density + dr.select(self._is_aimed_at(p, d), aimed, 0)
-
-    def _is_aimed_at(self, p, d):
-        return _aside2(p - self._aim, d) <= dr.square(self._aim_radius)
 
     def _direction_density(self, index, d, active):
         """Solid-angle density of the emission into the direction ``d`` from emitters at a point."""
@@ -414,14 +385,13 @@ class Emitters:
 
     def _emit_infinite(self, emitter, index, u_point, u_direction, like, active) -> Emission:
         it = dr.zeros(mi.Interaction3f)
-        it.p, it.time, it.wavelengths = mi.Point3f(self.center), like.time, like.wavelengths
+        it.p, it.time, it.wavelengths = mi.Point3f(self.disks.scene.center), like.time, like.wavelengths
         ds, weight = emitter.sample_direction(it, u_direction, active)
         directional = self._is(index, active, DIRECTIONAL)
         d = -ds.d
-        p = self._start_at_infinity(d, u_point)
+        p, pdf_second = self.disks.start(d, u_point)
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.p, si.time, si.wavelengths = d, p, like.time, like.wavelengths
-        pdf_second = self._disk_density(p, d)
         return Emission(
             weight=dr.select(ds.pdf > 0, weight / pdf_second, 0),
             d=d,
@@ -435,19 +405,6 @@ class Emitters:
             index=index,
             si=si,
         )
-
-    def _start_at_infinity(self, d, u):
-        """A point on the disk across ``d`` that covers the scene: anywhere, or aimed at the details."""
-        center, radius = self.center, self.radius
-        if self._details is not None:
-            aimed = u.x < AIMED
-            u = mi.Point2f(dr.select(aimed, u.x / AIMED, (u.x - AIMED) / (1 - AIMED)), u.y)
-            along = dr.dot(self._aim - self.center, d)
-            center = dr.select(aimed, self._aim - along * d, center)
-            radius = dr.select(aimed, self._aim_radius, radius)
-        disk = mi.warp.square_to_uniform_disk_concentric(u)
-        frame = mi.Frame3f(d)
-        return center + radius * (frame.s * disk.x + frame.t * disk.y) - self.radius * d
 
     def connection_density(self, emission: Emission, si, active):
         """Density of next-event estimation making y_0 of ``emission`` from its first hit ``si``.
@@ -472,18 +429,9 @@ class Emitters:
             density = dr.select(here, pmf * pdf * emission.cos, density)
         return dr.select(emission.beam, 0, density) if self.beams else density
 
-    def covers(self, p, d):
-        """Mask: light that travels along ``d`` from infinity passes ``p`` on its way from the disk where its
-        subpaths start. Points of a shape are all covered."""
-        along = dr.dot(p - self.center, d)
-        passed = _aside2(p - self.center, d) <= dr.square(self.radius)
-        if self._details is not None:
-            passed |= self._is_aimed_at(p, d)
-        return passed & (along >= -self.radius)
-
     def direction_density(self, emission: Emission, p, d, active):
         """Density with which emission from y_0 goes along ``d`` to ``p``, in ``pdf_second``'s measure."""
-        density = self._disk_density(p, d)  # what is not at infinity is replaced
+        density = self.disks.density(p, d)  # what is not at infinity is replaced
         if AREA in self.kinds:
             mask = self._is(emission.index, active, AREA)
             cos = dr.dot(emission.si.sh_frame.n, d)
@@ -557,7 +505,7 @@ class Emitters:
             here = self._is(index, active, *POSITIONS)
             emitted = self._direction_density(index, -ds.d, here) / dr.square(ds.dist)
             ratio = dr.select(here, emitted, ratio)
-        ratio = dr.select(infinite, self._disk_density(si.p, ds.d), ratio)
+        ratio = dr.select(infinite, self.disks.density(si.p, ds.d), ratio)
         if UNKNOWN in self.kinds:
             ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
         curvature = mi.Float(0)
@@ -593,7 +541,7 @@ class Emitters:
         else:
             ds.n = mi.Normal3f(si.n)
         pdf = pmf * self._pdf_direction(emitter, index, it, ds, active)
-        connect, first, second = mi.Float(pdf), mi.Float(pdf), self._disk_density(previous, ds.d)
+        connect, first, second = mi.Float(pdf), mi.Float(pdf), self.disks.density(previous, ds.d)
         on_surface = si.is_valid()
         if self.kinds & {AREA, UNKNOWN}:
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
@@ -626,11 +574,6 @@ class Emitters:
         if self.count == 1:
             return mi.Float(1)
         return dr.gather(mi.Float, self._pmf, index, active)
-
-
-def _aside2(offset, d):
-    """Squared distance of ``offset`` from the line along ``d``."""
-    return dr.squared_norm(offset - dr.dot(offset, d) * d)
 
 
 def _all_answer(pointers) -> bool:

@@ -1,4 +1,4 @@
-"""The integrator plugin ``bdpt``: parameters, passes, statistics."""
+"""The integrator plugin ``bdpt``: its manual, its class, what it logs."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ All of them are combined by multiple importance sampling.
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
-that is called with a `PassReport` after each pass.
+that is called with a `rendering.PassReport` after each pass.
 
 Not supported, and refused in words: scalar and polarized variants, participating media,
 derivatives, ``strategy_images`` on a ``specfilm``. Emitters and sensors of every kind take part; where
@@ -221,7 +221,7 @@ def _samples(sensor, spp, settings) -> int:
 
 
 def _whole_sets(sampler, spp: int, parts: int) -> int:
-    """``spp``, rounded up so that each of ``parts`` (see `schedule`) is a number of samples that the
+    """``spp``, rounded up so that each of ``parts`` (see `passes.schedule`) is a number of samples that the
     sampler makes: stratified ones do not make any."""
 
     def made(count):

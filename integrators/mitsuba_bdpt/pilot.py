@@ -50,11 +50,6 @@ class Weighting:
     light: float
     inner: float
 
-    @property
-    def kappas(self) -> tuple:
-        """In the order of `mis.CLASSES`."""
-        return self.hit, self.direct, self.light, self.inner
-
     def of(self, kind: str) -> float:
         """kappa of a class."""
         return getattr(self, kind)
@@ -159,18 +154,18 @@ class Pilot:
             size = self._size(c)
             own, _ = _parts(size, c)
             own_visible, moments = _parts(dr.select(visible, size, 0), c)
-            new = {"before": own, "after": own_visible, **moments}
+            new = {"unshadowed": own, "visible": own_visible, **moments}
             return {name: _sums(total[name], more) for name, more in new.items()}
 
-        before = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
-        found = {"before": _none(_PARTS["draw"]), "after": _none(_PARTS["draw"])}
+        tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
+        found = {"unshadowed": _none(_PARTS["draw"]), "visible": _none(_PARTS["draw"])}
         found |= {name: total[name] for name in ("moment", "light")}
         found = connect.connect_all(kernel, z, lane.path, counters, found, add)
-        shadowed, seen = found.pop("before"), found.pop("after")
+        unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.
-        draw = [d + a * (b - a) for d, b, a in zip(total["draw"], shadowed, seen, strict=True)]
-        joined = total["joined"] + dr.select(counters["shadow_inner"] > before, mi.UInt32(1), 0)
+        draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
+        joined = total["joined"] + dr.select(counters["shadow_inner"] > tested, mi.UInt32(1), 0)
         # In the order of `begin`, as a loop's state has to be.
         return total | found | {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
 
@@ -180,7 +175,9 @@ class Pilot:
         row = self._group(dr.arange(mi.UInt32, self._lanes)) * TILES**2 + self._tile(position)
         _, moments = _parts(size, c)
         _add(self._splats, _SPLAT_COLUMNS, [size, *moments["moment"], *moments["light"]], row, size > 0)
-        counters["non_finite"] += dr.select(c.active & ~dr.isfinite(_size(c)), mi.UInt32(1), 0)
+        # As `sinks.Image` does: loops hold the counters that they change.
+        broken = c.active & ~dr.isfinite(_mean_colour(c))
+        counters["non_finite"] += dr.select(broken, mi.UInt32(1), mi.UInt32(0))
 
     def end(self, kernel, lane, sample, total, seen, counters):
         """Add a camera sample."""
@@ -223,8 +220,10 @@ class Pilot:
             return np.pad(total, ((0, 0), (len(WEIGHTINGS) - total.shape[1], 0))) * (GROUPS / lanes)
 
         end = 1 + _PARTS["moment"]
+        with np.errstate(invalid="ignore"):  # inf - inf, of weightings that are ruled out
+            base = estimate**2 + moment - estimate * other
         return Moments(
-            base=summed(estimate**2 + moment - estimate * other, splats[:, :, 1:end]),
+            base=summed(base, splats[:, :, 1:end]),
             light=summed(light, splats[:, :, end : end + _PARTS["light"]]),
             draw=summed(draw),
             mean=float(np.median(by_group) * GROUPS / lanes),
@@ -239,7 +238,7 @@ class Pilot:
         else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
         (1,1) finds and path tracing alone hardly.
         """
-        size = _size(c)
+        size = _mean_colour(c)
         return dr.select(c.active & (c.s + c.t > 2) & dr.isfinite(size), size, 0)
 
     def _group(self, lane):
@@ -282,7 +281,7 @@ def _add(target, columns: int, values, row, active):
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
 
 
-def _size(c):
+def _mean_colour(c):
     """Mean of the colours of a contribution, which adds up unlike the largest."""
     return dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
 
@@ -307,7 +306,7 @@ def _parts(size, c):
     own, moments, lights = [], [], []
     for w in WEIGHTINGS:
         total = _dot(w, shares, 1)
-        # Whose class has a share of its own can make the path; a weighting that cannot is ruled out.
+        # With inner connections every class is in use; a weighting that cannot make the path is ruled out.
         possible = mi.Bool(True) if w.inner else total > 0
         scale = size / total
         square = dr.square(scale)

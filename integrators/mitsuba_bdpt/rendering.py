@@ -76,7 +76,7 @@ class Render:
         border = self.world.camera.region.border
         self.accumulator = Accumulator(sensor.film(), colour, border, depth, settings.variance, features)
         self._samplers, self._running = {}, []
-        self.decisions, self._moments, self._small = [], None, None
+        self.decisions, self._moments, self._threshold = [], None, None
         self._pilots, self._changes, self._next_pilot = 0, 0, FIRST_REPEAT
         self._use(self.plan)
         self._counts = dict.fromkeys(COUNTERS, 0)
@@ -118,14 +118,14 @@ class Render:
         if self.decisions and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
             self._changes += 1
         self.decisions.append(decision)
-        self._small = decision.small
+        self._threshold = decision.threshold
         self._use(adopted)
 
     def _use(self, chosen):
         self.plan = chosen
         self.kernel = Kernel(self.world, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
-        if self._small and chosen.roulette:
-            self.kernel.set_threshold(dr.opaque(mi.Float64, self._small))
+        if self._threshold and chosen.roulette:
+            self.kernel.set_threshold(dr.opaque(mi.Float64, self._threshold))
 
     def replay(self, number: int):
         """Adopt the decision that is given for the pass of this ``number``, if there is one."""
@@ -173,7 +173,7 @@ class Render:
     def _steps(self):
         """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
         # The first pass gives roulette the scale of the image, if no pilot has.
-        known = self._small is not None or self.settings.decisions
+        known = self._threshold is not None or self.settings.decisions
         small_first = self.plan.roulette and self.plan.light and not known
         for step in schedule(self.world.camera, self.spp, self.settings, small_first):
             done, end = step.done, step.done + step.size
@@ -190,7 +190,7 @@ class Render:
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
 
     def _pass(self, step: Step):
-        first = not self.accumulator.passes and self._small is None
+        first = not self.accumulator.passes and self._threshold is None
         for launch, batch in enumerate(batches(self.world.camera, step.done, step.size, self.settings)):
             if launch:
                 self._wait()

@@ -97,6 +97,9 @@ class Side:
     side). ``complete``: called with the first vertex of a light subpath, returns the density of
     next-event estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event
     other than null happened. ``parallel``: the first edge has one direction, its density is one across it.
+    ``join``: called with each vertex, returns the endpoint of the other side with which it is to be joined
+    (`emitters.Direct`, or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no
+    strategy does so.
     """
 
     name: str
