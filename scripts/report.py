@@ -324,11 +324,14 @@ def _cost(results: Results, scene: str) -> str:
 
 
 def _pilot(results: Results, scene: str) -> str:
-    """At the deciding budget: in the committed rows of larger ones a second pilot waited for another pass."""
-    rows = results.of(scene, results.methods[0], results.deciding)
-    if not rows:
-        raise Refused(f"no render of {scene} at {results.deciding} spp")
-    return f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} % at {results.deciding} spp"
+    found = []
+    for budget in (results.deciding, 4 * results.deciding):
+        rows = results.of(scene, results.methods[0], budget)
+        if rows:
+            found.append(f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} % at {budget} spp")
+    if not found:
+        raise Refused(f"no render of {scene}")
+    return ", ".join(found)
 
 
 def _floor(results: Results) -> str:
@@ -381,8 +384,13 @@ def goals_table(results: Results, goals) -> str:
             figure = "not measured yet"
         else:
             figure = said(lambda m=measure, n=names: GOALS[m](results, *n), str)
-        lines.append([goal["what"], goal["at_least"], figure])
-    return table(["what", "at least", "measured"], lines)
+        lines.append([goal["what"], goal["at_least"], goal.get("aim", "–"), figure])
+    return table(["what", "at least", "aim", "measured"], lines)
+
+
+def tried_text(goals) -> str:
+    """What was tried for goals that are not reached, or far from their aim."""
+    return "".join(f"* {goal['what']}: {goal['tried']}\n" for goal in goals if "tried" in goal)
 
 
 # -- files ------------------------------------------------------------------------------------
@@ -447,7 +455,7 @@ holds the median in 90 % of cases, not 95 %).
 """
     ]
     if goals:
-        parts.append(f"## Goals\n\n{goals_table(results, goals)}")
+        parts.append(f"## Goals\n\n{goals_table(results, goals)}\n{tried_text(goals)}")
     parts.append(
         f"""## Efficiency
 

@@ -215,7 +215,14 @@ def test_tables_say_what_the_rows_say(results):
 
 def test_goals_stand_beside_what_is_measured(results):
     goals = [
-        {"what": "box", "at_least": "1.4x", "measure": "efficiency", "scene": "box"},
+        {
+            "what": "box",
+            "at_least": "1.4x",
+            "aim": "2x",
+            "measure": "efficiency",
+            "scene": "box",
+            "tried": "larger boxes",
+        },
         {"what": "worst", "at_least": "0.97x", "measure": "worst"},
         {"what": "near", "at_least": "0.96x", "measure": "near one", "scene": "box"},
         {"what": "cost", "at_least": "3x", "measure": "cost", "scene": "box"},
@@ -228,26 +235,29 @@ def test_goals_stand_beside_what_is_measured(results):
         {"what": "dark", "at_least": "1x", "measure": "efficiency", "scene": "dark"},
     ]
     text = report.goals_table(results, goals)
-    assert cells(text, "box") == ["1.4x", "0.8x (0.8–0.8)"]
+    assert cells(text, "box") == ["1.4x", "2x", "0.8x (0.8–0.8)"]
     near = "0.800x, interval 0.800–0.800, 16 pairs"
-    assert cells(text, "worst") == ["0.97x", f"`box` of 1 scenes: {near}"]
+    assert cells(text, "worst") == ["0.97x", "–", f"`box` of 1 scenes: {near}"]
     assert cells(text, "near") == [
         "0.96x",
+        "–",
         f"{near.replace('0.8', '2.0')} over path; {near} over path multijitter",
     ]
-    assert cells(text, "cost") == ["3x", "3x (3–3) / 1.5x (1.5–1.5)"]
+    assert cells(text, "cost") == ["3x", "–", "3x (3–3) / 1.5x (1.5–1.5)"]
     assert cells(text, "alone") == [
         "1x",
+        "–",
         "fewer than two renders at 64 spp, fewer than two renders at 256 spp",
     ]
-    assert cells(text, "none") == ["2x", "3x, 2 of 2 scenes"]
-    assert cells(text, "cold") == ["4x", "4.00 s, 2x (2–2) `path`'s"]
-    assert cells(text, "memory") == ["1 GiB", "not measured"]
-    assert cells(text, "floor") == ["1x", "1.3x (1.2–1.4) `box`"]
-    assert cells(text, "nothing") == ["1x", "not measured yet"]
-    dark = cells(text, "dark")[1]
+    assert cells(text, "none") == ["2x", "–", "3x, 2 of 2 scenes"]
+    assert cells(text, "cold") == ["4x", "–", "4.00 s, 2x (2–2) `path`'s"]
+    assert cells(text, "memory") == ["1 GiB", "–", "not measured"]
+    assert cells(text, "floor") == ["1x", "–", "1.3x (1.2–1.4) `box`"]
+    assert cells(text, "nothing") == ["1x", "–", "not measured yet"]
+    dark = cells(text, "dark")[2]
     assert dark.startswith("path: 9.8 % of the energy is missing")
     assert dark.endswith("(against their error all the same: 2x (2–2), 0.8x (0.8–0.8))")
+    assert report.tried_text(goals) == "* box: larger boxes\n"
 
 
 def test_slopes_need_an_explanation():
@@ -345,7 +355,7 @@ def test_a_report_is_written(results, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.argv", ["report.py", str(tmp_path), "--readme", str(readme)])
     report.main()
     page = (tmp_path / "README.md").read_text()
-    assert "* `box`: why" in page and cells(page, "floor") == ["1x", "not measured yet"]
+    assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet"]
     assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
     for name in ("efficiency", "seconds", "samples", "rays"):

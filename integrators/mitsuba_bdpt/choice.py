@@ -17,7 +17,7 @@ from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
 # `LEAST_SAMPLES` has none. A pilot's sample takes three to seven times as long as one of path tracing alone,
-# and another 20 to 40 ms go to recording it.
+# and recording it takes 15 to 25 ms more (scripts/overhead.py).
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES = 1 << 19
