@@ -337,8 +337,7 @@ def test_aimed_points_know_that_they_are(scale):
                 "ground": {"type": "rectangle", "to_world": transform.scale(scale)},
                 "ball": {"type": "sphere", "center": [0.3, 0.2, 1], "radius": 1.0},
             }
-        ),
-        aimed=True,
+        )
     )
     u = [mi.Float(v) for v in numbers(4)]
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[2], u[3]))
@@ -359,7 +358,7 @@ def test_a_vertex_that_is_not_finite():
     params["faces"] = [0, 1, 2, 1, 2, 3]
     params.update()
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "sky": {"type": "constant"}})
-    sphere = infinity.Disks(scene, aimed=True).scene
+    sphere = infinity.Disks(scene).scene
     np.testing.assert_allclose(np.array(sphere.center).ravel(), [1, 1, 0], atol=1e-6)
     assert float(sphere.radius[0]) == pytest.approx(np.sqrt(2), rel=1e-3)
 

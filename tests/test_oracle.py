@@ -510,7 +510,9 @@ class Lights:
         )
 
     at_infinity = True
-    disks = SimpleNamespace(covers=lambda p, d: mi.Bool(True))
+
+    def covers(self, p, d):
+        return mi.Bool(True)
 
     def direction_density(self, emission, p, d, active):
         return self.second

@@ -132,7 +132,7 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, connect))
     older = dr.select(kernel.within_store(z.edges), first * second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
-        older = dr.select(z.hit | ~directly | emitters.disks.covers(z.previous, z.si.wi), older, 0)
+        older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
@@ -205,7 +205,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     camera_side = 0
     if kernel.plan.arrival:
         towards = kernel.emitters.direction_density(emission, join.p, join.d, active)
-        covered = ~emission.infinite | kernel.emitters.disks.covers(join.p, join.d)
+        covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
         towards = dr.select(covered, towards, 0)
         camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)

@@ -114,8 +114,8 @@ class Emitters:
     is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: one can be reached only
     by the light subpaths that it starts; ``evaluated``: one that lives, be it in another scene, makes it
     necessary to record kernels without symbolic loops, calls and branches. ``left_out``: what single ones
-    cannot take part in, and why. ``disks`` where light subpaths from infinity start; ``quadrics`` of the
-    scene, for rays.
+    cannot take part in, and why. ``disks`` where light subpaths from infinity start, if any do;
+    ``quadrics`` of the scene, for rays.
     """
 
     def __init__(self, scene):
@@ -150,7 +150,7 @@ class Emitters:
         self._inward_spheres = any(p.radius > 0 for p in placements)
         self._projectors = Projectors.of(emitters, kinds)
         self._inverse = inverse_table(self._pointers)
-        self.disks = Disks(scene, aimed=self.at_infinity)
+        self.disks = Disks(scene) if self.at_infinity else None
         dr.make_opaque(self._kind, self._pmf, self._inv_area, self._placements, self._inverse)
 
     def _read_shapes(self, scene, emitters, kinds):
@@ -208,6 +208,14 @@ class Emitters:
             return mi.UInt32(0), mi.Float(1), u
         index, _, u = self.scene.sample_emitter(u, active)
         return index, dr.gather(mi.Float, self._pmf, index, active), u
+
+    def _density_across(self, p, d):
+        """`Disks.density`; 0 where no light subpath starts at infinity."""
+        return self.disks.density(p, d) if self.disks is not None else mi.Float(0)
+
+    def covers(self, p, d):
+        """`Disks.covers`; true where no light subpath starts at infinity."""
+        return self.disks.covers(p, d) if self.disks is not None else mi.Bool(True)
 
     def _direction_density(self, index, d, active):
         """Solid-angle density of the emission into the direction ``d`` from emitters at a point."""
@@ -431,7 +439,7 @@ class Emitters:
 
     def direction_density(self, emission: Emission, p, d, active):
         """Density with which emission from y_0 goes along ``d`` to ``p``, in ``pdf_second``'s measure."""
-        density = self.disks.density(p, d)  # what is not at infinity is replaced
+        density = self._density_across(p, d)  # what is not at infinity is replaced
         if AREA in self.kinds:
             mask = self._is(emission.index, active, AREA)
             cos = dr.dot(emission.si.sh_frame.n, d)
@@ -505,7 +513,7 @@ class Emitters:
             here = self._is(index, active, *POSITIONS)
             emitted = self._direction_density(index, -ds.d, here) / dr.square(ds.dist)
             ratio = dr.select(here, emitted, ratio)
-        ratio = dr.select(infinite, self.disks.density(si.p, ds.d), ratio)
+        ratio = dr.select(infinite, self._density_across(si.p, ds.d), ratio)
         if UNKNOWN in self.kinds:
             ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
         curvature = mi.Float(0)
@@ -541,7 +549,7 @@ class Emitters:
         else:
             ds.n = mi.Normal3f(si.n)
         pdf = pmf * self._pdf_direction(emitter, index, it, ds, active)
-        connect, first, second = mi.Float(pdf), mi.Float(pdf), self.disks.density(previous, ds.d)
+        connect, first, second = mi.Float(pdf), mi.Float(pdf), self._density_across(previous, ds.d)
         on_surface = si.is_valid()
         if self.kinds & {AREA, UNKNOWN}:
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)

@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .objects import parameters
+
 # A shape is a detail if the longest side of its box is not more than this part of the scene's.
 DETAIL = 0.25
 
@@ -54,16 +56,16 @@ class Sphere:
 
 class Disks:
     """Disks of a scene: ``scene`` the `Sphere` about all shapes, ``details`` that about its details, or None
-    if it has none or if not ``aimed``."""
+    if it has none."""
 
-    def __init__(self, scene, aimed: bool):
+    def __init__(self, scene):
         each, box = boxes(scene), mi.ScalarBoundingBox3f()
         for one in each:
             box.expand(one)
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
         # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
         self.scene = Sphere.about(sphere, 1e-4)
-        found = details(each, box) if aimed and box.valid() else None
+        found = details(each, box) if box.valid() else None
         self.details = Sphere.about(found, 1e-4) if found is not None else None
 
     def start(self, d, u):
@@ -110,7 +112,7 @@ def boxes(scene) -> list:
     found = []
     for shape in scene.shapes():
         box = mi.ScalarBoundingBox3f(shape.bbox())
-        params = mi.traverse(shape) if shape.is_mesh() else {}
+        params = parameters(shape) if shape.is_mesh() else {}
         if "vertex_positions" in params:
             vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
             vertices = vertices[np.isfinite(vertices).all(axis=1)]
