@@ -3,8 +3,8 @@
     python scripts/strategy_noise.py ajar_door glass_caustics
 
 From the technique images of renders with everything switched on (64^2): the relative variance of a sample,
-raw and trimmed of its worst 0.1 % of values, of the image and of each strategy's weighted part of it. What the
-strategies' variances lack to that of the image is the covariance of strategies that share a subpath.
+raw and trimmed of its worst 0.1 % of values, of the image and of each strategy's weighted part of it. What
+the strategies' variances lack to that of the image is the covariance of strategies that share a subpath.
 """
 
 from __future__ import annotations

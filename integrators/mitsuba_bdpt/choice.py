@@ -172,15 +172,15 @@ class Candidate:
     def decided(self, first_pass: int, cost: float, variance: float, mean: float) -> Decision:
         """The decision for this candidate."""
         weighting = WEIGHTINGS[self.weighting]
+        # Six digits: further ones depend on the order in which the pilot's lanes were added up.
+        numbers = {"cost": cost, "variance": variance, "mean": mean}
         return Decision(
             first_pass=first_pass,
-            light_paths=self.light_paths,
+            light_paths=float(self.light_paths),
             connections=self.connections,
             splat_coefficient=weighting.light * self.served if weighting.light else 1.0,
-            direct_coefficient=weighting.direct,
-            cost=cost,
-            variance=variance,
-            mean=mean,
+            direct_coefficient=float(weighting.direct),
+            **{name: float(f"{number:.6g}") for name, number in numbers.items()},
         )
 
 
