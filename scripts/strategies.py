@@ -1,0 +1,125 @@
+"""The technique pyramid of a scene: what each strategy (s, t) makes of it.
+
+    python scripts/strategies.py veach_bidir -o renders/pyramid
+    python scripts/strategies.py scenes/pool.xml --max-depth 4 --spp 256 -o renders/pool
+
+A row for each path length of k = 2, 3, ... edges with the k + 2 ways (s, t) to make such paths, s light
+vertices and t camera vertices, brightened by 2^(k-1); strategies that contribute nothing are left out.
+
+Written are OUTPUT.exr, with the image and the layers ``weighted.s{S}t{T}.R`` ... and
+``unweighted.s{S}t{T}.R`` ..., and the pyramids OUTPUT_weighted.png, which adds up to the image, and
+OUTPUT_unweighted.png, in which each panel is an estimate by itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import matplotlib
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import numpy as np
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+import mitsuba as mi  # noqa: E402
+from metrics import tone_map  # noqa: E402
+from mitsuba_bdpt.render import write_images  # noqa: E402
+from mitsuba_bdpt.strategies import strategies  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
+
+SHORTEST = 2  # edges: of single ones the emitters themselves are seen
+
+
+def scene_file(name: str) -> Path:
+    """A file, or one of scenes/ by its name; raises ``ValueError`` if there is none."""
+    for path in (Path(name), ROOT / "scenes" / f"{name}.xml"):
+        if path.is_file():
+            return path
+    raise ValueError(f"scene={name!r} is neither a file nor the name of one in scenes/")
+
+
+def render(path: Path, options):
+    """The film after a render with technique images, and its layers by name, shape (height, width)."""
+    values = {"resolution": str(options.resolution)} if options.resolution else {}
+    scene = mi.load_file(str(path), **values)
+    integrator = mi.load_dict(
+        {
+            "type": "bdpt",
+            "max_depth": options.max_depth,
+            "strategy_images": True,
+            "heuristic": options.heuristic,
+        }
+    )
+    image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
+    names = integrator.aov_names()
+    first = image.shape[-1] - len(names)
+    return scene.sensors()[0].film(), {name: image[..., first + i] for i, name in enumerate(names)}
+
+
+def panels(layers: dict, kind: str, depth: int) -> dict:
+    """Images (height, width, 3) of the strategies that contribute anything, by (k, s, t)."""
+    found = {}
+    for k, s, t in strategies(depth):
+        image = np.stack([layers[f"{kind}.s{s}t{t}.{channel}"] for channel in "RGB"], axis=-1)
+        if k >= SHORTEST and image.any():
+            found[k, s, t] = image
+    return found
+
+
+def draw(found: dict, path: Path, exposure: float):
+    """The pyramid as a picture: rows of path lengths, s rising to the right."""
+    lengths = sorted({k for k, _, _ in found})
+    rows = [[key for key in found if key[0] == k] for k in lengths]
+    columns = max(len(row) for row in rows)
+    height, width = next(iter(found.values())).shape[:2]
+    panel, margin, title = 1.9, 0.5, 0.3  # inches
+    high = panel * height / width + title
+    wide = margin + panel * columns
+    figure = plt.figure(figsize=(wide, high * len(rows)))
+    for i, row in enumerate(rows):
+        bottom = 1 - (i + 1) / len(rows)
+        for j, (k, s, t) in enumerate(row):
+            # Rows are centred, which makes the pyramid.
+            left = margin + panel * (j + (columns - len(row)) / 2)
+            box = (left / wide, bottom, 0.97 * panel / wide, (1 - title / high) / len(rows))
+            axis = figure.add_axes(box)
+            axis.imshow(tone_map(found[k, s, t], exposure + k - 1), interpolation="nearest")
+            axis.set_title(f"s = {s}, t = {t}", fontsize=8, pad=2)
+            axis.set_axis_off()
+        text = f"k = {lengths[i]}\n{2 ** (lengths[i] - 1)}x"
+        figure.text(0.05 / wide, bottom + 0.5 / len(rows), text, fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(arguments=None) -> int:
+    """Render, write, say what was written."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("scene", help="a scene file, or a name in scenes/")
+    parser.add_argument("-o", "--output", type=Path, help="default: renders/pyramid_SCENE")
+    parser.add_argument("--max-depth", type=int, default=5, help="longest path in edges; default 5")
+    parser.add_argument("--spp", type=int, default=64)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--resolution", type=int, help="value of $resolution in the scene file")
+    parser.add_argument("--heuristic", default="balance")
+    parser.add_argument("--exposure", type=float, default=0.0, help="stops, of the pictures")
+    options = parser.parse_args(arguments)
+    mi.set_variant("llvm_ad_rgb")
+    path = scene_file(options.scene)
+    output = options.output or ROOT / "renders" / f"pyramid_{path.stem}"
+    film, layers = render(path, options)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_images(film, output.with_suffix(".exr"), {"heuristic": options.heuristic}, options.exposure)
+    for kind in ("weighted", "unweighted"):
+        file = output.with_name(f"{output.name}_{kind}.png")
+        draw(panels(layers, kind, options.max_depth), file, options.exposure)
+        print(file)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

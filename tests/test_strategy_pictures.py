@@ -1,0 +1,61 @@
+"""Pictures of single strategies: scripts/strategies.py."""
+
+import matplotlib.image
+import numpy as np
+import OpenEXR
+import pytest
+import strategies
+
+SCENE = """<scene version="3.0.0">
+    <default name="spp" value="4"/> <default name="resolution" value="16"/>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="$resolution"/> <integer name="height" value="$resolution"/>
+            <rfilter type="box"/> <string name="pixel_format" value="rgb"/>
+            <string name="component_format" value="float32"/>
+        </film>
+    </sensor>
+    <shape type="sphere"><float name="radius" value="5"/><boolean name="flip_normals" value="true"/></shape>
+    <shape type="sphere"><float name="radius" value="0.3"/>
+        <emitter type="area"><rgb name="radiance" value="3, 2, 1"/></emitter></shape>
+</scene>"""
+
+
+def test_pyramid(tmp_path, capsys):
+    """Expected: an EXR whose layers OpenEXR finds by the names of the contract, whose weighted ones add up to
+    the image (float32: 1e-4), and two pictures of the pyramid with a row for k = 2 and one for k = 3."""
+    file = tmp_path / "room.xml"
+    file.write_text(SCENE)
+    output = tmp_path / "made" / "room"
+    strategies.main([str(file), "-o", str(output), "--max-depth", "3", "--spp", "8", "--resolution", "16"])
+    said = capsys.readouterr().out.split()
+    assert said == [f"{output}_weighted.png", f"{output}_unweighted.png"]
+    with OpenEXR.File(str(output.with_suffix(".exr")), separate_channels=True) as opened:
+        channels = {name: np.array(c.pixels, dtype=float) for name, c in opened.channels().items()}
+    for channel in "RGB":
+        layers = [v for k, v in channels.items() if k.startswith("weighted.") and k.endswith("." + channel)]
+        assert len(layers) == 12  # 3 + 4 + 5 of 1, 2 and 3 edges
+        np.testing.assert_allclose(sum(layers), channels[channel], rtol=1e-4, atol=1e-5)
+        assert f"unweighted.s2t2.{channel}" in channels
+    for name in said:
+        picture = matplotlib.image.imread(name)[..., :3]
+        height, width = picture.shape[:2]
+        assert width > 400 and height > 400 and 0.02 < picture.mean() < 0.98
+
+
+def test_panels_are_those_that_contribute():
+    """Expected: neither single edges nor strategies whose layer is black, in the order of path lengths."""
+    names = [f"weighted.s{s}t{k + 1 - s}.{c}" for k in (1, 2, 3) for s in range(k + 2) for c in "RGB"]
+    layers = {name: np.zeros((2, 2)) for name in names}
+    layers["weighted.s0t2.R"] += 1
+    layers["weighted.s1t2.G"] += 1
+    layers["weighted.s2t2.B"][0, 0] = 1
+    assert list(strategies.panels(layers, "weighted", 3)) == [(2, 1, 2), (3, 2, 2)]
+
+
+def test_scenes_by_name_or_file(tmp_path):
+    """Expected: a name in scenes/, or a file; else an error that says so."""
+    assert strategies.scene_file("cornell_box").name == "cornell_box.xml"
+    with pytest.raises(ValueError, match="scene='nothing' is neither a file nor the name of one in scenes/"):
+        strategies.scene_file("nothing")
