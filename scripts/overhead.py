@@ -2,10 +2,11 @@
 
     python scripts/overhead.py cornell_box veach_mis open_sky
 
-Medians over rounds in which all of them alternate, at 128^2. The cost of a sample: seconds of a whole render
-of 64 samples per pixel less those of 4, so that what is fixed cancels. Beside `path`: path tracing alone
-(light_paths=0) with its points and with independent numbers. The pilot: its seconds, of the statistics, in
-renders of 64 and 256 samples per pixel, and its share of these.
+Medians over rounds in which all of them alternate, at 128^2. The cost of a sample, over that of `path`: seconds
+of a whole render of 64 samples per pixel less those of 4, so that what is fixed cancels. Path tracing alone
+(light_paths=0) with its points and with independent numbers; a light subpath for 16 camera subpaths without
+inner connections, with one per vertex, with all; everything switched on. The pilot: its seconds, of the statistics,
+in renders of 64 and 256 samples per pixel, and its share of these.
 """
 
 from __future__ import annotations
@@ -25,11 +26,16 @@ from report import table
 ROUNDS, SHORT, LONG = 7, 4, 64
 
 ALONE = {"type": "bdpt", "light_paths": 0}
+SHARED = {"type": "bdpt", "light_paths": 1 / 16}
 METHODS = {
     "path": ({"type": "path"}, "independent"),
     "path multijitter": ({"type": "path"}, "multijitter"),
     "path tracing alone": (ALONE, "independent"),
-    "with independent numbers": (ALONE | {"points": "independent"}, "independent"),
+    "independent numbers": (ALONE | {"points": "independent"}, "independent"),
+    "1/16, none": (SHARED | {"connections": "none"}, "independent"),
+    "1/16, one": (SHARED | {"connections": "one"}, "independent"),
+    "1/16, all": (SHARED | {"connections": "all"}, "independent"),
+    "skip=none": ({"type": "bdpt", "skip": "none"}, "independent"),
 }
 
 
