@@ -29,6 +29,7 @@ import drjit as dr
 import metrics
 import reference
 from mitsuba_bdpt import choice, pilot, rendering
+from preset import benchmark_depth
 
 RESOLUTION, SPP, LANES, ROUNDS = 128, 64, 1 << 15, 4
 
@@ -135,7 +136,7 @@ def main(arguments=None) -> int:
     )
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
-    depths = {n: 6 if n == "cornell_box" else reference.default_depth(n) for n in options.scene}
+    depths = {name: benchmark_depth(name) for name in options.scene}
     if options.seeds:
         rows = [stability(name, depth, options.seeds) for name, depth in depths.items()]
         print(table(["scene", "chosen (seeds)", "above the best: median", "worst"], rows))

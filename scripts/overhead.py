@@ -21,6 +21,7 @@ import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
 import drjit as dr
 import reference
+from preset import benchmark_depth
 from report import table
 
 ROUNDS, SHORT, LONG = 7, 4, 64
@@ -50,7 +51,7 @@ def seconds(integrator, scene, spp: int, seed: int) -> float:
 
 def measure(name: str) -> list[str]:
     """A row of the table."""
-    depth = 6 if name == "cornell_box" else reference.default_depth(name)
+    depth = benchmark_depth(name)
     scenes = {
         s: reference.load_scene(name, resolution=128, sampler=s) for s in ("independent", "multijitter")
     }

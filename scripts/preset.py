@@ -45,6 +45,8 @@ from metrics import TILES
 
 MATCHES = ("seconds", "spp")
 
+BENCHMARK = Path(__file__).resolve().parents[1] / "presets" / "benchmark.toml"
+
 
 @dataclass(frozen=True)
 class Method:
@@ -131,6 +133,12 @@ def read_preset(path: Path) -> Preset:
         more=_more(path, data["more"], data["scenes"], methods) if "more" in data else None,
         probes=counts,
     )
+
+
+def benchmark_depth(name: str) -> int:
+    """The ``max_depth`` at which the benchmark renders a scene."""
+    scenes = tomllib.loads(BENCHMARK.read_text())["scene"]
+    return scenes.get(name, {}).get("max_depth") or reference.default_depth(name)
 
 
 def _check_keys(path, entry, needed, allowed, what):

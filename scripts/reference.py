@@ -124,15 +124,20 @@ def scene_file(name: str) -> Path:
 
 
 def load_scene(name: str, **definitions):
-    """A scene of scenes/ with its ``<default>``s replaced; ``resolution`` keeps the image's proportions."""
-    text = scene_file(name).read_text()
+    """A scene of scenes/ with its ``<default>``s replaced, see `load_file`."""
+    return load_file(scene_file(name), **definitions)
+
+
+def load_file(path: Path, **definitions):
+    """A scene with its ``<default>``s replaced; ``resolution`` keeps the image's proportions."""
+    text = path.read_text()
     width, height = (
         re.search(rf'<default name="{key}" value="(\d+)"', text) for key in ("resolution", "resolution_y")
     )
     if height and "resolution" in definitions:
         proportion = int(height[1]) / int(width[1])
         definitions["resolution_y"] = max(round(definitions["resolution"] * proportion), 1)
-    return mi.load_file(str(scene_file(name)), parallel=False, **definitions)
+    return mi.load_file(str(path), parallel=False, **definitions)
 
 
 def default_depth(name: str) -> int:

@@ -14,6 +14,7 @@ OUTPUT_unweighted.png, in which each panel is an estimate by itself.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
@@ -24,27 +25,43 @@ import numpy as np
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import mitsuba as mi  # noqa: E402
+import reference  # noqa: E402
 from metrics import tone_map  # noqa: E402
 from mitsuba_bdpt.render import write_images  # noqa: E402
-from mitsuba_bdpt.strategies import strategies  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+
+KINDS = ("weighted", "unweighted")
 
 SHORTEST = 2  # edges: of single ones the emitters themselves are seen
 
 
 def scene_file(name: str) -> Path:
     """A file, or one of scenes/ by its name; raises ``ValueError`` if there is none."""
-    for path in (Path(name), ROOT / "scenes" / f"{name}.xml"):
-        if path.is_file():
-            return path
-    raise ValueError(f"scene={name!r} is neither a file nor the name of one in scenes/")
+    if Path(name).is_file():
+        return Path(name)
+    try:
+        return reference.scene_file(name)
+    except ValueError as error:
+        raise ValueError(f"scene={name!r} is neither a file nor the name of one in scenes/") from error
+
+
+def technique_images(image, names: list, kind: str) -> dict:
+    """``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``, shape of ``image`` (..., 3),
+    out of a render whose last channels have these ``names``."""
+    first = image.shape[-1] - len(names)
+    found = {}
+    for i, name in enumerate(names):
+        if match := re.fullmatch(rf"{kind}\.s(\d+)t(\d+)\.R", name):
+            s, t = int(match[1]), int(match[2])
+            found[s + t - 1, s, t] = image[..., first + i : first + i + 3]
+    return found
 
 
 def render(path: Path, options):
-    """The film after a render with technique images, and its layers by name, shape (height, width)."""
-    values = {"resolution": str(options.resolution)} if options.resolution else {}
-    scene = mi.load_file(str(path), **values)
+    """The film after a render with technique images, and these, weighted and unweighted."""
+    values = {"resolution": options.resolution} if options.resolution else {}
+    scene = reference.load_file(path, **values)
     integrator = mi.load_dict(
         {
             "type": "bdpt",
@@ -55,18 +72,12 @@ def render(path: Path, options):
     )
     image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
     names = integrator.aov_names()
-    first = image.shape[-1] - len(names)
-    return scene.sensors()[0].film(), {name: image[..., first + i] for i, name in enumerate(names)}
+    return scene.sensors()[0].film(), {kind: technique_images(image, names, kind) for kind in KINDS}
 
 
-def panels(layers: dict, kind: str, depth: int) -> dict:
-    """Images (height, width, 3) of the strategies that contribute anything, by (k, s, t)."""
-    found = {}
-    for k, s, t in strategies(depth):
-        image = np.stack([layers[f"{kind}.s{s}t{t}.{channel}"] for channel in "RGB"], axis=-1)
-        if k >= SHORTEST and image.any():
-            found[k, s, t] = image
-    return found
+def panels(images: dict) -> dict:
+    """Those `technique_images` to which anything contributes, but for single edges."""
+    return {key: image for key, image in images.items() if key[0] >= SHORTEST and image.any()}
 
 
 def draw(found: dict, path: Path, exposure: float):
@@ -91,7 +102,6 @@ def draw(found: dict, path: Path, exposure: float):
             axis.set_axis_off()
         text = f"k = {lengths[i]}\n{2 ** (lengths[i] - 1)}x"
         figure.text(0.05 / wide, bottom + 0.5 / len(rows), text, fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -111,12 +121,12 @@ def main(arguments=None) -> int:
     mi.set_variant("llvm_ad_rgb")
     path = scene_file(options.scene)
     output = options.output or ROOT / "renders" / f"pyramid_{path.stem}"
-    film, layers = render(path, options)
+    film, images = render(path, options)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_images(film, output.with_suffix(".exr"), {"heuristic": options.heuristic}, options.exposure)
-    for kind in ("weighted", "unweighted"):
+    for kind in KINDS:
         file = output.with_name(f"{output.name}_{kind}.png")
-        draw(panels(layers, kind, options.max_depth), file, options.exposure)
+        draw(panels(images[kind]), file, options.exposure)
         print(file)
     return 0
 

@@ -14,10 +14,12 @@ import sys
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
+from metrics import TRIM
 from report import table
 
 import mitsuba as mi  # isort: skip
 import reference
+from strategies import technique_images
 
 RESOLUTION, SPP, RENDERS, SHOWN = 64, 8, 24, 6
 
@@ -25,7 +27,7 @@ RESOLUTION, SPP, RENDERS, SHOWN = 64, 8, 24, 6
 def noise(values, norm) -> tuple[float, float]:
     """Relative variance per sample of renders (first axis), raw and trimmed."""
     found = np.sort((values.var(axis=0, ddof=1) / norm).ravel()) * SPP
-    return found.mean(), found[: int(0.999 * len(found))].mean()
+    return found.mean(), found[: int((1 - TRIM) * len(found))].mean()
 
 
 def lines(name: str) -> list:
@@ -36,16 +38,11 @@ def lines(name: str) -> list:
     renders = np.array(
         [np.array(integrator.render(scene, seed=s, spp=SPP)) for s in range(RENDERS)], dtype=float
     )
-    layers = integrator.aov_names()
-    first = renders.shape[-1] - len(layers)
     mean = renders[..., :3].mean(axis=0)
     norm = mean**2 + 0.01 * mean.mean() ** 2
     found = []
-    for i, layer in enumerate(layers):
-        if layer.startswith("weighted.") and layer.endswith(".R"):
-            part = renders[..., first + i : first + i + 3]
-            text = layer.removeprefix("weighted.").removesuffix(".R")
-            found.append((*noise(part, norm), part.mean() / mean.mean(), text))
+    for (_, s, t), part in technique_images(renders, integrator.aov_names(), "weighted").items():
+        found.append((*noise(part, norm), part.mean() / mean.mean(), f"s{s}t{t}"))
     found.sort(reverse=True)
     total = noise(renders[..., :3], norm)
     rows = [[f"`{name}`", "image", f"{total[0]:.3g}", f"{total[1]:.3g}", "100 %"]]

@@ -172,6 +172,53 @@ def test_digits_vary_as_in_nested_uniform_scrambling():
                 assert variance == pytest.approx(want, rel=0.1, abs=1e-12), (m, k, j)
 
 
+NUMBERS = range(len(sobol.MAPS))
+
+
+def joint(index, group, number) -> np.ndarray:
+    """Points of NumPy indices and group seeds, as of a draw of this number with a seed of its own."""
+    index, group = np.broadcast_arrays(np.asarray(index, np.uint32), np.asarray(group, np.uint32))
+    reverse = dr.brev(mi.UInt32(index.ravel()))
+    digits = sobol.related(sobol.shuffled(reverse, mi.UInt32(group.ravel())), number)
+    points = sobol.pair_of(digits, sobol.hash_u32(mi.UInt32(group.ravel()), 7 + number))
+    return np.stack([np.float64(p.numpy()).reshape(index.shape) for p in points], axis=-1)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_joint_pairs_are_nets(number):
+    """Each joint pair by itself is the (0,m,2)-net that it is without the map, exactly."""
+    for m in range(9):
+        p = joint(np.arange(1 << m) + (5 << m), 12345, number)
+        for k in range(m + 1):
+            cells = np.floor(p * [1 << k, 1 << (m - k)]).astype(int)
+            assert len(set(map(tuple, cells))) == 1 << m
+
+
+@pytest.mark.parametrize(("m", "bound"), [(4, 1.0), (6, 0.25), (8, 0.125)])
+def test_products_of_joint_pairs_are_less_noisy_than_independent(m, bound):
+    """Rationale: a contribution is a product of functions of several draws, say of the place in the pixel and
+    of the light sample, which is where padded points are noisier than independent ones (1.58 times).
+
+    n Var of the mean of z z' over n = 2^m points, z one coordinate of each of two pairs of a group, is 1
+    with independent draws. Expected: below ``bound`` on the average over the coordinates, for all pairs
+    of numbers from 2^6 points on and on the average over these at 2^4 (measured: at most 0.19 and 0.08;
+    0.74); number 3 is for single numbers. Over 4,000 seeds one has a relative deviation of 2 %.
+    """
+    n, count = 1 << m, 4000
+    groups = sobol.hash_u32(dr.arange(mi.UInt32, count), 5).numpy()
+    z = [(joint(np.arange(n)[:, None], groups[None, :], i) - 0.5) * np.sqrt(12) for i in NUMBERS]
+    found = {}
+    for i in NUMBERS:
+        for j in range(i):
+            axes = [(a, b) for a in range(1 if i == 3 else 2) for b in range(1 if j == 3 else 2)]
+            ratios = [((z[i][..., a] * z[j][..., b]).mean(0) ** 2).mean() * n for a, b in axes]
+            found[j, i] = np.mean(ratios)
+    if m > 4:
+        assert max(found.values()) < bound, found
+    else:
+        assert np.mean(list(found.values())) < bound, found
+
+
 def smooth(p: np.ndarray) -> np.ndarray:
     """A smooth, non-separable integrand on the square, with a mixed derivative nowhere zero."""
     return np.exp(p[..., 0] * p[..., 1] + 0.5 * p[..., 0])

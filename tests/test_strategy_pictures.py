@@ -47,11 +47,13 @@ def test_pyramid(tmp_path, capsys):
 def test_panels_are_those_that_contribute():
     """Expected: neither single edges nor strategies whose layer is black, in the order of path lengths."""
     names = [f"weighted.s{s}t{k + 1 - s}.{c}" for k in (1, 2, 3) for s in range(k + 2) for c in "RGB"]
-    layers = {name: np.zeros((2, 2)) for name in names}
-    layers["weighted.s0t2.R"] += 1
-    layers["weighted.s1t2.G"] += 1
-    layers["weighted.s2t2.B"][0, 0] = 1
-    assert list(strategies.panels(layers, "weighted", 3)) == [(2, 1, 2), (3, 2, 2)]
+    image = np.zeros((2, 2, 3 + len(names)))
+    for name in ("weighted.s0t2.R", "weighted.s1t2.G"):
+        image[..., 3 + names.index(name)] = 1
+    image[0, 0, 3 + names.index("weighted.s2t2.B")] = 1
+    images = strategies.technique_images(image, names, "weighted")
+    assert images[2, 1, 2].shape == (2, 2, 3) and len(images) == 12
+    assert list(strategies.panels(images)) == [(2, 1, 2), (3, 2, 2)]
 
 
 def test_scenes_by_name_or_file(tmp_path):

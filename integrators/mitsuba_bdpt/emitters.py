@@ -45,13 +45,7 @@ from .emitter_kinds import (
     needs_evaluation,
     refuse_curves,
 )
-from .emitter_tables import (
-    Placement,
-    Projectors,
-    SmoothMeshes,
-    inverse_table,
-    placement,
-)
+from .emitter_tables import Placement, Projectors, SmoothMeshes, inverse_table, placement
 from .infinity import Disks
 from .objects import children, living_emitters, number
 

@@ -26,6 +26,8 @@ NARROW = 0.5
 # disk's subpaths pass a point is known up to rounding (6e-8 of these).
 TINY = 1e-4
 
+MARGIN = 1e-4
+
 # Share of the light subpaths that are aimed at details. What is elsewhere loses at most half of its subpaths.
 AIMED = 0.5
 
@@ -38,9 +40,10 @@ class Sphere:
     radius: object
 
     @staticmethod
-    def about(sphere, margin: float) -> Sphere:
-        """A sphere of Mitsuba's, larger by the factor 1 + ``margin``."""
-        made = Sphere(mi.Point3f(sphere.center), mi.Float(max(float(sphere.radius) * (1 + margin), 1e-30)))
+    def about(sphere) -> Sphere:
+        """A sphere of Mitsuba's, as there a little larger, so that surfaces on it are not missed."""
+        radius = max(float(sphere.radius) * (1 + MARGIN), 1e-30)
+        made = Sphere(mi.Point3f(sphere.center), mi.Float(radius))
         dr.make_opaque(made)
         return made
 
@@ -63,10 +66,9 @@ class Disks:
         for one in each:
             box.expand(one)
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
-        # As in Mitsuba, a little larger, so that surfaces on the sphere are not missed.
-        self.scene = Sphere.about(sphere, 1e-4)
+        self.scene = Sphere.about(sphere)
         found = details(each, box) if box.valid() else None
-        self.details = Sphere.about(found, 1e-4) if found is not None else None
+        self.details = Sphere.about(found) if found is not None else None
 
     def start(self, d, u):
         """A point from which a subpath along ``d`` starts, and its density (per area)."""

@@ -151,10 +151,9 @@ class Pilot:
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c, visible, total):
-            size = self._size(c)
-            own, _ = _parts(size, c)
-            own_visible, moments = _parts(dr.select(visible, size, 0), c)
-            new = {"unshadowed": own, "visible": own_visible, **moments}
+            own, moments = _parts(self._size(c), c)
+            seen = {"visible": own, **moments}
+            new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
             return {name: _sums(total[name], more) for name, more in new.items()}
 
         tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place

@@ -2,9 +2,11 @@
 
 Every draw names its purpose and the vertex it serves, so that the point set can be exchanged:
 
-* ``sobol``: Owen-scrambled Sobol' pairs, padded, for the purposes in `STRATIFIED` at every vertex:
-  one sequence over all samples of the image in pixel order (all samples of a pixel are neighbours
-  in it, so each pixel holds a net, and so does each power-of-two group of pixels).
+* ``sobol``: Owen-scrambled Sobol' pairs for the purposes in `STRATIFIED` at every vertex: one
+  sequence over all samples of the image in pixel order (all samples of a pixel are neighbours
+  in it, so each pixel holds a net, and so does each power-of-two group of pixels). Draws on which one
+  contribution depends together, up to the second vertex, are joint points of several
+  dimensions (`sobol.related`); further ones are joined vertex by vertex.
 * ``sampler``: the scene's own sampler for the first dimensions, see `SAMPLER_TABLE`; more would take
   memory and gain little. A path takes each number from another pixel's sequence of the sampler:
   those of one sequence are correlated (0.92 for ``stratified`` at 4 samples, 0.25 for ``ldsampler``
@@ -46,32 +48,34 @@ class Purpose(IntEnum):
 
 
 _PURPOSES = 16  # room per vertex in the numbering of dimensions
+_GROUP = 15  # the place in it of what joint draws share
 _SPREAD = 0x9E3779B1  # odd, so that dimensions stay distinct; spreads them over all bits
 _SECOND = 0x85EBCA6B  # tells the second number of a pair from the first
 _KEY = 0x27D4EB2F  # keeps the key of sample 0 from being 0
 
-# Measured on a Cornell box: gains come from film, emission, first light sample and the first bounces;
-# beyond the third there are none, but telling these vertices apart would cost more. Roulette and the draw of
-# connections gain nothing there, and a factor of 4 in a closed room where they are all the noise there is.
+# Stratified draws, with their number in `sobol.related`; those with None have a shuffle of their own. The
+# light samples of the first and second vertex may share a number: no contribution depends on both. Roulette
+# and the draw of connections gain nothing on a Cornell box, joined or not, and a factor of 4 in a closed room
+# where they are all the noise there is.
 STRATIFIED = {
     "camera": {
-        Purpose.FILM,
-        Purpose.APERTURE,
-        Purpose.EMITTER,
-        Purpose.BSDF,
-        Purpose.LOBE,
-        Purpose.ROULETTE,
-        Purpose.CONNECTION,
+        Purpose.FILM: 0,
+        Purpose.APERTURE: 4,
+        Purpose.EMITTER: 1,
+        Purpose.BSDF: 2,
+        Purpose.LOBE: 3,
+        Purpose.ROULETTE: None,
+        Purpose.CONNECTION: None,
     },
     "light": {
-        Purpose.TIME,
-        Purpose.WAVELENGTH,
-        Purpose.EMISSION_POINT,
-        Purpose.EMISSION_DIRECTION,
-        Purpose.BSDF,
-        Purpose.LOBE,
-        Purpose.ROULETTE,
-        Purpose.CONNECTION,
+        Purpose.TIME: None,
+        Purpose.WAVELENGTH: None,
+        Purpose.EMISSION_POINT: 0,
+        Purpose.EMISSION_DIRECTION: 1,
+        Purpose.BSDF: 2,
+        Purpose.LOBE: 3,
+        Purpose.ROULETTE: None,
+        Purpose.CONNECTION: None,
     },
 }
 
@@ -158,17 +162,33 @@ class Points:
     def _draw(self, side, stream, purpose, vertex, dims):
         # The seed is in the dimension's word, not in the key: else the hashed numbers of two dimensions
         # would be the same pairs for every seed, in another order.
-        dimension = (mi.UInt32(int(purpose)) + _PURPOSES * vertex) * _SPREAD
-        seed = sobol.mix(stream.seed ^ dimension)
+        seed = _seed(stream, purpose, vertex)
         if self.kind == "sobol" and purpose in STRATIFIED[side]:
+            digits = _digits(stream, purpose, vertex, STRATIFIED[side][purpose], seed)
             if dims == 1:
-                return sobol.scrambled_single_at(stream.digits, seed)
-            return mi.Point2f(*sobol.scrambled_pair_at(stream.digits, seed))
+                return sobol.single_of(digits, seed)
+            return mi.Point2f(*sobol.pair_of(digits, seed))
         value = _hashed(sobol.mix(stream.key ^ seed), dims)
         for name, drawn in stream.first.items():
             if name[0] is purpose:
                 value = _replace(vertex, name[1], drawn, value)
         return value
+
+
+def _seed(stream, purpose, vertex):
+    """Seed of a dimension."""
+    return sobol.mix(stream.seed ^ (mi.UInt32(int(purpose)) + _PURPOSES * vertex) * _SPREAD)
+
+
+def _digits(stream, purpose, vertex, number, seed):
+    """Digit word of a stratified draw, see `STRATIFIED`."""
+    if number is None:
+        return sobol.shuffled(stream.digits, seed)
+    # The light sample goes with the direction that led to its vertex.
+    later = 1 if purpose is Purpose.EMITTER else 0
+    group = mi.UInt32(vertex)
+    group = dr.select(group <= 1 + later, 0, group - later)
+    return sobol.related(sobol.shuffled(stream.digits, _seed(stream, _GROUP, group)), number)
 
 
 def _hashed(word, dims):
