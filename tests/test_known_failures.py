@@ -668,5 +668,5 @@ def test_point_light_in_a_glass_shell_lights_the_room():
     assert render(scene, integrator("path", max_depth=6), [1], 16).max() == 0
     transmittance = (1 - ((1.5 - 1) / (1.5 + 1)) ** 2) ** 2
     for skip in ("none", "auto"):
-        images = render(scene, integrator(max_depth=4, skip=skip), range(16), 512)
+        images = render(scene, integrator(max_depth=4, skip=skip), range(16), 1024)
         known(images.mean((1, 2, 3)), 0.5 * transmittance, 0.04)
