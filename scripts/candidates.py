@@ -114,13 +114,13 @@ def stability(name: str, depth: int, seeds: int) -> list:
     scene = reference.load_scene(name, resolution=RESOLUTION)
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     judge = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
+    if not choice.is_open(judge.plan, settings):
+        raise ValueError(f"scene={name!r} leaves nothing to choose: light subpaths are impossible in it")
     possible = choice.candidates(judge.world, judge.plan, settings)
     table_of_judge = choice.choose(predicted(scene, settings), possible, True)
     times = {row.candidate: row.time for row in table_of_judge}
-    chosen = [
-        rendering.Render(scene, scene.sensors()[0], settings, seed, SPP).decide()[0].candidate
-        for seed in range(seeds)
-    ]
+    renders = (rendering.Render(scene, scene.sensors()[0], settings, seed, SPP) for seed in range(seeds))
+    chosen = [render.decide()[0].candidate for render in renders]
     above = [times[c] / table_of_judge[0].time - 1 for c in chosen]
     counts = Counter(f"1/{c.served} {c.connections}" if c.light_paths else "0" for c in chosen)
     texts = ", ".join(f"{text} ({n})" for text, n in counts.most_common())

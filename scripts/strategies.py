@@ -7,7 +7,7 @@ A row for each path length of k = 2, 3, ... edges with the k + 2 ways (s, t) to 
 vertices and t camera vertices, brightened by 2^(k-1); strategies that contribute nothing are left out.
 
 Written are OUTPUT.exr, with the image and the layers ``weighted.s{S}t{T}.R`` ... and
-``unweighted.s{S}t{T}.R`` ..., and the pyramids OUTPUT_weighted.png, which adds up to the image, and
+``unweighted.s{S}t{T}.R`` ..., OUTPUT.png, the image, and the pyramids OUTPUT_weighted.png, which adds up to the image, and
 OUTPUT_unweighted.png, in which each panel is an estimate by itself.
 """
 
@@ -81,7 +81,10 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """The pyramid as a picture: rows of path lengths, s rising to the right."""
+    """The pyramid as a picture: rows of path lengths, s rising to the right; raises ``ValueError`` if no
+    strategy contributes."""
+    if not found:
+        raise ValueError(f"nothing to draw in {path.name}: no path of {SHORTEST} edges or more brings light")
     lengths = sorted({k for k, _, _ in found})
     rows = [[key for key in found if key[0] == k] for k in lengths]
     columns = max(len(row) for row in rows)
@@ -118,12 +121,14 @@ def main(arguments=None) -> int:
     parser.add_argument("--heuristic", default="balance")
     parser.add_argument("--exposure", type=float, default=0.0, help="stops, of the pictures")
     options = parser.parse_args(arguments)
+    if options.max_depth < SHORTEST:
+        raise ValueError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     mi.set_variant("llvm_ad_rgb")
     path = scene_file(options.scene)
     output = options.output or ROOT / "renders" / f"pyramid_{path.stem}"
     film, images = render(path, options)
     output.parent.mkdir(parents=True, exist_ok=True)
-    write_images(film, output.with_suffix(".exr"), {"heuristic": options.heuristic}, options.exposure)
+    write_images(film, output.with_name(f"{output.name}.exr"), {"heuristic": options.heuristic}, options.exposure)
     for kind in KINDS:
         file = output.with_name(f"{output.name}_{kind}.png")
         draw(panels(images[kind]), file, options.exposure)

@@ -15,6 +15,7 @@ import sys
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 from metrics import TRIM
+from preset import benchmark_depth
 from report import table
 
 import mitsuba as mi  # isort: skip
@@ -33,7 +34,7 @@ def noise(values, norm) -> tuple[float, float]:
 def lines(name: str) -> list:
     """Rows of a scene: the image, all strategies together, and those with most noise."""
     scene = reference.load_scene(name, resolution=RESOLUTION)
-    parameters = {"type": "bdpt", "max_depth": reference.default_depth(name), "skip": "none"}
+    parameters = {"type": "bdpt", "max_depth": benchmark_depth(name), "skip": "none"}
     integrator = mi.load_dict(parameters | {"strategy_images": True})
     renders = np.array(
         [np.array(integrator.render(scene, seed=s, spp=SPP)) for s in range(RENDERS)], dtype=float

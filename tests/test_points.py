@@ -1,0 +1,62 @@
+"""Which numbers a path draws: `mitsuba_bdpt.points` with Sobol' points."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt.points import STRATIFIED, Points, Purpose
+
+FILM, LENS, LIGHT, BSDF = (Purpose.FILM, 0), (Purpose.APERTURE, 0), (Purpose.EMITTER, 1), (Purpose.BSDF, 1)
+POINT, DIRECTION = (Purpose.EMISSION_POINT, 0), (Purpose.EMISSION_DIRECTION, 0)
+
+
+def drawn(side, draws, samples: int, seeds: int) -> np.ndarray:
+    """The draws of one pixel's samples under many seeds, of variance 1: (draws, seeds, samples, 2)."""
+    seed = dr.repeat(dr.arange(mi.UInt32, seeds), samples)
+    index = dr.tile(dr.arange(mi.UInt32, samples), seeds)
+    points = Points("sobol", seed)
+    stream = points.stream(side, mi.UInt64(index), index)
+    found = []
+    for purpose, vertex in draws:
+        u = points.draw_2d(side, stream, purpose, mi.UInt32(vertex))
+        found.append(np.stack([c.numpy().astype(float).reshape(seeds, samples) for c in u], axis=-1))
+    return (np.stack(found) - 0.5) * np.sqrt(12)
+
+
+@pytest.mark.parametrize(
+    ("side", "first", "second"),
+    [
+        ("camera", FILM, LIGHT),
+        ("camera", FILM, LENS),
+        ("camera", LENS, LIGHT),
+        ("camera", FILM, BSDF),
+        ("camera", BSDF, (Purpose.EMITTER, 2)),
+        ("camera", FILM, (Purpose.EMITTER, 2)),
+        ("camera", (Purpose.BSDF, 2), (Purpose.EMITTER, 3)),
+        ("camera", (Purpose.BSDF, 5), (Purpose.EMITTER, 6)),
+        ("light", POINT, DIRECTION),
+        ("light", POINT, BSDF),
+        ("light", DIRECTION, BSDF),
+    ],
+)
+def test_draws_of_one_contribution_are_joint(side, first, second):
+    """Rationale: which draws share a shuffle, and with which map, decides how noisy products of them are; a
+    mistake would bias nothing. Expected: n Var of the mean of z z' over a pixel's n = 64 samples, z one
+    coordinate of each draw, averaged over the coordinates: below 0.4, where independent draws have 1 and
+    draws with shuffles of their own 1.58. Over 2,000 seeds one has a relative deviation of 3 %."""
+    a, b = drawn(side, [first, second], 64, 2000)
+    products = [((a[..., i] * b[..., j]).mean(axis=1) ** 2).mean() * 64 for i in (0, 1) for j in (0, 1)]
+    assert np.mean(products) < 0.4, products
+
+
+@pytest.mark.parametrize("side", ["camera", "light"])
+def test_draws_of_one_sample_are_independent(side):
+    """Rationale: joint draws share digits; were any two of them scrambled alike, the image would be biased.
+    Expected: over 40,000 seeds all draws of one sample are uncorrelated, coordinate by coordinate, and so
+    are their signs about 1/2. Tolerance: 5 / sqrt(40,000), with 2,016 pairs a chance of 1e-3 to fail."""
+    draws = [(purpose, vertex) for purpose in STRATIFIED[side] for vertex in (0, 1, 2, 3)]
+    z = drawn(side, draws, 1, 40000)[:, :, 0].transpose(0, 2, 1).reshape(2 * len(draws), -1)
+    for values in (z, np.sign(z)):
+        correlation = values @ values.T / values.shape[1]
+        np.fill_diagonal(correlation, 0)
+        assert np.abs(correlation).max() < 0.025
