@@ -7,8 +7,8 @@ A row for each path length of k = 2, 3, ... edges with the k + 2 ways (s, t) to 
 vertices and t camera vertices, brightened by 2^(k-1); strategies that contribute nothing are left out.
 
 Written are OUTPUT.exr, with the image and the layers ``weighted.s{S}t{T}.R`` ... and
-``unweighted.s{S}t{T}.R`` ..., OUTPUT.png, the image, and the pyramids OUTPUT_weighted.png, which adds up to the image, and
-OUTPUT_unweighted.png, in which each panel is an estimate by itself.
+``unweighted.s{S}t{T}.R`` ..., OUTPUT.png, the image, and the pyramids OUTPUT_weighted.png, which adds up to
+the image, and OUTPUT_unweighted.png, in which each panel is an estimate by itself.
 """
 
 from __future__ import annotations
@@ -128,7 +128,9 @@ def main(arguments=None) -> int:
     output = options.output or ROOT / "renders" / f"pyramid_{path.stem}"
     film, images = render(path, options)
     output.parent.mkdir(parents=True, exist_ok=True)
-    write_images(film, output.with_name(f"{output.name}.exr"), {"heuristic": options.heuristic}, options.exposure)
+    write_images(
+        film, output.with_name(f"{output.name}.exr"), {"heuristic": options.heuristic}, options.exposure
+    )
     for kind in KINDS:
         file = output.with_name(f"{output.name}_{kind}.png")
         draw(panels(images[kind]), file, options.exposure)

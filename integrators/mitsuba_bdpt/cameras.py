@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import rays
-from .objects import number, parameters
+from .objects import number, own_parameters
 from .sensor_records import Arrival, CameraJoin, CameraStart, Sensor, view_at
 
 KINDS = ("PerspectiveCamera", "ThinLensCamera")
@@ -226,7 +226,7 @@ def _numbers(sensor, share: float):
         area,
         sensor.near_clip(),
         sensor.far_clip(),
-        parameters(sensor)["aperture_radius"] if lens else 0,
+        own_parameters(sensor)["aperture_radius"] if lens else 0,
         sensor.focus_distance() if lens else 1,
     ]
     return [number(x) for x in values]

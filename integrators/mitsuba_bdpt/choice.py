@@ -1,4 +1,5 @@
-"""What pays: the candidate with the least cost times variance, from a pilot's moments.
+"""What pays: the candidate with the least cost times variance, from a pilot's moments (splats count more
+where points are good, and some candidates less: `STRATIFIED_SPLATS`, `DIRECT_GAIN`).
 
 Costs are counted, not timed: what the pilot's subpaths did times what that takes (`COSTS`), so that the same
 seed leads to the same decision on every machine.
@@ -17,7 +18,7 @@ from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
 # `LEAST_SAMPLES` has none. A pilot's sample takes three to seven times as long as one of path tracing alone,
-# and recording it takes 15 to 25 ms more (scripts/overhead.py).
+# and recording it longer than all of a short pilot's samples (scripts/overhead.py).
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES = 1 << 19
@@ -36,14 +37,16 @@ COSTS = {
 }
 
 
-# Stratified points lower the variance of camera samples more than that of splats, by this factor: to 0.31 to
-# 0.54 of that with independent points against 0.57 to 1.05, ratios of 1.8 to 2.0 in five scenes. This is why
+# Stratified points lower the variance of camera samples more than that of splats, by this factor: padded ones
+# to 0.31 to 0.54 of that with independent points against 0.57 to 1.05, ratios of 1.8 to 2.0 in five scenes;
+# joint ones 0.26 against 0.55 in a Cornell box, 0.44 against 1.03 in `uplight_room`, 2.1 and 2.3. This is why
 # t = 1 with its nominal coefficient raises the error: its variance is what the points leave.
 STRATIFIED_SPLATS = 2.0
 
-# A coefficient of s = 1 other than 1 has to gain this factor: it evens out two strategies whose noise good
-# points take off anyway. Predicted factors of 2.0 (`open_sky`) and 4.3 (`furnace_white`) became 0.95 and 4.3.
-STRATIFIED_DIRECT = 3.0
+# With stratified points a coefficient of s = 1 other than 1 has to gain this factor over path tracing alone:
+# it evens out two strategies whose noise good points may take off anyway. Predicted factors of 2.0
+# (`open_sky`) and 4.3 (`furnace_white`) became 0.95 and 4.3.
+DIRECT_GAIN = 3.0
 
 # Films of fewer pixels have a light subpath for each camera subpath.
 FEW_PIXELS = 64
@@ -169,6 +172,11 @@ class Candidate:
         return 1 / self.served if WEIGHTINGS[self.weighting].light else 0
 
     @property
+    def direct(self) -> float:
+        """kappa of s = 1."""
+        return WEIGHTINGS[self.weighting].direct
+
+    @property
     def combination(self) -> str:
         """See `pilot.Weighting.combination`."""
         return WEIGHTINGS[self.weighting].combination
@@ -183,7 +191,7 @@ class Candidate:
             light_paths=float(self.light_paths),
             connections=self.connections,
             splat_coefficient=weighting.light * self.served if weighting.light else 1.0,
-            direct_coefficient=float(weighting.direct),
+            direct_coefficient=float(self.direct),
             **{name: float(f"{number:.6g}") for name, number in numbers.items()},
         )
 
@@ -191,17 +199,16 @@ class Candidate:
 @dataclass(frozen=True)
 class Choice:
     """A candidate with the ``cost`` of a sample (path tracing alone: 1) and its ``variance`` as relMSE,
-    before what points take off it; ``handicap`` where they take less off than for other candidates."""
+    before what points take off that of all candidates."""
 
     candidate: Candidate
     cost: float
     variance: float
-    handicap: float = 1.0
 
     @property
     def time(self) -> float:
         """To a certain error, in a unit of its own."""
-        return self.cost * self.variance * self.handicap
+        return self.cost * self.variance
 
 
 def lanes(samples: int) -> int:
@@ -263,8 +270,8 @@ def cost(candidate: Candidate, rays: dict) -> float:
 
 
 def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> list[Choice]:
-    """All ``possible`` candidates, the best first; ``stratified``: whether points will be better than
-    independent ones."""
+    """The ``possible`` candidates, the best first; ``stratified``: whether points will be better than
+    independent ones, see `STRATIFIED_SPLATS` and `DIRECT_GAIN`."""
     factor = STRATIFIED_SPLATS if stratified else 1.0
     drawn, every = moments.variance(_trimmed_mean(moments.draw), factor), moments.variance(0, factor)
     parts = np.stack(
@@ -272,11 +279,15 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
     )
     variances = parts[:, :, 0] + parts[:, :, 1] * [c.served for c in possible]
     variances = _robust_mean(variances)
-    table = []
-    for c, v in zip(possible, variances.tolist(), strict=True):
-        if math.isfinite(v):
-            handicap = STRATIFIED_DIRECT if stratified and WEIGHTINGS[c.weighting].direct != 1 else 1.0
-            table.append(Choice(c, cost(c, moments.rays), max(v, LEAST_VARIANCE), handicap))
+    table = [
+        Choice(c, cost(c, moments.rays), max(v, LEAST_VARIANCE))
+        for c, v in zip(possible, variances.tolist(), strict=True)
+        if math.isfinite(v)
+    ]
+    if stratified:
+        alone = [row.variance for row in table if not row.candidate.light_paths and row.candidate.direct == 1]
+        most = min(alone, default=math.inf) / DIRECT_GAIN
+        table = [row for row in table if row.candidate.direct == 1 or row.variance <= most]
     return sorted(table, key=lambda row: row.time)
 
 

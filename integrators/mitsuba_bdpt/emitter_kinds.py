@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .objects import children, number, parameters
+from .objects import children, number, own_parameters
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
 # direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
@@ -42,7 +42,7 @@ def kind_of(emitter) -> int:
     """The kind of an emitter; raises ``ValueError`` for one that Mitsuba itself renders inconsistently, and
     ``NotImplementedError`` for one that it cannot sample."""
     kind = _KINDS.get(emitter.class_name(), UNKNOWN)
-    if kind == INFINITE and "to_world" in parameters(emitter):
+    if kind == INFINITE and "to_world" in own_parameters(emitter):
         _check_rotation(emitter)
     if kind == AREA and not _tells_its_points(emitter):
         return UNSAMPLED
@@ -167,7 +167,7 @@ def check_projector(emitter):
 
 
 def _columns(emitter):
-    matrix = parameters(emitter)["to_world"].matrix
+    matrix = own_parameters(emitter)["to_world"].matrix
     return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
 
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .emitter_kinds import AREA, POINT, PROJECTOR, SPOT, check_projector
-from .objects import children, parameters
+from .objects import children, own_parameters
 
 
 @dataclass
@@ -48,10 +48,10 @@ class Placement:
 def placement(emitter, kind) -> Placement:
     """The row of one emitter."""
     if kind == POINT:
-        position = dr.slice(mi.Point3f(parameters(emitter)["position"]))
+        position = dr.slice(mi.Point3f(own_parameters(emitter)["position"]))
         return Placement(position=position, density_w=1 / (4 * dr.pi))
     if kind == SPOT:
-        params = parameters(emitter)
+        params = own_parameters(emitter)
         to_world = params["to_world"]
         x, y, z = (
             dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
@@ -67,10 +67,10 @@ def placement(emitter, kind) -> Placement:
             cos_cutoff=cos_cutoff,
         )
     if kind == PROJECTOR:
-        to_world = parameters(emitter)["to_world"]
+        to_world = own_parameters(emitter)["to_world"]
         return Placement(position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))))
     if kind == AREA and emitter.get_shape().shape_type() == mi.ShapeType.Sphere.value:
-        to_world = parameters(emitter.get_shape())["to_world"]
+        to_world = own_parameters(emitter.get_shape())["to_world"]
         p = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
         ps = emitter.get_shape().sample_position(0, mi.Point2f(0.5))
         inwards = dr.slice(dr.dot(ps.n, ps.p - p)) < 0
@@ -120,7 +120,7 @@ class _Projector:
 
     def __init__(self, emitter):
         check_projector(emitter)
-        to_world = parameters(emitter)["to_world"]
+        to_world = own_parameters(emitter)["to_world"]
         matrix = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
         probes = matrix @ np.array([[0, 0, 1, 1], [1, 0, 1, 1], [0, 1, 1, 1]], dtype=np.float64).T
         it = dr.zeros(mi.Interaction3f, 3)
@@ -165,7 +165,7 @@ class _Projector:
 
 def _is_as_it_was(texture) -> bool:
     """Whether a texture has no ``to_uv`` that changes it."""
-    found = parameters(texture)
+    found = own_parameters(texture)
     if "to_uv" not in found:
         return True
     return np.allclose(np.array(found["to_uv"].matrix).reshape(3, 3), np.eye(3), atol=1e-7)
@@ -218,7 +218,7 @@ def _curved_faces(shape):
     differ from its faces' normals; None for all other shapes."""
     if shape is None or not shape.is_mesh():
         return None
-    params = parameters(shape)
+    params = own_parameters(shape)
     # Neither a rectangle (flat, without vertices) nor a mesh without normals at its vertices.
     if "vertex_positions" not in params or not len(params["vertex_normals"]):
         return None

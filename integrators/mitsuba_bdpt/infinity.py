@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import parameters
+from .objects import own_parameters
 
 # A shape is a detail if the longest side of its box is not more than this part of the scene's.
 DETAIL = 0.25
@@ -26,6 +26,7 @@ NARROW = 0.5
 # disk's subpaths pass a point is known up to rounding (6e-8 of these).
 TINY = 1e-4
 
+# What spheres are larger by, so that surfaces on them are not missed.
 MARGIN = 1e-4
 
 # Share of the light subpaths that are aimed at details. What is elsewhere loses at most half of its subpaths.
@@ -41,7 +42,7 @@ class Sphere:
 
     @staticmethod
     def about(sphere) -> Sphere:
-        """A sphere of Mitsuba's, as there a little larger, so that surfaces on it are not missed."""
+        """A sphere of Mitsuba's, a little larger, as Mitsuba makes it."""
         radius = max(float(sphere.radius) * (1 + MARGIN), 1e-30)
         made = Sphere(mi.Point3f(sphere.center), mi.Float(radius))
         dr.make_opaque(made)
@@ -58,8 +59,8 @@ class Sphere:
 
 
 class Disks:
-    """Disks of a scene: ``scene`` the `Sphere` about all shapes, ``details`` that about its details, or None
-    if it has none."""
+    """Disks of a scene: ``scene`` the `Sphere` about all shapes (a unit sphere if no shape has a finite box),
+    ``details`` that about its details, or None if it has none."""
 
     def __init__(self, scene):
         each, box = boxes(scene), mi.ScalarBoundingBox3f()
@@ -114,7 +115,7 @@ def boxes(scene) -> list:
     found = []
     for shape in scene.shapes():
         box = mi.ScalarBoundingBox3f(shape.bbox())
-        params = parameters(shape) if shape.is_mesh() else {}
+        params = own_parameters(shape) if shape.is_mesh() else {}
         if "vertex_positions" in params:
             vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
             vertices = vertices[np.isfinite(vertices).all(axis=1)]

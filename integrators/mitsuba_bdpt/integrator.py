@@ -54,8 +54,8 @@ All of them are combined by multiple importance sampling.
      Given by hand, there is no pilot.
  * - points
    - |string|
-   - ``sobol`` (default): Owen-scrambled Sobol' points for light and BSDF samples; ``sampler``: the
-     scene's sampler for the first of them; ``independent``.
+   - ``sobol`` (default): Owen-scrambled Sobol' points for all draws that gain by them, at every vertex;
+     ``sampler``: the scene's sampler for a path's first draws; ``independent``.
  * - decisions
    - |string|
    - JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.

@@ -53,7 +53,7 @@ def children(owner) -> dict:
     return _collector(mi.variant())().of(owner)
 
 
-def parameters(owner) -> dict:
+def own_parameters(owner) -> dict:
     """The parameters of ``owner`` alone, by name. (``mi.traverse`` goes through all that it holds: that takes
     longer.)"""
     collector = _collector(mi.variant())()

@@ -4,8 +4,8 @@ Every draw names its purpose and the vertex it serves, so that the point set can
 
 * ``sobol``: Owen-scrambled Sobol' pairs for the purposes in `STRATIFIED` at every vertex: one
   sequence over all samples of the image in pixel order (all samples of a pixel are neighbours
-  in it, so each pixel holds a net, and so does each power-of-two group of pixels). Draws on which one
-  contribution depends together, up to the second vertex, are joint points of several
+  in it, so each pixel holds a net, and so does each power-of-two group of pixels). Draws of a subpath on
+  which one contribution depends together, up to the second vertex, are joint points of several
   dimensions (`sobol.related`); further ones are joined vertex by vertex.
 * ``sampler``: the scene's own sampler for the first dimensions, see `SAMPLER_TABLE`; more would take
   memory and gain little. A path takes each number from another pixel's sequence of the sampler:

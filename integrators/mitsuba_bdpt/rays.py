@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .objects import parameters
+from .objects import own_parameters
 
 # Measured: from 16 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to
 # 1 % of hits on cylinders); 32 keeps a factor of two in hand.
@@ -93,7 +93,7 @@ def _curvatures(shape) -> tuple[float, float]:
         box = shape.bbox()
         return 2 / max(float(box.max.x - box.min.x), 1e-30), 0.0
     if shape.shape_type() == mi.ShapeType.Cylinder.value:
-        to_world = parameters(shape)["to_world"]
+        to_world = own_parameters(shape)["to_world"]
         across = dr.norm(mi.Vector3f(to_world @ mi.Vector3f(1, 0, 0)))
         inverse = 1 / max(float(dr.slice(across)), 1e-30)
         return inverse, inverse

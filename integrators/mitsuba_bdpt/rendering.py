@@ -30,7 +30,7 @@ PILOT_SEQUENCE, CHANGED_SEQUENCE = 1 << 16, 1 << 17
 # Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
 FIRST_REPEAT = 32
 
-# Share of a render after which none is asked any more.
+# Share of a render after which none is asked any more: what is left has to pay for it.
 LATEST_REPEAT = 1 / 4
 
 # What strategy images may take, in bytes, before the render is refused.

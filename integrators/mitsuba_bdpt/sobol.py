@@ -2,9 +2,9 @@
 
 Everything here is a pure function of 32-bit unsigned arrays: no tables, no memory access, no
 state. A high-dimensional sample is made of pairs and single numbers, all with the same ``index`` and
-each with its own ``seed`` (see `points`), in two ways: by *padding*, where each has a shuffle of its own
-(:func:`scrambled_pair`), and *jointly*, where up to five share one shuffle and differ by a linear map
-of the index (:func:`related`).
+each with its own ``seed`` (see `points`), in two ways: by *padding*, where each has a shuffle of its own,
+and *jointly*, where up to five share one :func:`shuffled` index and differ by a linear map of its digits
+(:func:`related`).
 
 Why not what Mitsuba ships: ``mi.radical_inverse_2`` and ``mi.sobol_2`` do run in a kernel, but
 their ``scramble`` argument is only xor-ed onto the digits (a random digital shift). That keeps
@@ -54,8 +54,6 @@ __all__ = [
     "mix",
     "pair_of",
     "related",
-    "scrambled_pair",
-    "scrambled_single",
     "shuffled",
     "single_of",
     "split_index",
@@ -66,7 +64,8 @@ __all__ = [
 # all blocks of 2^m points, m = 2 to 20, least mean of 2^r - 1 over the elementary boxes of volume 2^-m in the
 # four dimensions of two pairs (three with the fourth entry, of which the first coordinate counts), r what the
 # rank of their digits' rows lacks: the other points of the block that share a point's box. It is 0 for
-# nets, 1 for independent points, and 0.3 to 0.9 here.
+# nets, 1 for independent points, and 0.2 to 1.0 here. The beam was 6 wide, for each of 40 random sets of
+# shifts from 1 to 8; a map was found after the other, each beside those before it.
 MAPS = (
     (),
     ((7, 0x014C5DFE), (2, 0x144B3B33), (3, 0x08BA9CF1), (5, 0x0081BBDF)),
@@ -86,43 +85,18 @@ def hash_u32(x: UInt32Like, y: UInt32Like) -> mi.UInt32:
     return mix(mix(mi.UInt32(x) + 0x9E3779B9) ^ (mi.UInt32(y) * 0x9E3779B1))
 
 
-def scrambled_pair(index: UInt32Like, seed: UInt32Like) -> tuple[mi.Float, mi.Float]:
-    """Point ``index`` of the shuffled, Owen-scrambled (0,2)-sequence in base 2 named by ``seed``.
-
-    ``index`` and ``seed`` are arrays of equal width, or of width 1, or Python integers, each in
-    [0, 2^32) (see :func:`split_index` for longer sequences). Any seeds will do, consecutive ones
-    too: they are hashed here. Returns two arrays of the broadcast width, multiples of 2^-24 in
-    [0, 1), at most 1 - 2^-24, which float32 holds exactly.
-
-    For a given seed the points of every aligned block of 2^m indices, m <= 24, form a (0,m,2)-net
-    (finer intervals than 2^-24 are cut off), whatever the seed. Over the seeds each point is
-    uniform in the square, and the points of two seeds at the same index are independent, as far
-    as hashes go. Over the indices of one pair of seeds it is otherwise: neighbours in index are
-    opposite in the first digit under every seed. A mean over products of functions of two seeds
-    thus has more variance than with independent draws: 1.58 times for the product of one
-    coordinate of each, at most 2 for any functions of one coordinate of each, and 4 for the
-    product of the first digits of all four. Functions of one seed converge an order faster.
-    For products that matter there is :func:`related`.
-    """
-    hashed = mix(mi.UInt32(seed) + 0x9E3779B9)
-    return pair_of(shuffled(dr.brev(mi.UInt32(index)), hashed), hashed)
-
-
-def scrambled_single(index: UInt32Like, seed: UInt32Like) -> mi.Float:
-    """First coordinate of :func:`scrambled_pair`, without the cost of the second.
-
-    Arguments, range and width as there. Every aligned block of 2^m indices, m <= 24, has exactly
-    one value in each interval of length 2^-m.
-    """
-    hashed = mix(mi.UInt32(seed) + 0x9E3779B9)
-    return single_of(shuffled(dr.brev(mi.UInt32(index)), hashed), hashed)
-
-
 def shuffled(reversed_index: mi.UInt32, hashed: mi.UInt32) -> mi.UInt32:
     """Digit word of an index, whose bits are given in reverse order, after a nested shuffle.
 
-    ``hashed`` is a seed that was hashed already, here and in :func:`pair_of` and :func:`single_of`; where
-    a shuffle and a scramble have the same one, they are independent nevertheless.
+    ``hashed`` is a seed that was hashed already (consecutive ones would be related), here and in
+    :func:`pair_of` and :func:`single_of`; where a shuffle and a scramble have the same one, they are
+    independent nevertheless. Indices are below 2^32, see :func:`split_index` for longer sequences.
+
+    Over the seeds the points of two shuffles of an index are independent, as far as hashes go. Over the
+    indices of one pair of seeds it is otherwise: neighbours in index are opposite in the first digit
+    under every seed. A mean over products of functions of two padded pairs thus has more variance
+    than with independent draws: 1.58 times for the product of one coordinate of each, at most 2 for any
+    functions of one coordinate of each, and 4 for the product of the first digits of all four.
     """
     return dr.brev(_scramble(reversed_index, hashed))
 
@@ -132,10 +106,11 @@ def related(digits: mi.UInt32, number: int) -> mi.UInt32:
 
     Each pair by itself is what it would be without the map, and any two together are nearly a net in four
     dimensions. The mean over n points of a product of one coordinate of each pair has, on the average over
-    the coordinates, 0.1 to 1.4 times the variance it has with independent draws at n = 16 (4.7 for numbers
-    3 and 4), at most 0.33 times at 64, 0.04 at 256; with shuffles of their own pairs have 1.58 times as
-    much at any n. Of number 3 that is said of the first coordinate alone: it is for single numbers. Two
-    draws of the same number and digits must not enter one product.
+    the coordinates, at most 0.33 times the variance it has with independent draws at n = 64, 0.04 at
+    256, where padded pairs have 1.58 times as much at any n. Below 64 some pairs have more than that: 2.5
+    at n = 8, 1.4 at 16 and 32, and number 3 with 4 has 2.5, 4.7 and 9.2. Of number 3 all this is said of the
+    first coordinate alone: it is for single numbers. Three pairs are not looked at together. Two draws of
+    the same number and digits must not enter one product.
     """
     for shift, mask in MAPS[number]:
         digits = digits ^ ((digits >> shift) & mask)
@@ -143,7 +118,13 @@ def related(digits: mi.UInt32, number: int) -> mi.UInt32:
 
 
 def pair_of(digits: mi.UInt32, hashed: mi.UInt32) -> tuple[mi.Float, mi.Float]:
-    """Both coordinates of the point of a digit word, Owen-scrambled."""
+    """Both coordinates of the point of a digit word, Owen-scrambled, see :func:`shuffled` for ``hashed``.
+
+    Multiples of 2^-24 in [0, 1), at most 1 - 2^-24, which float32 holds exactly. The points of every aligned
+    block of 2^m indices, m <= 24, form a (0,m,2)-net (finer intervals than 2^-24 are cut off), whatever
+    the seed, and over the seeds each point is uniform in the square. Means of functions of one pair
+    converge an order faster than with independent draws.
+    """
     seed_x, seed_y = _seeds(hashed)
     return _unit(_scramble(digits, seed_x)), _unit(_scramble(_second(digits), seed_y))
 
@@ -177,7 +158,8 @@ def _seeds(hashed: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
     """Seeds of the permutation trees of the two coordinates, from one that is also that of the shuffle.
 
     The low bits decide the leading digits: with shifts of 11 and 22 the low ten bits of the three are exactly
-    independent and uniform over uniform seeds.
+    independent and uniform over uniform seeds. That trees are independent of the shuffle, which uses the
+    high digits of its index first, is tested.
     """
     return (hashed ^ (hashed >> 11)) * 0x2C1B3C6D, (hashed ^ (hashed >> 22)) * 0x297A2D39
 
