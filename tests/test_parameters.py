@@ -361,7 +361,7 @@ def test_timeout_stops_after_a_pass(monkeypatch):
     """
     clock = Clock()
     monkeypatch.setattr(rendering, "time", SimpleNamespace(perf_counter=clock.perf_counter))
-    for timeout, count in ((2.5, 3), (0, 1), (-1, 10), (100, 10)):
+    for timeout, count in ((2.5, 3), (0, 1), (-1, 10), (100, 10), (float("inf"), 10)):
         bdpt = integrator(max_depth=1, light_paths=0, skip="none", spp_per_pass=1, timeout=timeout)
 
         def tick(report):

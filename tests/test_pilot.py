@@ -350,6 +350,9 @@ def test_changed_decisions_change_the_points():
         (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 0.5}]), "pass=0.5"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"colour": 0}]), "colour is no part"),
         ("[{}]", "KeyError 'light_paths'"),
+        ("[" * 100000, "RecursionError"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"mean": 10**400}]), "OverflowError"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"mean": 1e300}]), "mean=1e+300"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"light_paths": 0.3}]), "light_paths=0.3"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "some"}]), "connections='some'"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "all"}]), "without light paths"),
@@ -363,6 +366,16 @@ def test_bad_decisions(text, words):
     with pytest.raises(RuntimeError, match="bdpt: decisions=") as caught:
         bdpt(decisions=text)
     assert words in str(caught.value)
+
+
+def test_pilots_that_see_nothing_decide_nothing():
+    """Rationale: a sky alone is seen directly, which pilots leave out; `explain` printed a
+    table of equals beside a plan that was not the first of them. Expected: no decision, and no table."""
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "sensor": camera(24)})
+    integrator = bdpt()
+    assert "time to the same error" not in integrator.explain(scene, spp=1024)
+    integrator.render(scene, spp=1024)
+    assert integrator.statistics["decisions"] == []
 
 
 def test_decisions_by_two_hands():

@@ -56,6 +56,9 @@ FEW_PIXELS = 64
 # scenes a tenth of that, but all of it in a furnace, where hardly anything else is noisy.
 MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 
+# Of a recorded number: what single precision still holds when it is multiplied.
+MOST = 1e30
+
 # Per sample, as relMSE: below it nobody sees noise, and candidates differ by that of the pilot.
 LEAST_VARIANCE = 1e-4
 
@@ -119,7 +122,7 @@ def read_decisions(text: str) -> tuple[Decision, ...]:
         if passes != sorted(set(passes)) or passes[:1] not in ([], [0]):
             raise ValueError(f"passes {passes} must start at 0 and rise")
         return made
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise ValueError(
             f"bdpt: decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: "
             f"{type(error).__name__} {error}"
@@ -152,7 +155,7 @@ def _read_decision(entry: dict) -> Decision:
     }
     for name, value in numbers.items():
         least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
-        if not least <= value < math.inf:
+        if not least <= value <= MOST:
             raise ValueError(f"{name}={value!r}")
     return Decision(light_paths=light_paths, connections=connections, **numbers)
 

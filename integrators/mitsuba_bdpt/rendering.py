@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -99,7 +100,9 @@ class Render:
         self._moments = moments if self._moments is None else self._moments.joined(moments)
         possible = choice.candidates(self.world, self._full, self.settings)
         table = choice.choose(self._moments, possible, self._has_stratified_points())
-        if table and self._moments.mean > 0:  # a pilot that sees nothing says nothing
+        if not self._moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
+            table = []
+        if table:
             best, number = table[0], len(self.accumulator.passes)
             decision = best.candidate.decided(number, best.cost, best.variance, self._moments.mean)
             self._adopt(decision, choice.left_out(table))
@@ -183,7 +186,7 @@ class Render:
                 done += size
 
     def _affordable(self, size: int) -> int:
-        if self.settings.timeout < 0 or self.settings.points == "sampler":
+        if not 0 <= self.settings.timeout < math.inf or self.settings.points == "sampler":
             return size
         busy = time.perf_counter() - self.started - self.compile_seconds - self.pilot_seconds
         rate = sum(self.accumulator.passes) / max(busy, 1e-3)
