@@ -6,8 +6,8 @@ Medians over rounds in which all of them alternate, at 128^2. The cost of a samp
 seconds of a whole render of 64 samples per pixel less those of 4, so that what is fixed cancels. Path
 tracing alone (light_paths=0) with its points and with independent numbers; a light subpath for 16 camera
 subpaths without inner connections, with one per vertex, with all; everything switched on. A whole render of
-one sample, with path tracing alone. The pilot: its
-seconds, of the statistics, in renders of 64 and 256 samples per pixel, and its share of these.
+one sample, with path tracing alone. The pilot: its seconds, of the statistics, in renders of 64 and 256
+samples per pixel, and its share of these.
 """
 
 from __future__ import annotations

@@ -517,7 +517,7 @@ def test_coefficients_of_direct_light_have_to_gain_much(gain, stratified, kappa)
     assert table[0].time == pytest.approx(1 / gain if kappa != 1 else 1)
 
 
-def test_records_are_short_and_plain(tmp_path):
+def test_records_are_short_and_plain():
     """Expected: numbers of a decision have six digits at most, and survive JSON as they are."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 4})
     integrator.render(cornell(64), spp=128, seed=3)

@@ -21,16 +21,15 @@ LAST = 0xFFFFFFFF
 SEEDS = [0, 1, 2, 12345, 0x80000000, LAST]
 
 
-def scrambled_pair(index, seed):
+def scrambled_pair(index, seed, coordinates=sobol.pair_of):
     """A padded pair: shuffle and scrambles of its own, from one seed; arrays or integers."""
     hashed = sobol.mix(mi.UInt32(seed) + 0x9E3779B9)
-    return sobol.pair_of(sobol.shuffled(dr.brev(mi.UInt32(index)), hashed), hashed)
+    return coordinates(sobol.shuffled(dr.brev(mi.UInt32(index)), hashed), hashed)
 
 
 def scrambled_single(index, seed):
     """The first coordinate of it."""
-    hashed = sobol.mix(mi.UInt32(seed) + 0x9E3779B9)
-    return sobol.single_of(sobol.shuffled(dr.brev(mi.UInt32(index)), hashed), hashed)
+    return scrambled_pair(index, seed, sobol.single_of)
 
 
 def pair(index, seed) -> np.ndarray:
@@ -246,9 +245,8 @@ def boxes_with_others(numbers: tuple, m: int) -> float:
     rows = [[sum((int(c[j]) >> k & 1) << j for j in range(m)) for k in range(m)] for c in columns]
     found = []
     for lengths in product(range(m), repeat=len(rows)):
-        if sum(lengths) != m or any(
-            sum(n for n, p in zip(lengths, pairs, strict=True) if p == i) == 0 for i in (0, 1)
-        ):
+        divided = {pair for n, pair in zip(lengths, pairs, strict=True) if n}
+        if sum(lengths) != m or len(divided) < 2:
             continue
         basis = {}
         for row in (r for dimension, n in zip(rows, lengths, strict=True) for r in dimension[:n]):
