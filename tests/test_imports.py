@@ -15,7 +15,7 @@ ORDER = (
     ("parameters", "explain", "passes"),
     ("choice",),
     ("pilot",),
-    ("kernel", "film", "sinks"),
+    ("kernel", "film", "sinks", "snapshot"),
     ("connect",),
     ("subpath",),
     ("colour", "features"),

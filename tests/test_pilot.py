@@ -346,7 +346,7 @@ def test_changed_decisions_change_the_points():
         ("[1]", "TypeError"),
         ("{}", "a list of decisions is needed"),
         ('""', "a list of decisions is needed"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 3}]), "passes [3] must start at 0"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": n} for n in (3, 1)]), "[3, 1] must rise"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 0.5}]), "pass=0.5"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"colour": 0}]), "colour is no part"),
         ("[{}]", "KeyError 'light_paths'"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .choice import STRATIFIED_SPLATS
 from .plan import Plan, Settings, lost_paths
 
 
@@ -45,7 +46,8 @@ def _pilot(settings: Settings, table) -> list[str]:
     if not table:
         return []
     lines = [
-        "pilot: time to the same error, over that of the best (cost of a sample, its variance as relMSE):"
+        "pilot: time to the same error, over that of the best (cost of a sample; variance as relMSE, that "
+        f"of splats times {STRATIFIED_SPLATS:g} where the points are stratified):"
     ]
     shown = set()
     for row in table:

@@ -18,6 +18,9 @@ import numpy as np
 
 from .strategies import layer_names, strategies, strategy_count, strategy_index
 
+# The blocks of sums, as `Snapshot.arrays` calls them.
+_NAMES = ("camera", "light", "strategies")
+
 
 class Block:
     """Sums of samples weighted by the film's filter, as in ``mi.ImageBlock``, but of a size that is a
@@ -93,6 +96,20 @@ class Replicates:
         mean = before + (x - before) * (n / spp)
         self._squares = self._squares + n * (x - before) * (x - mean)
         self.count, self.mean, self._spp, self._sums = self.count + 1, mean, spp, sums
+
+    def store(self, arrays: dict) -> dict:
+        """Put what `restore` needs into ``arrays`` of a `Snapshot`; the rest is returned."""
+        if self.count:
+            arrays |= {"replicates.mean": self.mean, "replicates.squares": self._squares}
+            arrays |= {f"replicates.last.{i}": sums for i, sums in enumerate(self._sums)}
+        return {"count": self.count, "spp": self._spp}
+
+    def restore(self, progress: dict, arrays: dict):
+        """Go on from what `store` gave."""
+        self.count, self._spp = progress["count"], progress["spp"]
+        if self.count:
+            self.mean, self._squares = arrays["replicates.mean"], arrays["replicates.squares"]
+            self._sums = [arrays[n] for n in sorted(arrays) if n.startswith("replicates.last.")]
 
     def variance(self, spp: int, shape=()):
         """Variance of the mean of ``spp`` samples per pixel (those of a replicate that was not
@@ -176,6 +193,22 @@ class Accumulator:
         self._done = (sums, (*passes, spp))  # at once: Ctrl-C may come between any two steps
         for b in blocks:
             b.clear()
+
+    def store(self) -> tuple[dict, dict | None]:
+        """Arrays of a `Snapshot`, and what it has to know of the replicates, if there are any."""
+        sums = self._done[0] or []
+        arrays = {name: np.array(s) for name, s in zip(_NAMES, sums, strict=False)}
+        return arrays, self.replicates.store(arrays) if self.replicates else None
+
+    def restore(self, passes: tuple, arrays: dict, replicates: dict | None):
+        """Go on from what `store` gave after these ``passes``."""
+        sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
+        for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
+            if len(s) != len(block.data):
+                raise ValueError(f"bdpt: the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
+        self._done = (sums, tuple(passes))
+        if self.replicates is not None:
+            self.replicates.restore(replicates, arrays)
 
     def close_replicate(self):
         """Count what was added since the last call as one independent replicate of the image."""

@@ -15,6 +15,7 @@ from .parameters import check_made_for, check_variant, integer, is_index, read_s
 from .passes import REPLICATES
 from .plan import UNLIMITED
 from .rendering import Render
+from .snapshot import Snapshot
 from .strategies import layer_names
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
@@ -73,6 +74,11 @@ All of them are combined by multiple importance sampling.
      estimated from 8 independent parts of the render; ``statistics["error"]`` is the relMSE that
      follows. Needs at least 8 samples per pixel. On a ``specfilm`` these layers are called after its
      bands. (Default: false)
+ * - until_error
+   - |float|
+   - Stop when the estimate of the relMSE is this or less; needs ``variance``. It is looked at after 32
+     samples per pixel, 64, 128, …; ``spp`` is the most that is spent. An estimate that is too small by
+     chance ends a render too early: see docs/long_renders.md for by how much. (Default: 0, never)
  * - aovs
    - |string|
    - Adds feature layers, named by pairs ``name:kind`` as in Mitsuba's ``aov`` and equal to its layers:
@@ -127,18 +133,43 @@ def _make_class():
             settings = self.settings
             return layer_names(settings.strategy_depth, settings.variance, feature_names(settings.aovs))
 
-        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            """Render ``scene``; see ``mi.Integrator.render`` for the arguments."""
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, start=None):
+            """Render ``scene``; see ``mi.Integrator.render`` for the arguments. ``start``: a
+            `snapshot.Snapshot` of ``PassReport.snapshot`` to go on from, of the same scene; the image is
+            that of the uninterrupted render up to rounding."""
             check_made_for(self, scene)
             sensor = _resolve(scene, sensor)
             spp = _samples(sensor, spp, self.settings)
             render = Render(scene, sensor, self.settings, seed, spp)
+            if start is not None:
+                _check_resumable(start, self.settings)
+                render.resume(start)
             try:
                 self._cancelled = False
                 render.run(self.on_pass, lambda: self._cancelled)
             finally:
                 self.statistics = render.statistics()
             _log(self.statistics)
+            return _result(sensor.film(), develop, evaluate)
+
+        def decide(self, scene, sensor=0, seed=0, spp=0):
+            """What the pilot of such a render chooses, as in ``statistics["decisions"]``: an empty list
+            without a pilot. The parameter ``decisions`` of other renders of the scene takes it as JSON."""
+            check_made_for(self, scene)
+            sensor = _resolve(scene, sensor)
+            render = Render(scene, sensor, self.settings, seed, _samples(sensor, spp, self.settings))
+            render.decide()
+            return [decision.record() for decision in render.decisions]
+
+        def assemble(self, snapshot, scene, sensor=0, develop=True, evaluate=True):
+            """The image of a snapshot, also of several that were joined (`Snapshot.joined`), traced by
+            this integrator or one with the same parameters; what `render` would have returned."""
+            check_made_for(self, scene)
+            sensor = _resolve(scene, sensor)
+            render = Render(scene, sensor, self.settings, 0, 1)
+            render.resume(snapshot, apart_from=("seed", "spp", "decisions"))
+            render.accumulator.finish()
+            self.statistics = render.statistics()
             return _result(sensor.film(), develop, evaluate)
 
         def sample(self, *args, **kwargs):
@@ -172,6 +203,16 @@ def _make_class():
             return f"BDPTIntegrator[\n{lines}]"
 
     return BDPTIntegrator
+
+
+def _check_resumable(start, settings):
+    if not isinstance(start, Snapshot):
+        raise TypeError(f"bdpt: start={type(start).__name__} must be a snapshot from a PassReport")
+    if settings.points == "sampler":
+        raise ValueError(
+            "bdpt: start with points=sampler is not possible: a scene's sampler cannot start in the middle "
+            "of its samples; use points=sobol"
+        )
 
 
 NO_DERIVATIVES = (

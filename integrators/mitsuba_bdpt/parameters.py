@@ -86,6 +86,15 @@ def _aovs(props):
     return value
 
 
+def _until_error(props):
+    value = props.get("until_error", 0.0)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"bdpt: until_error={value!r} must be a number, the relMSE to stop at")
+    if not 0 <= value < math.inf:
+        raise ValueError(f"bdpt: until_error={value!r} must be a positive relMSE, or 0 for none")
+    return float(value)
+
+
 def _check_layers(settings: Settings):
     """Raise ``ValueError`` if two layers of the film have the same name."""
     seen = set()
@@ -134,6 +143,7 @@ def read_settings(props) -> Settings:
         ),
         strategy_images=_boolean(props, "strategy_images"),
         variance=_boolean(props, "variance"),
+        until_error=_until_error(props),
         aovs=_aovs(props),
         spp_per_pass=integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
         timeout=float(timeout),
@@ -150,6 +160,15 @@ def read_settings(props) -> Settings:
             "contradictory; leave out one or the other"
         )
     _check_layers(settings)
+    if settings.until_error and not settings.variance:
+        raise ValueError(
+            f"bdpt: until_error={settings.until_error} follows from the variance; set variance to true"
+        )
+    if settings.until_error and settings.points == "sampler":
+        raise ValueError(
+            f"bdpt: until_error={settings.until_error} with points=sampler is not possible: a sampler's "
+            "samples are numbered before it is known how many there will be; use points=sobol"
+        )
     return settings
 
 

@@ -23,6 +23,9 @@ PASS_SAMPLES_SAMPLER = 1 << 20
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
 
+# Samples per pixel of each of the first `REPLICATES` under ``until_error``.
+FIRST_REPLICATE = 4
+
 
 def _most_samples(settings: Settings) -> int:
     """Samples in one launch."""
@@ -48,27 +51,40 @@ def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) 
 @dataclass(frozen=True)
 class Step:
     """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate, whose last it
-    may be; ``replicate`` counts the independent images that `variance` needs, else 0."""
+    may be; ``replicate`` counts the independent images that `variance` needs, else 0. ``judged``: after it
+    ``until_error`` is looked at."""
 
     replicate: int
     done: int
     size: int
     of: int
     last: bool
+    judged: bool = False
 
 
 def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[Step]:
     """All passes of a render of ``spp`` samples per pixel; ``small_first`` see `pass_sizes`."""
     parts = [spp]
     if settings.variance:
-        parts = [spp // REPLICATES + (i < spp % REPLICATES) for i in range(REPLICATES)]
+        parts = _replicates(spp, bool(settings.until_error))
     steps = []
     for replicate, part in enumerate(parts):
-        done = 0
+        done, closes = 0, replicate % REPLICATES == REPLICATES - 1
         for size in pass_sizes(camera, part, settings, small_first and replicate == 0):
-            steps.append(Step(replicate, done, size, part, done + size == part))
+            last = done + size == part
+            steps.append(Step(replicate, done, size, part, last, last and closes))
             done += size
     return steps
+
+
+def _replicates(spp: int, growing: bool) -> list[int]:
+    """Samples per pixel of the replicates: `REPLICATES` of them, or, if ``growing``, groups of so many, each
+    group as large as all before it, so that half of the samples lie in few long sequences."""
+    sizes = []
+    while (left := spp - sum(sizes)) > 0:
+        group = min(left, max(sum(sizes), REPLICATES * FIRST_REPLICATE)) if growing else left
+        sizes += [group // REPLICATES + (i < group % REPLICATES) for i in range(min(group, REPLICATES))]
+    return sizes
 
 
 def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):

@@ -32,6 +32,7 @@ class Settings:
     stored_vertices: int
     strategy_images: bool
     variance: bool
+    until_error: float
     aovs: str
     spp_per_pass: int
     timeout: float

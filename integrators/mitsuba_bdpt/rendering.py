@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from . import choice, mis, pilot, points
+from ._version import __version__
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
@@ -18,6 +22,7 @@ from .parameters import check_film, check_scene, check_variant, integer
 from .passes import Step, batches, schedule
 from .plan import Settings, plan
 from .sinks import Image
+from .snapshot import Snapshot
 from .strategies import strategy_count
 from .world import World
 
@@ -40,16 +45,20 @@ STRATEGY_MEMORY = 2 << 30
 
 @dataclass(frozen=True)
 class PassReport:
-    """Progress after a pass: samples per pixel, seconds and rays so far."""
+    """Progress after a pass: samples per pixel, seconds and rays so far; ``error`` the relMSE estimated when
+    ``until_error`` was last looked at, else ``None``; ``snapshot()`` gives what a later render can start
+    from."""
 
     spp_done: int
     spp_total: int
     seconds: float
     rays: int
+    error: float | None
+    snapshot: Callable[[], Snapshot]
 
 
 def sequence_seed(seed, number: int):
-    """Seed of a point sequence besides the image's own: numbers 1 to 7 are the replicates of `variance`."""
+    """Seed of a point sequence besides the image's own: numbers from 1 are the replicates of `variance`."""
     other = mi.sample_tea_32(seed, mi.UInt32(number))[1]
     dr.make_opaque(other)
     return other
@@ -82,6 +91,7 @@ class Render:
         self._use(self.plan)
         self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
+        self._left_out, self._small_first, self._error, self._earlier = [], None, None, 0.0
 
     def decide(self) -> list:
         """Run a pilot and adopt what it chooses, if there is a choice and the render is long enough to pay
@@ -121,6 +131,7 @@ class Render:
         if self.decisions and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
             self._changes += 1
         self.decisions.append(decision)
+        self._left_out = list(left_out)
         self._threshold = decision.threshold
         self._use(adopted)
 
@@ -154,7 +165,8 @@ class Render:
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         try:
-            self.decide()
+            if not self.accumulator.passes:
+                self.decide()
             for number, step in enumerate(self._steps()):
                 self._decide_before(step)
                 self._pass(step)
@@ -163,9 +175,10 @@ class Render:
                     self._wait()
                 if step.last and self.settings.variance:
                     self.accumulator.close_replicate()
+                exact = step.judged and self._is_exact_enough()
                 if on_pass is not None:
                     on_pass(self.report())
-                if 0 <= timeout <= time.perf_counter() - self.started or cancelled():
+                if exact or 0 <= timeout <= time.perf_counter() - self.started or cancelled():
                     break
         finally:
             try:
@@ -176,14 +189,27 @@ class Render:
     def _steps(self):
         """The passes of `schedule`; under ``timeout`` cut, so that one takes about a tenth of it."""
         # The first pass gives roulette the scale of the image, if no pilot has.
-        known = self._threshold is not None or self.settings.decisions
-        small_first = self.plan.roulette and self.plan.light and not known
-        for step in schedule(self.world.camera, self.spp, self.settings, small_first):
+        if self._small_first is None:
+            first = self.settings.decisions and self.settings.decisions[0].first_pass == 0
+            known = self._threshold is not None or first
+            self._small_first = bool(self.plan.roulette and self.plan.light and not known)
+        earlier = sum(self.accumulator.passes)
+        for step in schedule(self.world.camera, self.spp, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
+            skipped = min(earlier, step.size)
+            done, earlier = done + skipped, earlier - skipped
             while done < end:
                 size = min(end - done, self._affordable(step.size))
-                yield replace(step, done=done, size=size, last=step.last and done + size == end)
+                last = step.last and done + size == end
+                yield replace(step, done=done, size=size, last=last, judged=step.judged and last)
                 done += size
+
+    def _is_exact_enough(self) -> bool:
+        """Whether the estimated error is what ``until_error`` asks for."""
+        if not self.settings.until_error:
+            return False
+        self._error = self.accumulator.error()
+        return self._error <= self.settings.until_error
 
     def _affordable(self, size: int) -> int:
         if not 0 <= self.settings.timeout < math.inf or self.settings.points == "sampler":
@@ -244,8 +270,75 @@ class Render:
 
     def report(self) -> PassReport:
         """Progress so far, for ``on_pass``."""
-        seconds = time.perf_counter() - self.started
-        return PassReport(sum(self.accumulator.passes), self.spp, seconds, sum(self._rays().values()))
+        rays = sum(self._rays().values())
+        return PassReport(
+            sum(self.accumulator.passes), self.spp, self._seconds(), rays, self._error, self.snapshot
+        )
+
+    def _seconds(self) -> float:
+        """So far, those of the render that this one goes on from included."""
+        return self._earlier + time.perf_counter() - self.started
+
+    def identity(self) -> dict:
+        """What two renders have to have in common for one to go on from the other, besides the scene; as
+        JSON holds it."""
+        film, settings = self.sensor.film(), asdict(self.settings)
+        del settings["timeout"]
+        settings["until_error"] = bool(self.settings.until_error)  # the passes depend on whether there is one
+        values = settings | {
+            "version": __version__,
+            "variant": mi.variant(),
+            "seed": int(self.seed[0]),
+            "spp": self.spp,
+            "film": [type(film).__name__, *self.accumulator.size, *self.accumulator.offset],
+            "filter": str(film.rfilter()),
+            "colours": list(self.accumulator.colour.names),
+        }
+        return json.loads(json.dumps(values))
+
+    def snapshot(self) -> Snapshot:
+        """The passes that are done, for `resume`."""
+        self._wait()
+        arrays, replicates = self.accumulator.store()
+        moments = None
+        if self._moments is not None:
+            moments = {name: getattr(self._moments, name) for name in ("mean", "rays", "lanes")}
+            arrays |= {f"moments.{name}": getattr(self._moments, name) for name in ("base", "light", "draw")}
+        progress = {
+            "decisions": [decision.record() for decision in self.decisions],
+            "left_out": self._left_out,
+            "moments": moments,
+            "pilots": [self._pilots, self._next_pilot],
+            "small_first": self._small_first,
+            "inverse_threshold": str(self.kernel.inverse_threshold[0]),  # may be infinite
+            "replicates": replicates,
+            "counts": dict(self._counts),
+            "compiled": self.compiled,
+            "cached": self.cached,
+            "seconds": self._seconds(),
+            "compile_seconds": self.compile_seconds,
+            "pilot_seconds": self.pilot_seconds,
+        }
+        return Snapshot(self.identity(), self.accumulator.passes, progress, arrays)
+
+    def resume(self, snapshot: Snapshot, apart_from=()):
+        """Go on after the passes of a snapshot, which raises ``ValueError`` if it is of another render (see
+        `Snapshot.check`)."""
+        snapshot.check(self.identity(), apart_from)
+        progress, arrays = snapshot.progress, snapshot.arrays
+        for decision in choice.read_decisions(json.dumps(progress["decisions"])):
+            self._adopt(decision, progress["left_out"])
+        self.accumulator.restore(snapshot.passes, arrays, progress["replicates"])
+        if progress["moments"] and "moments.base" in arrays:
+            parts = {name: arrays[f"moments.{name}"] for name in ("base", "light", "draw")}
+            self._moments = pilot.Moments(**parts, **progress["moments"])
+        self._pilots, self._next_pilot = progress["pilots"]
+        self._small_first = progress["small_first"]
+        self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(progress["inverse_threshold"]))
+        self._counts = dict(progress["counts"])
+        self.compiled, self.cached = progress["compiled"], progress["cached"]
+        self.compile_seconds, self.pilot_seconds = progress["compile_seconds"], progress["pilot_seconds"]
+        self._earlier = progress["seconds"]
 
     def _rays(self):
         rays = {name: self._counts[name] for name in RAYS}
@@ -257,7 +350,7 @@ class Render:
         """The render in numbers; plain values only."""
         connections = {name: self._counts[name] for name in ("evaluated", "zero", "rouletted")}
         connections["traced"] = self._counts["shadow_inner"]
-        total = time.perf_counter() - self.started
+        total = self._seconds()
         return {
             "seconds": {
                 "compile": self.compile_seconds,

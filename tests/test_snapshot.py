@@ -1,0 +1,227 @@
+"""Renders that go on from a snapshot, and renders that are joined from several."""
+
+import json
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import choice
+from mitsuba_bdpt.passes import REPLICATES, _replicates
+from mitsuba_bdpt.snapshot import Snapshot
+
+# Sums of a pass are made by atomic additions, whose order differs from run to run.
+ROUNDING = {"rtol": 2e-4, "atol": 1e-6}
+
+
+def scene(rfilter="box", size=16):
+    box = mi.cornell_box()
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": rfilter}}
+    box["sensor"]["film"] = film | {"pixel_format": "rgb", "component_format": "float32"}
+    return mi.load_dict(box)
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 4} | parameters)
+
+
+def stopped(integrator, target, after: int | None, **arguments) -> Snapshot:
+    """The snapshot of a render that is stopped after so many passes, or that is whole, through a file's
+    bytes and back."""
+    reports = []
+
+    def on_pass(report):
+        reports.append(report)
+        if len(reports) == after:
+            integrator.cancel()
+
+    integrator.on_pass = on_pass
+    integrator.render(target, develop=False, **arguments)
+    integrator.on_pass = None
+    return Snapshot.from_bytes(reports[-1].snapshot().to_bytes())
+
+
+@pytest.mark.parametrize(
+    ("rfilter", "parameters", "after"),
+    [
+        ("box", {}, 1),
+        ("gaussian", {"skip": "none"}, 3),
+        ("box", {"variance": True, "aovs": "dd:depth"}, 5),
+        ("box", {"variance": True, "until_error": 1e-9}, 9),
+        ("box", {"strategy_images": True}, 2),
+        ("box", {"light_paths": 0, "points": "independent"}, 2),
+    ],
+)
+def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
+    """Expected: the image, its layers and the counts of a render that was stopped and went on in a new
+    integrator are those of the render that never stopped. Tolerance: the rounding of atomic sums.
+    """
+    target = scene(rfilter)
+    whole = bdpt(**parameters)
+    expected = np.array(whole.render(target, seed=3, spp=64))
+    start = stopped(bdpt(**parameters), target, after, seed=3, spp=64)
+    assert 0 < start.spp < 64
+    resumed = bdpt(**parameters)
+    image = np.array(resumed.render(target, seed=3, spp=64, start=start))
+    np.testing.assert_allclose(image, expected, **ROUNDING)
+    for name in ("rays", "connections", "passes", "decisions", "skipped"):
+        assert resumed.statistics[name] == whole.statistics[name], name
+    if "variance" in parameters:
+        assert resumed.statistics["error"] == pytest.approx(whole.statistics["error"], rel=1e-3)
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_pilots_and_decisions_go_on(monkeypatch, blind):
+    """Rationale: later pilots are joined with earlier ones, and a changed decision starts a new point
+    sequence. Expected: with pilots that are forced to change their minds, at 0, 32 and 128 spp, a render
+    stopped after 41 spp or so goes on as the uninterrupted one, its decisions included; also where the
+    first pilot is ``blind`` and decides nothing, so that a small pass comes first.
+    """
+    monkeypatch.setattr(choice, "LEAST_SAMPLES", 0)
+    original = choice.choose
+
+    def changing(moments, possible, stratified):
+        table, number = original(moments, possible, stratified), moments.lanes // choice.LEAST_LANES
+        return table[number % 2 :] if number > blind else []
+
+    monkeypatch.setattr(choice, "choose", changing)
+    target = scene()
+    whole = bdpt(spp_per_pass=8)
+    expected = np.array(whole.render(target, seed=1, spp=1024))
+    assert len(whole.statistics["decisions"]) == 3 - blind
+    start = stopped(bdpt(spp_per_pass=8), target, 6, seed=1, spp=1024)
+    resumed = bdpt(spp_per_pass=8)
+    image = np.array(resumed.render(target, seed=1, spp=1024, start=start))
+    assert resumed.statistics["decisions"] == whole.statistics["decisions"]
+    assert resumed.statistics["passes"] == whole.statistics["passes"]
+    np.testing.assert_allclose(image, expected, **ROUNDING)
+    replayed = bdpt(spp_per_pass=8, decisions=json.dumps(whole.statistics["decisions"]))
+    np.testing.assert_allclose(np.array(replayed.render(target, seed=1, spp=1024)), expected, **ROUNDING)
+
+
+def test_a_snapshot_of_the_last_pass_traces_nothing():
+    target = scene()
+    start = stopped(bdpt(), target, None, seed=0, spp=16)
+    expected = np.array(bdpt().render(target, seed=0, spp=16))
+    passes = []
+    resumed = bdpt()
+    resumed.on_pass = passes.append
+    image = np.array(resumed.render(target, seed=0, spp=16, start=start))
+    assert sum(start.passes) == 16 and not passes
+    np.testing.assert_allclose(image, expected, **ROUNDING)
+
+
+@pytest.mark.parametrize(("rfilter", "tolerance"), [("box", 1e-5), ("gaussian", 0.02)])
+def test_joined_renders_are_their_mean(rfilter, tolerance):
+    """Rationale: renders of seeds of their own, made anywhere, add up by their raw sums. Expected: the
+    mean of the three images, weighted by their samples. Tolerance: the mean relative difference is
+    rounding with the box filter; with others the sums of filter weights differ by some per cent from
+    render to render, which the mean of images does not know.
+    """
+    target, parts = scene(rfilter), ((5, 8), (6, 16), (7, 8))
+    snapshots = [part(target, seed, spp) for seed, spp in parts]
+    images = [np.array(bdpt(skip="impossible").render(target, seed=seed, spp=spp)) for seed, spp in parts]
+    joined = snapshots[0].joined(snapshots[1]).joined(snapshots[2])
+    assert joined.spp == 32 and joined.identity["seed"] == [5, 6, 7]
+    assert joined.progress["counts"]["camera"] == sum(s.progress["counts"]["camera"] for s in snapshots)
+    image = np.array(bdpt(skip="impossible").assemble(joined, target))
+    expected = sum(spp * image for (_, spp), image in zip(parts, images, strict=True)) / 32
+    assert abs(image - expected).mean() < tolerance * expected.mean()
+
+
+def part(target, seed: int, spp: int, **parameters) -> Snapshot:
+    """The snapshot of a whole render, reduced to what is joined."""
+    integrator = bdpt(skip="impossible", **parameters)
+    return stopped(integrator, target, after=None, seed=seed, spp=spp).image_only()
+
+
+def test_joined_variance_is_that_of_all_replicates():
+    """Expected: the variance that follows from 8 replicates of one render and 8 of another is that of the
+    16 images, whose weighted mean and squares are taken here in one go; the joined order does not matter.
+    """
+    target = scene()
+    a, b = (part(target, seed, spp, variance=True) for seed, spp in ((1, 16), (2, 32)))
+    image = np.array(bdpt(skip="impossible", variance=True).assemble(a.joined(b), target))
+    swapped = np.array(bdpt(skip="impossible", variance=True).assemble(b.joined(a), target))
+    np.testing.assert_allclose(image, swapped, **ROUNDING)
+    means = [s.arrays["replicates.mean"] for s in (a, b)]
+    squares = [s.arrays["replicates.squares"] for s in (a, b)]
+    mean = (16 * means[0] + 32 * means[1]) / 48
+    total = sum(squares) + 16 * (means[0] - mean) ** 2 + 32 * (means[1] - mean) ** 2
+    np.testing.assert_allclose(image[..., 3:], total / (48 * 15), rtol=1e-3, atol=1e-9)
+
+
+def test_what_does_not_belong_together_is_refused():
+    target = scene()
+    start = stopped(bdpt(), target, 1, seed=0, spp=16)
+    for arguments, parameters, name in (
+        ({"seed": 1, "spp": 16}, {}, "seed"),
+        ({"seed": 0, "spp": 32}, {}, "spp"),
+        ({"seed": 0, "spp": 16}, {"max_depth": 5}, "max_depth"),
+        ({"seed": 0, "spp": 16}, {"heuristic": "power"}, "heuristic"),
+    ):
+        with pytest.raises(ValueError, match=f"its {name} is"):
+            bdpt(**parameters).render(target, start=start, **arguments)
+    with pytest.raises(ValueError, match="its film is"):
+        bdpt().render(scene(size=12), seed=0, spp=16, start=start)
+    with pytest.raises(ValueError, match="its filter is"):
+        bdpt().render(scene("gaussian"), seed=0, spp=16, start=start)
+    with pytest.raises(TypeError, match="start=dict must be a snapshot"):
+        bdpt().render(target, start={})
+    with pytest.raises(ValueError, match="points=sampler"):
+        bdpt(points="sampler").render(target, spp=16, start=start)
+    with pytest.raises(ValueError, match="seed=0 is in both"):
+        start.joined(start)
+    with pytest.raises(ValueError, match="not a snapshot"):
+        Snapshot.from_bytes(b"PK\x03\x04 and then nothing")
+    timed = bdpt(timeout=60)  # when a render is looked at is not what is in it
+    assert sum(timed.render(target, seed=0, spp=16, start=start).shape) > 0
+
+
+def test_decide_is_the_pilot_of_a_render():
+    """Expected: the decisions that a client asks for once are those of the render itself, and a render
+    that replays them is the same."""
+    target = scene(size=32)
+    integrator = bdpt()
+    decisions = integrator.decide(target, seed=4, spp=1024)
+    integrator.render(target, seed=4, spp=1024, develop=False)
+    assert decisions and decisions[0] == integrator.statistics["decisions"][0]
+    assert integrator.decide(target, spp=1) == []
+    replayed = bdpt(decisions=json.dumps(decisions))
+    replayed.render(target, seed=4, spp=8, develop=False)
+    assert replayed.statistics["decisions"] == decisions
+
+
+def test_replicates_of_a_render_until_an_error_grow():
+    assert _replicates(19, growing=False) == [3, 3, 3, 2, 2, 2, 2, 2]
+    sizes = _replicates(1024, growing=True)
+    assert sum(sizes) == 1024 and len(sizes) % REPLICATES == 0
+    assert sizes[:9] == [4] * 9 and sizes[-8:] == [64] * 8
+    assert _replicates(35, growing=True) == [4] * 8 + [1, 1, 1]
+
+
+def test_a_render_ends_at_the_error_that_is_asked_for():
+    """Expected: a render until an error stops at 32, 64, 128, … spp, the first at which its estimate is
+    small enough; what it reports is that estimate, also in its last report."""
+    target, reports = scene(), []
+    integrator = bdpt(variance=True, until_error=0.01)
+    integrator.on_pass = reports.append
+    integrator.render(target, seed=2, spp=1 << 14, develop=False)
+    done = sum(integrator.statistics["passes"])
+    assert done in (64, 128, 256, 512, 1024)
+    assert integrator.statistics["error"] == reports[-1].error <= 0.01
+    errors = [report.error for report in reports if report.error is not None]
+    assert all(error > 0.01 for error in errors if error != errors[-1])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "error", "message"),
+    [
+        ({"until_error": 0.1}, ValueError, "set variance to true"),
+        ({"until_error": -1.0, "variance": True}, ValueError, "positive relMSE"),
+        ({"until_error": "low", "variance": True}, TypeError, "must be a number"),
+        ({"until_error": 0.1, "variance": True, "points": "sampler"}, ValueError, "points=sobol"),
+    ],
+)
+def test_bad_parameters(parameters, error, message):
+    with pytest.raises((error, RuntimeError), match=message):
+        bdpt(**parameters)
