@@ -4,7 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 
-.PHONY: render test lint gallery references benchmark slow sweep
+# Every scene of the benchmark.
+SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
+
+.PHONY: render test lint gallery pictures docs package references benchmark slow sweep
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -19,14 +22,46 @@ slow: $(INSTALLED)
 gallery: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml -o renders/lamp_behind_glass.exr
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
-	mkdir -p docs/images
+	mkdir -p docs/images/gallery
 	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
+	for scene in $(SCENES); do \
+		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
+			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
+	done
+
+# The pictures of docs/pictures.md.
+pictures: $(INSTALLED)
+	mkdir -p docs/images
+	$(VENV)/bin/python scripts/equal_time.py veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
+	$(VENV)/bin/python scripts/equal_time.py glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
+	$(VENV)/bin/python scripts/equal_time.py lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
+	$(VENV)/bin/python scripts/equal_time.py veach_mis --spp 16 -o docs/images/veach_mis_heuristics.png \
+		-i "bdpt skip=none heuristic=uniform" "bdpt skip=none heuristic=maximum" \
+		"bdpt skip=none heuristic=power" "bdpt skip=none heuristic=balance"
+	$(VENV)/bin/python scripts/strategies.py veach_bidir -o renders/pyramid
+	cp renders/pyramid_weighted.png renders/pyramid_unweighted.png docs/images
+
+# The documentation as a site, in build/site.
+docs: $(INSTALLED)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(VENV)/bin/python -m mkdocs build --strict
+
+# Wheel and sdist, checked, and the wheel tried in an environment of its own.
+package: $(INSTALLED)
+	rm -rf dist build/try
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check build twine
+	$(VENV)/bin/python -m build
+	$(VENV)/bin/python -m twine check --strict dist/*
+	$(PYTHON) -m venv build/try
+	build/try/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
+	cd build/try && bin/python -m mitsuba_bdpt doctor
 
 # A small sweep of time against error, under ten minutes on two cores; goes on where it was stopped.
 sweep: $(INSTALLED)
 	-$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --spp 128 --seconds 120
 	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
 	$(VENV)/bin/python scripts/report.py results/small
+	$(VENV)/bin/python scripts/page.py results/small
 
 # The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)

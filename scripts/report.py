@@ -6,7 +6,7 @@
 reads rows.parquet and probes.json in the folder, and writes the plots and README.md with all tables beside
 them. Goals and explanations of what is not as one expects are read from goals.toml and notes.toml, if there
 are any. ``--readme`` fills the parts of a Markdown file between the lines `<!-- report: NAME -->` and
-`<!-- end -->`, NAME being ``goals`` or ``efficiency``.
+`<!-- end -->`, NAME being ``goals``, ``efficiency`` or ``gallery`` (`make gallery` renders its images).
 """
 
 from __future__ import annotations
@@ -116,6 +116,28 @@ def efficiency_table(results: Results) -> str:
             ]
         lines.append([*line, said(lambda s=scene: results.efficiency(s, NONE))])
     return table(head, lines)
+
+
+GALLERY = "docs/images/gallery"  # from the README
+GALLERY_COLUMNS = 3
+
+
+def gallery(results: Results) -> str:
+    """Images of all scenes, a few in a row, with the efficiency over the stronger `path` beneath."""
+    cells = []
+    for scene in results.scenes:
+        try:
+            figure = ranged(results.against_path(scene))
+        except Biased as why:
+            figure = f"`path`: {str(why).split('; ')[-1].split(': ')[-1]}"
+        except NotJudged:
+            figure = "not judged"
+        except Refused as why:
+            figure = str(why)
+        cells.append(f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{figure}")
+    cells += [""] * (-len(cells) % GALLERY_COLUMNS)
+    rows = [cells[i : i + GALLERY_COLUMNS] for i in range(0, len(cells), GALLERY_COLUMNS)]
+    return table(rows[0], rows[1:])
 
 
 def estimate(x) -> str:
@@ -513,8 +535,14 @@ def main():
     figures.convergence(results, "spp", args.folder / "samples.png")
     figures.rays(results, args.folder / "rays.png")
     if args.readme:
-        readme = replace_part(args.readme.read_text(), "goals", goals_table(results, goals))
-        write_text(args.readme, replace_part(readme, "efficiency", efficiency_table(results)))
+        readme = args.readme.read_text()
+        for name, part in (
+            ("goals", goals_table(results, goals)),
+            ("efficiency", efficiency_table(results)),
+            ("gallery", gallery(results)),
+        ):
+            readme = replace_part(readme, name, part)
+        write_text(args.readme, readme)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
     python scripts/sweep.py presets/small.toml -o results/small
     python scripts/sweep.py presets/small.toml -o results/small     # again: goes on where it was stopped
     python scripts/sweep.py presets/benchmark.toml --scenes pool    # one scene anew, other rows as they are
+    python scripts/sweep.py presets/small.toml --scheduler HOST:8786    # on a dask.distributed cluster
 
 Presets (see scripts/preset.py) say what is rendered. For each scene, budget and seed all integrators follow
 one another, so that a noisy machine is noisy for all. Every finished render is a file of its own in
@@ -10,6 +11,8 @@ OUTPUT/cells, named after a hash of all that determines it (parameters, scene, v
 source), and is not rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried
 again the next time. Errors are taken against the references of scripts/reference.py, and anew when a
 reference has become better; HDR-FLIP for the first seed alone, since it takes longer than most renders.
+On a cluster, renders that follow one another go to one worker together, which renders them one after the
+other; workers see this folder under the same path, and have the same software. Probes are left out there.
 OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what
 scripts/probes.py measures.
 """
@@ -24,8 +27,12 @@ import json
 import math
 import os
 import platform
+import sys
+import tempfile
 import time
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 
 import analysis
@@ -39,7 +46,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
-from mitsuba_bdpt import render  # isort: skip
+from mitsuba_bdpt import cluster, render  # isort: skip
 
 CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up
@@ -155,7 +162,6 @@ class Bench:
         self.cells, self.output, self.name = cells, output, cells.subject.name
         self.resolution, self.depth = cells.where()[1:]
         self._scenes, self._integrators, self._compile, self._spp = {}, {}, {}, {}
-        self.reference = judge_of(*cells.where())
 
     def scene(self, sampler: str):
         """The scene with that sampler."""
@@ -238,8 +244,8 @@ def judge_of(scene: str, resolution: int, depth: int):
     return reference.load_reference(scene, resolution, depth), sha256
 
 
-def measure(bench: Bench, cell: Cell) -> dict:
-    """Render a cell; its row."""
+def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
+    """Render a cell; its row, but for the errors, and its image."""
     spp = bench.spp_of(cell)
     compile_seconds = bench.compile_seconds(cell, spp)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -248,6 +254,7 @@ def measure(bench: Bench, cell: Cell) -> dict:
     row = {
         "key": cell.key,
         **{k: v for k, v in asdict(cell).items() if k not in ("parameters", "versions", "against")},
+        "machine": machine(),
         "parameters": json.dumps(dict(cell.parameters)),
         "versions": json.dumps(dict(cell.versions)),
         "started": started,
@@ -257,10 +264,52 @@ def measure(bench: Bench, cell: Cell) -> dict:
         "statistics": json.dumps(statistics),
         "decisions": json.dumps(statistics.get("decisions")),
     }
-    row |= {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}
-    path = image_file(bench.output, cell)
-    reference.write_exr(path, {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
-    return row | errors(image, *bench.reference, cell.seed == FIRST_SEED)
+    return row | {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}, image
+
+
+def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None:
+    """Write the image and the row of a cell, the errors against ``judge`` (see `judge_of`) added."""
+    reference.write_exr(image_file(output, cell), {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
+    found = row | errors(image, *judge, cell.seed == FIRST_SEED)
+    write_json(cell_file(output, cell), found)
+
+
+# -- on a worker of a cluster ------------------------------------------------------------------
+
+
+def on_worker(scripts: str, *arguments):
+    """`measured` on a worker, which knows these scripts only then."""
+    if scripts not in sys.path:
+        sys.path.insert(0, scripts)
+    import sweep
+
+    return sweep.measured(*arguments)
+
+
+def measured(preset: str, scene: str, cells: list[dict]) -> list:
+    """Row and image of each cell, or why it failed, as text; one after the other."""
+    with cluster.one_at_a_time:
+        mi.set_variant("llvm_ad_rgb")
+        bench, found = _bench(preset, scene), []
+        for entry in cells:
+            cell = Cell(**entry)
+            if cell.versions != tuple(software().items()):
+                raise ValueError(f"a worker has other software than the client: {software()}")
+            try:
+                found.append(measure(bench, cell))
+            except Exception as error:  # one cell must not cost the others
+                found.append(str(error))
+        return found
+
+
+@lru_cache(maxsize=2)
+def _bench(preset: str, scene: str) -> Bench:
+    """The bench of a scene of the preset in a file of this text; kept, so that it stays warm."""
+    folder = Path(tempfile.mkdtemp(prefix="bdpt_sweep_"))
+    (folder / "preset.toml").write_text(preset)
+    whole = read_preset(folder / "preset.toml")
+    subject = next(subject for subject in whole.subjects if subject.name == scene)
+    return Bench(Cells(whole, subject), folder)
 
 
 def errors(image, ref: reference.Reference, ref_sha256: str, flip: bool) -> dict:
@@ -302,27 +351,34 @@ class Sweep:
 
     def __init__(self, preset: Preset, output: Path, progress: Progress):
         self.preset, self.output, self.progress, self.failed = preset, output, progress, []
+        self._judges, self._task, self._tried = {}, None, set()
 
-    def run(self):
-        """Render all that is not there yet."""
+    def run(self, elsewhere=None):
+        """Render all that is not there yet; on a cluster if ``elsewhere``, a client and the preset's text, is
+        given."""
         scenes = [Cells(self.preset, subject) for subject in self.preset.subjects]
         todo = [[c for c in cells.planned() if not cell_file(self.output, c).exists()] for cells in scenes]
-        task = self.progress.add_task("", total=sum(map(len, todo)) + len(self.preset.probes))
+        probed = 0 if elsewhere else len(self.preset.probes)
+        self._task = self.progress.add_task("", total=sum(map(len, todo)) + probed)
         for cells, missing in zip(scenes, todo, strict=True):
             if missing:  # complain before hours of rendering, not after
                 reference.load_reference(*cells.where())
-        self._probes(task)
+        if elsewhere:
+            self._remote(*elsewhere, scenes, todo)
+            return
+        self._probes()
         for cells, missing in zip(scenes, todo, strict=True):
-            bench = None
-            for cell in missing:
-                bench = self._cell(task, bench, cells, cell)
-            self._more(task, bench, cells)
+            bench = Bench(cells, self.output)
+            while missing := missing or self._more(cells):
+                for cell in missing:
+                    self._cell(bench, cell)
+                missing = []
 
-    def _probes(self, task):
+    def _probes(self):
         file = self.output / "probes.json"
         kept = json.loads(file.read_text()) if file.exists() else {}
         for name, rounds in self.preset.probes.items():
-            self.progress.update(task, description=name)
+            self.progress.update(self._task, description=name)
             key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
             try:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
@@ -330,40 +386,76 @@ class Sweep:
                     write_json(file, kept)
             except Exception as error:  # a probe must not cost the cells
                 self.failed.append(f"{name}: {error}")
-            self.progress.advance(task)
+            self.progress.advance(self._task)
 
-    def _cell(self, task, bench, cells: Cells, cell: Cell):
-        """Render a cell; the bench, made if there was none."""
-        description = f"{cell.scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}"
-        self.progress.update(task, description=description)
+    def _cell(self, bench: Bench, cell: Cell):
+        """Render a cell here."""
+        self.progress.update(self._task, description=_description(cell))
         try:
-            bench = bench or Bench(cells, self.output)
-            write_json(cell_file(self.output, cell), measure(bench, cell))
+            self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
             reference.raise_interrupt(error)
-            self.failed.append(f"{description}: {error}")
-        self.progress.advance(task)
-        return bench
+            self.failed.append(f"{_description(cell)}: {error}")
+        self.progress.advance(self._task)
 
-    def _more(self, task, bench, cells: Cells):
-        """Further seeds until the interval is narrow enough, or there are enough of them."""
+    def _store(self, cells: Cells, cell: Cell, result):
+        if cells.where() not in self._judges:
+            self._judges[cells.where()] = judge_of(*cells.where())
+        store(self.output, cell, *result, self._judges[cells.where()])
+
+    def _remote(self, client, preset: str, scenes: list[Cells], todo: list[list[Cell]]):
+        """Render the cells of ``todo``, and those that follow from them, on a cluster."""
+        scripts = str(Path(__file__).resolve().parent)
+        while any(
+            todo := [missing or self._more(cells) for cells, missing in zip(scenes, todo, strict=True)]
+        ):
+            groups = [
+                (cells, list(group))
+                for cells, missing in zip(scenes, todo, strict=True)
+                for _, group in groupby(missing, key=lambda cell: (cell.budget, cell.seed))
+            ]
+            calls = [
+                (scripts, preset, cells.subject.name, [asdict(cell) for cell in group])
+                for cells, group in groups
+            ]
+            for index, results in cluster.results(client, on_worker, calls):
+                cells, group = groups[index]
+                for cell, result in zip(group, results, strict=True):
+                    if isinstance(result, str):
+                        self.failed.append(f"{_description(cell)}: {result}")
+                    else:
+                        self._store(cells, cell, result)
+                    self.progress.update(self._task, description=_description(cell), advance=1)
+            todo = [[] for _ in scenes]
+
+    def _more(self, cells: Cells) -> list[Cell]:
+        """The cells of a further seed, none if the interval is narrow enough, or there are enough of them."""
         if not cells.fewest():
-            return
+            return []
         for seeds in range(cells.fewest(), cells.more.at_most + 1):
             found = [c for seed in range(seeds) for c in cells.further(seed)]
             if not all(cell_file(self.output, c).exists() for c in found):
-                return  # one of them failed
+                return []  # one of them failed
             try:
                 widths = analysis.widths(read_rows(self.output, found), cells.more.methods)
             except ValueError as error:
                 self.failed.append(f"further seeds in {cells.subject.name}: {error}")
-                return
+                return []
             if max(widths.values()) < cells.more.width or seeds == cells.more.at_most:
-                return
+                return []
             missing = [c for c in cells.further(seeds) if not cell_file(self.output, c).exists()]
-            self.progress.update(task, total=self.progress.tasks[task].total + len(missing))
-            for cell in missing:
-                bench = self._cell(task, bench, cells, cell)
+            if missing:
+                if not self._tried.isdisjoint(keys := {c.key for c in missing}):
+                    return []  # one of them failed
+                self._tried |= keys
+                total = self.progress.tasks[self._task].total
+                self.progress.update(self._task, total=total + len(missing))
+                return missing
+        return []
+
+
+def _description(cell: Cell) -> str:
+    return f"{cell.scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}"
 
 
 def cell_file(output: Path, cell: Cell) -> Path:
@@ -455,6 +547,7 @@ def main() -> int:
     parser.add_argument("preset", type=Path)
     parser.add_argument("-o", "--output", type=Path, help="default: results/NAME_OF_PRESET")
     parser.add_argument("--scenes", nargs="+", help="these of the preset alone; other rows stay as they are")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster to render on")
     args = parser.parse_args()
     output = args.output or Path("results") / args.preset.stem
     mi.set_variant("llvm_ad_rgb")
@@ -463,7 +556,11 @@ def main() -> int:
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as progress:
         sweep = Sweep(preset, output, progress)
-        sweep.run()
+        if args.scheduler:
+            with cluster.connected(args.scheduler) as client:
+                sweep.run((client, args.preset.read_text()))
+        else:
+            sweep.run()
     table = rows(preset, output)
     if args.scenes:
         table = beside(table, whole, output)

@@ -12,3 +12,14 @@ mi.set_variant(VARIANT)
 def _variant():
     """Give every test the same variant, whatever the one before it has set."""
     mi.set_variant(VARIANT)
+
+
+@pytest.fixture(scope="session")
+def workers():
+    """A dask.distributed cluster of two processes on this machine, without a dashboard."""
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        yield cluster

@@ -351,7 +351,9 @@ def test_a_report_is_written(results, tmp_path, monkeypatch):
     (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = "1x"\n')
     (tmp_path / "notes.toml").write_text('box = "why"\n')
     readme = tmp_path / "TOP.md"
-    readme.write_text("".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("goals", "efficiency")))
+    readme.write_text(
+        "".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("goals", "efficiency", "gallery"))
+    )
     monkeypatch.setattr("sys.argv", ["report.py", str(tmp_path), "--readme", str(readme)])
     report.main()
     page = (tmp_path / "README.md").read_text()

@@ -9,6 +9,8 @@ import mitsuba_bdpt
 ORDER = (
     ("__main__",),
     ("doctor", "render"),
+    ("checkpoints", "cluster"),
+    ("loading",),
     ("__init__",),
     ("integrator",),
     ("rendering",),
@@ -26,7 +28,7 @@ ORDER = (
     ("emitter_kinds",),
     ("bsdf", "rays", "mis", "sobol"),
     ("objects",),
-    ("llvm", "_version"),
+    ("llvm", "files", "_version"),
 )
 
 

@@ -1,5 +1,8 @@
 """What is read from Mitsuba's objects."""
 
+import subprocess
+import sys
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -26,3 +29,35 @@ def test_own_parameters_are_those_of_traverse(kind):
         expected = everything[name]
         a, b = (x.matrix if hasattr(x, "matrix") else x for x in (value, expected))
         np.testing.assert_array_equal(np.array(a), np.array(b), err_msg=name)
+
+
+FREED_MEANWHILE = """
+import gc, mitsuba_bdpt, mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+def box():
+    found = mi.cornell_box()
+    found["sensor"]["film"].update(width=8, height=8)
+    return mi.load_dict(found)
+class Cycle: pass
+target = box()
+for threshold in (20, 50, 100, 200, 400, 700):
+    for depth in (2, 3, 4):
+        for skip in ("none", "impossible"):
+            cycle = Cycle()
+            cycle.scene, cycle.me = box(), cycle
+            del cycle
+            integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": skip})
+            gc.set_threshold(threshold, 1, 1)
+            integrator.render(target, spp=2)
+            gc.set_threshold(700, 10, 10)
+print("alive")
+"""
+
+
+def test_scenes_that_the_cycle_collector_frees():
+    """Rationale: a scene in a reference cycle (a notebook's, or one in a traceback) goes whenever Python's
+    cycle collector runs. While a kernel was being recorded, Dr.Jit aborted the process. Expected: renders
+    beside such scenes end, however often the collector runs."""
+    command = [sys.executable, "-c", FREED_MEANWHILE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and done.stdout.strip() == "alive", done.stderr[-500:]

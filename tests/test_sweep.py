@@ -288,6 +288,42 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch
     assert len(pyarrow.parquet.read_table(output / "rows.parquet")) == 8
 
 
+def test_a_sweep_on_a_cluster(folder, monkeypatch, workers):
+    """Expected: the same cells as here, by the same keys, with their images (the same seeds, so the same up
+    to rounding) and errors; further seeds until the interval is narrow enough; nothing is rendered twice.
+    """
+    reference.make(job(3))
+    path = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 3") + MORE)
+    arguments = ["sweep.py", str(path), "-o"]
+    monkeypatch.setattr(sys, "argv", [*arguments, str(folder / "here")])
+    assert sweep.main() == 0
+    there = [*arguments, str(folder / "there"), "--scheduler", workers.scheduler_address]
+    monkeypatch.setattr(sys, "argv", there)
+    assert sweep.main() == 0
+    tables = [
+        pyarrow.parquet.read_table(folder / name / "rows.parquet").to_pylist() for name in ("here", "there")
+    ]
+    ours = [{row["key"]: row for row in table if row["method"] == "ours"} for table in tables]
+    common = set(ours[0]) & set(ours[1])
+    assert len(common) >= 6
+    for key in common:
+        here, remote = (table[key] for table in ours)
+        assert remote["rel_mse"] == pytest.approx(here["rel_mse"], rel=1e-3) and remote["seconds"] > 0
+        assert (folder / "there" / "images" / "cornell_box" / f"{key}.exr").exists()
+    monkeypatch.setattr(sweep.cluster, "results", None)
+    assert sweep.main() == 0
+
+
+def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers):
+    """Expected: renders of another version are not mixed in; the message says what the worker has."""
+    reference.make(job(3))
+    monkeypatch.setattr(sweep, "software", lambda: {"mitsuba-bdpt": "other"})
+    there = ["sweep.py", str(preset_file(folder)), "-o", str(folder / "out")]
+    monkeypatch.setattr(sys, "argv", [*there, "--scheduler", workers.scheduler_address])
+    with pytest.raises(ValueError, match="a worker has other software"):
+        sweep.main()
+
+
 def test_one_scene_of_a_preset_anew(folder, monkeypatch):
     """Expected: with --scenes the rows of other scenes stay as they are, in the preset's order, though their
     cells are gone; a scene that the preset lacks is named before anything is rendered.

@@ -62,6 +62,15 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--spp", type=number(int, 1), help="samples per pixel; default: the scene's")
     text = "stop after the pass in which this time is over; without --spp, only the time limits"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
+    text = "stop at this estimated relMSE; without --spp, only it limits; adds the layers of the variance"
+    add("--until-error", type=number(float, 0), metavar="X", help=text)
+    text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
+    add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
+    add("--resume", action="store_true", help="go on from the checkpoint of an earlier, unfinished render")
+    text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
+    add("--scheduler", metavar="ADDRESS", help=text)
+    text = "number of parts of a render on a cluster; default: 4 for each worker"
+    add("--parts", type=number(int, 1), metavar="N", help=text)
     text = "replace the scene's integrator, keeping max_depth, rr_depth and hide_emitters"
     add("--integrator", metavar="TYPE", help=text)
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")

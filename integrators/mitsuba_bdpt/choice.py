@@ -18,10 +18,17 @@ from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
 # `LEAST_SAMPLES` has none. A pilot's sample takes three to seven times as long as one of path tracing alone,
-# and recording it longer than all of a short pilot's samples (scripts/overhead.py).
+# and recording it longer than all of a short pilot's samples (scripts/overhead.py): 2 % of a render of
+# `CHEAP_SAMPLES` of path tracing alone. In between a pilot is asked where the scene alone does not tell what
+# pays: all the same a render with one is faster than one that guesses (docs/skipping.md).
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
-LEAST_SAMPLES = 1 << 19
+LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 17, 1 << 24
+
+# kappa of s = 1 under an even sky, where s = 0 has hardly any noise of its own. Efficiency over path with
+# multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in `open_sky`, 1.02, 1.00, 0.95 in
+# `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`.
+SKY_DIRECT = 1 / 2
 
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
@@ -47,6 +54,10 @@ STRATIFIED_SPLATS = 2.0
 # it evens out two strategies whose noise good points may take off anyway. Predicted factors of 2.0
 # (`open_sky`) and 4.3 (`furnace_white`) became 0.95 and 4.3.
 DIRECT_GAIN = 3.0
+
+# Light subpaths have to gain this factor over path tracing alone: predicted costs are off by 17 %, and who
+# renders a plain scene should not notice that they were an option.
+LIGHT_GAIN = 1.15
 
 # Films of fewer pixels have a light subpath for each camera subpath.
 FEW_PIXELS = 64
@@ -233,6 +244,27 @@ def is_open(full: Plan, settings: Settings) -> bool:
     )
 
 
+def by_scene(world, full: Plan, settings: Settings, samples: int) -> Decision | None:
+    """The decision for a render of so many ``samples`` for which the scene alone suffices, because a pilot
+    would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky
+    wherever its light enters, caustics included, and light subpaths hardly find the way in.)"""
+    if samples >= CHEAP_SAMPLES or not world.emitters.even_surroundings:
+        return None
+    if all(candidate.light_paths for candidate in candidates(world, full, settings)):
+        return None
+    return Decision(0, 0.0, "none", 1.0, SKY_DIRECT, 1.0, 0.0, 0.0)
+
+
+BY_SCENE = [
+    {
+        "class": name,
+        "level": "not worth its cost here",
+        "why": "all light comes from an even sky, and the render is too short to ask a pilot",
+    }
+    for name in ("t<=1", "inner")
+]
+
+
 def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
     """All ways to render that lose no light which ``full`` finds."""
 
@@ -291,7 +323,13 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
         alone = [row.variance for row in table if not row.candidate.light_paths and row.candidate.direct == 1]
         most = min(alone, default=math.inf) / DIRECT_GAIN
         table = [row for row in table if row.candidate.direct == 1 or row.variance <= most]
-    return sorted(table, key=lambda row: row.time)
+    table.sort(key=lambda row: row.time)
+    # Path tracing alone before what is hardly better.
+    alone = next((row for row in table if not row.candidate.light_paths), None)
+    if alone is not None and alone.time <= LIGHT_GAIN * table[0].time:
+        table.remove(alone)
+        table.insert(0, alone)
+    return table
 
 
 def _trimmed_mean(draw):
@@ -329,5 +367,7 @@ def left_out(table: list[Choice]) -> list[dict]:
         if others and lacks(table[0].candidate):
             ratio = others[0].time / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
+            if ratio < 1:
+                why = f"in the pilot it gains {1 / ratio:.2f}x at most, and a prediction is off by as much"
             skipped.append({"class": name, "level": "not worth its cost here", "why": why})
     return skipped

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -34,6 +35,13 @@ POSITIONS = (POINT, SPOT, PROJECTOR)
 # only one face is sampled (a cube: a sixth).
 _TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
 
+# Ratio of the largest radiance of an environment to its mean up to which it is even: a clear sky without its
+# sun has some ten, one with it thousands.
+EVEN = 100
+
+# Numbers of an environment map that are looked at for that, at most: 4 ms.
+_QUICKLY_READ = 1 << 20
+
 _CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 _SAMPLED = _TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
 
@@ -63,6 +71,22 @@ def _tells_its_points(emitter) -> bool:
     if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
         check_coordinates(emitter)
     return not _reads_attributes(children(emitter)["radiance"])
+
+
+def is_even(emitter) -> bool:
+    """Whether an emitter is an environment whose radiance is nowhere more than `EVEN` times its mean; false
+    also where that would take long to find out, or where the numbers of an ``envmap`` are not radiances."""
+    kind = emitter.class_name()
+    if kind == "ConstantBackgroundEmitter":
+        return True
+    if kind != "EnvironmentMapEmitter" or mi.is_spectral:
+        return False
+    data = own_parameters(emitter)["data"]
+    if dr.width(data) > _QUICKLY_READ:
+        return False
+    pixels = np.array(data).max(axis=-1)
+    rows = np.sin(np.pi * (np.arange(len(pixels)) + 0.5) / len(pixels))
+    return bool(pixels.max() <= EVEN * (pixels.mean(axis=1) @ rows) / rows.sum())
 
 
 def _reads_attributes(texture) -> bool:

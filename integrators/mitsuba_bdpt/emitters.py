@@ -20,6 +20,7 @@ spheres, d^2/cos, environments).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -34,6 +35,7 @@ from .emitter_kinds import (
     PROJECTOR,
     UNKNOWN,
     UNSAMPLED,
+    is_even,
     is_foreign,
     is_hittable,
     is_lit_directly,
@@ -146,6 +148,12 @@ class Emitters:
         self._inverse = inverse_table(self._pointers)
         self.disks = Disks(scene) if self.at_infinity else None
         dr.make_opaque(self._kind, self._pmf, self._inv_area, self._placements, self._inverse)
+
+    @cached_property
+    def even_surroundings(self) -> bool:
+        """Whether all light comes from environments without bright spots, see `emitter_kinds.is_even`."""
+        emitters = self.scene.emitters()
+        return bool(emitters) and all(is_even(emitter) for emitter in emitters)
 
     def _read_shapes(self, scene, emitters, kinds):
         """Areas of the emitting shapes, how their points are chosen, and their geometric normals."""

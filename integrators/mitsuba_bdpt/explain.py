@@ -46,7 +46,7 @@ def _pilot(settings: Settings, table) -> list[str]:
     if not table:
         return []
     lines = [
-        "pilot: time to the same error, over that of the best (cost of a sample; variance as relMSE, that "
+        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, that "
         f"of splats times {STRATIFIED_SPLATS:g} where the points are stratified):"
     ]
     shown = set()

@@ -41,8 +41,9 @@ All of them are combined by multiple importance sampling.
  * - skip
    - |string|
    - ``impossible`` leaves out what the scene cannot use, draws one connection per camera vertex and drops
-     small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^19
-     samples or more, asks a pilot what pays (see `choice`); ``none`` does everything.
+     small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^17
+     samples or more, asks a pilot what pays, or the scene alone where that tells (see `choice`); ``none``
+     does everything.
  * - light_paths
    - |string| or |float|
    - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses, else 1/4, or 1 with
@@ -195,7 +196,8 @@ def _make_class():
             table = render.decide() if spp else []
             if self.settings.decisions:
                 render.replay(0)
-            return explain(render.world, render.plan, self.settings, table)
+            text = explain(render.world, render.plan, self.settings, table)
+            return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"
 
         def to_string(self):
             values = asdict(self.settings) | {"max_depth": self.max_depth}
@@ -283,7 +285,9 @@ def _log(statistics: dict):
         f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
     )
     for made in statistics["decisions"]:
-        mi.Log(mi.LogLevel.Info, f"bdpt: decided by a pilot: {json.dumps(made)}")
+        mi.Log(mi.LogLevel.Info, f"bdpt: decided: {json.dumps(made)}")
+    for left_out in statistics["skipped"]:
+        mi.Log(mi.LogLevel.Info, f"bdpt: skipped: {json.dumps(left_out)}")
     if statistics.get("error") == math.inf:
         mi.Log(
             mi.LogLevel.Warn,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 from functools import cache
 
 import drjit as dr
@@ -46,6 +47,20 @@ def step_by_step(on=True):
         for flag in flags if on else ():
             stack.enter_context(dr.scoped_set_flag(flag, False))
         yield
+
+
+@contextlib.contextmanager
+def nothing_freed():
+    """Python's cycle collector waits: a scene that only it would free, and that goes while a kernel is being
+    recorded, leaves calls of its objects in the kernel beside those of the others, and Dr.Jit aborts the
+    process ("invalid redefinition of function")."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def children(owner) -> dict:

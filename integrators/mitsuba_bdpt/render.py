@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import json
-import os
 import re
 import sys
 import time
@@ -22,8 +20,9 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 import mitsuba_bdpt
 
-KEPT = ("max_depth", "rr_depth", "hide_emitters")
-"""What an integrator that replaces the scene's takes over: the same paths are to be found."""
+from . import checkpoints, cluster
+from .files import replacing
+from .loading import choose_sensor, load
 
 UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""
@@ -51,15 +50,20 @@ def run(options: Namespace) -> int:
     try:
         output = options.output or Path("renders") / f"{options.scene.stem}.exr"
         prepare_output(output)
+        check_options(options, output)
         scene, integrator = load(options)
+        check_integrator(options, integrator)
         sensor = choose_sensor(scene, options.sensor)
-        spp = options.spp or (UNLIMITED_SPP if options.time is not None else sensor.sampler().sample_count())
-        outcome = render(scene, integrator, options, spp)
+        open_ended = options.time is not None or options.until_error is not None
+        spp = options.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
+        outcome = render(scene, integrator, options, spp, output)
         if outcome.interrupted and not outcome.spp:
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
             return INTERRUPTED
         attributes = {"bdptSettings": settings(options, spp), "bdptStatistics": report(outcome)}
         write_images(sensor.film(), output, attributes, options.exposure)
+        if options.checkpoint is not None and not outcome.interrupted:
+            checkpoints.path_of(output).unlink(missing_ok=True)
     except KeyboardInterrupt:
         print("interrupted; no image written", file=sys.stderr)
         return INTERRUPTED
@@ -94,82 +98,65 @@ def prepare_output(output: Path) -> None:
     output.parent.mkdir(parents=True, exist_ok=True)
 
 
-def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
-    """Load the scene and the integrator to render it with."""
-    if options.variant not in mi.variants():
-        known = ", ".join(mi.variants())
-        raise ValueError(f"variant={options.variant!r} is not one of Mitsuba's: {known}.")
-    if not options.scene.is_file():
-        raise ValueError(f"scene={str(options.scene)!r} is not a file.")
-    try:
-        mi.set_variant(options.variant)
-    except ImportError as error:
-        raise ValueError(
-            f"variant={options.variant!r} cannot be used on this machine ({error}); "
-            "use an LLVM variant, for example llvm_ad_rgb."
-        ) from error
-    mi.file_resolver().prepend(str(options.scene.resolve().parent))
-    overrides = dict(options.properties)
-    if options.time is not None:
-        overrides["timeout"] = options.time
-
-    config = mi.parser.ParserConfig(options.variant)
-    state = mi.parser.parse_file(config, str(options.scene), **dict(options.defines))
-    # Nodes are in the order of the file: an integrator comes before those nested in it.
-    kind = mi.ObjectType.Integrator
-    node = next((node for node in state.nodes if node.type == kind), None)
-    if node is not None:
-        node.props = integrator_properties(node.props, options.integrator, overrides)
-    mi.parser.transform_all(config, state)
-    scene = mi.parser.instantiate(config, state)
-    if node is not None:
-        return scene, scene.integrator()
-    return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+def check_options(options: Namespace, output: Path) -> None:
+    """Raise ``ValueError`` for options that contradict one another."""
+    if options.resume and options.checkpoint is None:
+        raise ValueError("resume needs --checkpoint MINUTES: how often to write the next ones.")
+    if options.parts is not None and options.scheduler is None:
+        raise ValueError("parts needs --scheduler: without one, a render is made in one piece.")
+    for name in ("checkpoint", "until_error", "time"):
+        if options.scheduler is not None and getattr(options, name) is not None:
+            raise ValueError(
+                f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
+                "leave out one or the other."
+            )
+    checkpoints.check(options, output)
 
 
-def integrator_properties(
-    given: mi.Properties, kind: str | None, overrides: Mapping[str, bool | int | float | str]
-) -> mi.Properties:
-    """The `given` properties with `overrides`, for an integrator of another `kind` if it is set."""
-    if kind is None or kind == given.plugin_name():
-        properties = mi.Properties(given)
-    else:
-        properties = mi.Properties(kind)
-        properties.set_id(given.id())
-        for key in KEPT:
-            if key in given:
-                properties[key] = given[key]
-                # Not every integrator has all of them; that is no mistake of the user's.
-                properties.mark_queried(key)
-    for key, value in overrides.items():
-        properties[key] = value
-    return properties
+def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
+    """Raise ``ValueError`` for options that only ``bdpt`` can follow."""
+    for name in ("checkpoint", "until_error", "scheduler"):
+        if getattr(options, name) is not None and not hasattr(integrator, "assemble"):
+            raise ValueError(
+                f"{name} is for the integrator bdpt, not for {integrator.class_name()}; add --integrator "
+                "bdpt."
+            )
 
 
-def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
-    """The sensor with this `index`."""
-    sensors = scene.sensors()
-    if not sensors:
-        raise ValueError("The scene has no sensor; add one to the scene file.")
-    if index >= len(sensors):
-        raise ValueError(f"sensor={index} is not in the scene; the last one is {len(sensors) - 1}.")
-    return sensors[index]
-
-
-def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
+def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, output: Path) -> Outcome:
     """Render into the sensor's film, drawing progress on a terminal."""
-    started, interrupted = time.perf_counter(), False
-    own_passes = hasattr(integrator, "on_pass")
-    if options.time is not None and not own_passes:
+    if options.scheduler is not None:
+        started = time.perf_counter()
+        with progress_bar() as bar:
+            statistics = cluster.render(scene, integrator, options, spp, show_pass(bar, None))
+        return Outcome(time.perf_counter() - started, spp, False, statistics)
+    if options.time is not None and not hasattr(integrator, "on_pass"):
         return render_repeatedly(scene, integrator, options, spp)
+    return render_here(scene, integrator, options, spp, output)
+
+
+def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -> Outcome:
+    """Render in one go, with checkpoints if they are wanted."""
+    started, interrupted, arguments = time.perf_counter(), False, {}
+    watchers, kept = [], None
+    if options.checkpoint is not None:
+        kept = checkpoints.Checkpoints(options, output)
+        watchers.append(kept.after_pass)
+    if options.resume:
+        arguments["start"] = checkpoints.start(options, output)
     with progress_bar() as bar:
-        if own_passes:
-            integrator.on_pass = show_pass(bar, options.time)
+        if hasattr(integrator, "on_pass"):
+            watchers.append(show_pass(bar, options.time))
+            integrator.on_pass = lambda report: [watch(report) for watch in watchers]
         try:
-            integrator.render(scene, options.sensor, options.seed, spp, develop=False, evaluate=True)
+            integrator.render(
+                scene, options.sensor, options.seed, spp, develop=False, evaluate=True, **arguments
+            )
             dr.sync_thread()
         except KeyboardInterrupt:
             interrupted = True
+            if kept is not None:
+                kept.write()
     statistics = getattr(integrator, "statistics", None) or {}
     if "passes" in statistics:
         spp = int(sum(statistics["passes"]))
@@ -220,8 +207,12 @@ def show_pass(bar: Progress, limit: float | None) -> Callable[[object], None]:
             left = max(0.0, min(left, limit - report.seconds))
             done = max(done, min(1.0, report.seconds / limit))
         rate = readable(report.rays / max(report.seconds, 1e-9))
-        total = "" if limit and report.spp_total == UNLIMITED_SPP else f"/{report.spp_total}"
-        text = f"{report.spp_done}{total} spp, {rate} rays/s, {left:.0f} s left"
+        open_ended = report.spp_total == UNLIMITED_SPP
+        text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp, {rate} rays/s"
+        if limit or not open_ended:
+            text += f", {left:.0f} s left"
+        if getattr(report, "error", None) is not None:
+            text += f", relMSE {report.error:.2g}"
         bar.update(task, total=1.0, completed=done, description=text)
 
     return draw
@@ -286,18 +277,6 @@ def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
     rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     bright = mi.Bitmap(mi.TensorXf(rgb) * 2.0**exposure, mi.Bitmap.PixelFormat.RGB)
     return bright.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
-
-
-@contextlib.contextmanager
-def replacing(path: Path):
-    """Name of a file beside `path` that takes its place at the end: whoever looks at `path` never sees half a
-    file, and an error leaves what was there."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:

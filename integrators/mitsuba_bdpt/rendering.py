@@ -17,7 +17,7 @@ from ._version import __version__
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
-from .objects import step_by_step
+from .objects import nothing_freed, step_by_step
 from .parameters import check_film, check_scene, check_variant, integer
 from .passes import Step, batches, schedule
 from .plan import Settings, plan
@@ -92,20 +92,32 @@ class Render:
         self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
         self._left_out, self._small_first, self._error, self._earlier = [], None, None, 0.0
+        self._resumed = (
+            0,
+            0.0,
+        )  # spp, and seconds of compiling and pilots, of the render that this one goes on from
 
     def decide(self) -> list:
-        """Run a pilot and adopt what it chooses, if there is a choice and the render is long enough to pay
-        for it; returns all candidates, the best first."""
-        left = self.spp - sum(self.accumulator.passes)
-        count = choice.lanes(left * int(self.world.camera.region.size.prod()))
-        if not (count and choice.is_open(self._full, self.settings)):
+        """Adopt what the scene alone or a pilot says, if there is a choice and the render is long enough to
+        pay for a pilot; returns all candidates of the pilot, the best first."""
+        if not choice.is_open(self._full, self.settings):
+            return []
+        pixels, done = int(self.world.camera.region.size.prod()), sum(self.accumulator.passes)
+        if decision := choice.by_scene(self.world, self._full, self.settings, self.spp * pixels):
+            if not done:
+                self._adopt(decision, choice.BY_SCENE)
+            return []
+        samples = (self.spp - done) * pixels
+        count = choice.lanes(samples)
+        if not count:
             return []
         self._wait()  # earlier passes are not the pilot's time
         started, compiled = time.perf_counter(), self.compile_seconds
         self._pilots += 1
         seed = sequence_seed(self.seed, PILOT_SEQUENCE + self._pilots)
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True), step_by_step(self.world.emitters.evaluated):
-            moments = pilot.measure(self.world, self._full, self.settings, seed, count)
+        flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
+        with nothing_freed(), flag, step_by_step(self.world.emitters.evaluated):
+            moments = pilot.measure(self.world, self._full, self.settings, seed, count, samples / count)
         self._wait()  # for the kernel's entry in the history
         self._moments = moments if self._moments is None else self._moments.joined(moments)
         possible = choice.candidates(self.world, self._full, self.settings)
@@ -118,6 +130,17 @@ class Render:
             self._adopt(decision, choice.left_out(table))
         self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
         return table
+
+    def why_no_pilot(self) -> str:
+        """Why none is asked at first, as a sentence."""
+        samples = self.spp * int(self.world.camera.region.size.prod())
+        if not choice.is_open(self._full, self.settings):
+            return "no pilot: there is nothing to choose, by the scene or by hand"
+        if choice.by_scene(self.world, self._full, self.settings, samples):
+            return "no pilot: the scene alone decides in a render as short as this"
+        if not choice.lanes(samples):
+            return f"no pilot: {samples} samples are too few, it takes {choice.LEAST_SAMPLES} (2^17)"
+        return "no pilot: it saw nothing, or no finite value"
 
     def _has_stratified_points(self) -> bool:
         if self.settings.points == "sampler":
@@ -214,8 +237,9 @@ class Render:
     def _affordable(self, size: int) -> int:
         if not 0 <= self.settings.timeout < math.inf or self.settings.points == "sampler":
             return size
-        busy = time.perf_counter() - self.started - self.compile_seconds - self.pilot_seconds
-        rate = sum(self.accumulator.passes) / max(busy, 1e-3)
+        spp, idle = sum(self.accumulator.passes), self.compile_seconds + self.pilot_seconds
+        busy = time.perf_counter() - self.started - (idle - self._resumed[1])
+        rate = (spp - self._resumed[0]) / max(busy, 1e-3)
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
 
     def _pass(self, step: Step):
@@ -224,9 +248,9 @@ class Render:
             if launch:
                 self._wait()
             drawn = self._points(step, batch)
-            with step_by_step(self.world.emitters.evaluated):
-                counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
-            with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            with nothing_freed(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                with step_by_step(self.world.emitters.evaluated):
+                    counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
                 self.accumulator.evaluate(counts)
             self._running.append(counts)
         self.accumulator.close_pass(step.size)
@@ -339,6 +363,7 @@ class Render:
         self.compiled, self.cached = progress["compiled"], progress["cached"]
         self.compile_seconds, self.pilot_seconds = progress["compile_seconds"], progress["pilot_seconds"]
         self._earlier = progress["seconds"]
+        self._resumed = snapshot.spp, self.compile_seconds + self.pilot_seconds
 
     def _rays(self):
         rays = {name: self._counts[name] for name in RAYS}

@@ -1,0 +1,154 @@
+# %% [markdown]
+# # Tutorial
+#
+# Run it as a script, or cell by cell in an editor that knows `# %%`:
+#
+#     pip install mitsuba-bdpt
+#     python docs/tutorial.py            # some minutes; images in renders/tutorial
+#     python docs/tutorial.py --size 32  # a quick look
+#
+# It needs the scenes of the repository.
+
+# %%
+import argparse
+import json
+from pathlib import Path
+
+import mitsuba_bdpt  # before mitsuba: it chooses the LLVM library that Dr.Jit loads
+import numpy as np
+
+import mitsuba as mi  # isort: skip
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--size", type=int, default=128, help="width of the images")
+SIZE = parser.parse_args().size
+ROOT = Path(__file__).resolve().parents[1]
+OUT = ROOT / "renders" / "tutorial"
+OUT.mkdir(parents=True, exist_ok=True)
+mi.set_variant("llvm_ad_rgb")
+print("mitsuba-bdpt", mitsuba_bdpt.__version__)
+
+
+def scene(name, **values):
+    """A scene of scenes/ at our size."""
+    return mi.load_file(str(ROOT / "scenes" / f"{name}.xml"), resolution=SIZE, **values)
+
+
+def rel_mse(image, reference):
+    """Mean of (x - r)^2 / (r^2 + 0.01 mean(r)^2)."""
+    x, r = (np.array(a, dtype=np.float64)[..., :3] for a in (image, reference))
+    return ((x - r) ** 2 / (r**2 + 0.01 * r.mean() ** 2)).mean()
+
+
+# %% [markdown]
+# ## A first render
+#
+# A point light inside cut glass. `path` needs to hit the light by chance or to join it through the glass, and can do
+# neither: black. Light subpaths leave the lamp, pass the glass, and are joined with what the camera sees.
+
+# %%
+lamp = scene("lamp_behind_glass")
+bdpt, path = (mi.load_dict({"type": kind, "max_depth": 12}) for kind in ("bdpt", "path"))
+images = {kind.class_name(): mi.render(lamp, integrator=kind, spp=64) for kind in (bdpt, path)}
+for name, image in images.items():
+    mi.util.write_bitmap(str(OUT / f"lamp_{name}.png"), image)
+    print(f"{name}: mean {np.array(image)[..., :3].mean():.3f}")
+assert np.array(images["PathIntegrator"])[..., :3].max() == 0
+assert np.array(images["BDPTIntegrator"])[..., :3].mean() > 0.01
+
+# %% [markdown]
+# ## Reading `explain`
+#
+# What is used, what is skipped and why. With `spp` it runs the pilot of such a render too: a table of ways to render,
+# with the time that each needs for the same error over that of the best. "impossible" follows from the scene, "not
+# worth its cost here" from the pilot.
+
+# %%
+print(bdpt.explain(lamp, spp=4096))
+box = scene("cornell_box")
+print(bdpt.explain(box, spp=4096))
+
+# %% [markdown]
+# After a render `statistics` has the same in numbers; its decisions can be done again in another process, or by an
+# artist who wants the same image tomorrow.
+
+# %%
+bdpt.render(box, spp=4096 if SIZE < 64 else 256, seed=1, develop=False)
+decisions = bdpt.statistics["decisions"]
+print({key: bdpt.statistics[key] for key in ("seconds", "rays", "passes")})
+again = mi.load_dict({"type": "bdpt", "max_depth": 12, "decisions": json.dumps(decisions)})
+again.render(box, spp=16, seed=1, develop=False)
+assert again.statistics["decisions"] == decisions
+
+# %% [markdown]
+# ## Choosing parameters
+#
+# Leave them alone first. Reasons to set one:
+#
+# * `max_depth`: as in `path`; paths in glass need more edges than one thinks (two for each pane).
+# * `light_paths=0`: path tracing with better points; for scenes without caustics, when every render is very short.
+# * `skip=none`, `light_paths=1`, `connections=all`: everything, for comparisons with other renderers.
+# * `heuristic`: `balance` is the best or nearly so; `power` helps where one strategy is nearly without noise.
+# * `variance=true`: error bars, and `until_error` to stop at one.
+
+# %%
+bars = mi.load_dict({"type": "bdpt", "max_depth": 6, "variance": True, "until_error": 0.02})
+image = bars.render(box, spp=4096, seed=3)
+done, error = sum(bars.statistics["passes"]), bars.statistics["error"]
+reference = mi.render(box, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=8192, seed=9)
+print(f"{done} spp; estimated relMSE {error:.3g}, found {rel_mse(image, reference):.3g}")
+assert error <= 0.02
+
+# %% [markdown]
+# ## Strategy images
+#
+# A path of k edges can be made in k + 2 ways (s, t). Each has its own image: weighted, what it adds to the result;
+# unweighted, what it would say alone. `scripts/strategies.py` makes the pyramid of all of them.
+
+# %%
+shown = mi.load_dict({"type": "bdpt", "max_depth": 3, "strategy_images": True})
+layers = np.array(shown.render(box, spp=64))
+names = ["R", "G", "B", *shown.aov_names()]
+layers = layers[..., -len(shown.aov_names()) :]
+three_edges = {}
+for s in range(5):
+    t = 4 - s
+    at = shown.aov_names().index(f"weighted.s{s}t{t}.R")
+    three_edges[s, t] = layers[..., at : at + 3].mean()
+print("paths of three edges, by strategy:", {key: f"{value:.4f}" for key, value in three_edges.items()})
+
+# %% [markdown]
+# ## Sweeps
+#
+# `presets/small.toml` names scenes, integrators and samples; a sweep is
+#
+#     python scripts/sweep.py presets/small.toml -o results/small
+#     python scripts/report.py results/small      # tables and plots
+#     python scripts/page.py results/small        # one HTML file to send around
+#
+# In a script of one's own, compare at equal time, not at equal samples, and more than one seed.
+
+# %% [markdown]
+# ## Limits
+#
+# In `pool` a small lamp shines over wavy water. The wall (sensor 0) gets its caustics by light tracing (t = 1), which
+# `path` does not have. The floor seen from above (sensor 2) is behind water for the lamp *and* for the camera: no vertex of
+# such a path can be joined with a neighbour, and only camera subpaths that happen to hit the lamp (s = 0) find it.
+
+# %%
+pool = scene("pool")
+both = {}
+for sensor, name in ((0, "wall"), (2, "floor through water")):
+    long_render = mi.render(pool, integrator=bdpt, sensor=sensor, spp=1024, seed=5)
+    for kind in (bdpt, path):
+        image = mi.render(pool, integrator=kind, sensor=sensor, spp=16, seed=6)
+        both[name, kind.class_name()] = rel_mse(image, long_render)
+        print(
+            f"{name}, {kind.class_name()}: relMSE {both[name, kind.class_name()]:.3g} at 16 samples per pixel"
+        )
+gain = {
+    name: both[name, "PathIntegrator"] / both[name, "BDPTIntegrator"]
+    for name in ("wall", "floor through water")
+}
+print("error of path over ours:", {name: f"{value:.3g}" for name, value in gain.items()})
+assert gain["wall"] > 3 * gain["floor through water"]

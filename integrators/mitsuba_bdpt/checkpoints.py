@@ -1,0 +1,71 @@
+"""Checkpoints of ``python -m mitsuba_bdpt render``: what a render that was killed goes on from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+
+from .files import replacing
+from .snapshot import Snapshot, read
+
+
+def path_of(output: Path) -> Path:
+    """Where the checkpoint of an image lies: beside it."""
+    return output.with_suffix(".checkpoint.npz")
+
+
+def digest(options: Namespace) -> str:
+    """Of a scene file and the definitions on the command line, not of the files that it names."""
+    text = options.scene.read_bytes() + json.dumps(sorted(options.defines)).encode()
+    return hashlib.sha256(text + str(options.sensor).encode()).hexdigest()
+
+
+def check(options: Namespace, output: Path) -> None:
+    """Raise ``ValueError`` if a checkpoint would be overwritten unasked."""
+    path = path_of(output)
+    if options.checkpoint is not None and path.exists() and not options.resume:
+        raise ValueError(
+            f"checkpoint={str(path)!r} of an unfinished render exists; go on by --resume, or delete it."
+        )
+
+
+def start(options: Namespace, output: Path) -> Snapshot:
+    """The snapshot to go on from; raises ``ValueError`` if there is none, or one of another scene."""
+    path = path_of(output)
+    if not path.exists():
+        raise ValueError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
+    kept = read(path)
+    if kept.progress.get("scene") != digest(options):
+        raise ValueError(
+            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r} or its definitions (-D) have "
+            "changed; go on with those it was begun with, or delete it."
+        )
+    return kept
+
+
+class Checkpoints:
+    """Writes the checkpoints of one render: `after_pass` every so many minutes, `write` at once."""
+
+    def __init__(self, options: Namespace, output: Path):
+        self.path, self._seconds, self._scene = path_of(output), 60 * options.checkpoint, digest(options)
+        self._last, self._report = time.monotonic(), None
+
+    def after_pass(self, report) -> None:
+        """To be called with every ``PassReport``."""
+        self._report = report
+        if time.monotonic() - self._last >= self._seconds:
+            self.write()
+
+    def write(self) -> None:
+        """Write what the last report knows, if there was one."""
+        if self._report is None:
+            return
+        snapshot = self._report.snapshot()
+        whole = replace(snapshot, progress=snapshot.progress | {"scene": self._scene})
+        with replacing(self.path) as temporary:
+            temporary.write_bytes(whole.to_bytes())
+        self._last = time.monotonic()

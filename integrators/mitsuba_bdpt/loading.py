@@ -1,0 +1,75 @@
+"""From a command line to a scene and the integrator that renders it."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections.abc import Mapping
+
+import mitsuba as mi
+
+KEPT = ("max_depth", "rr_depth", "hide_emitters")
+"""What an integrator that replaces the scene's takes over: the same paths are to be found."""
+
+
+def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+    """Load the scene and the integrator to render it with."""
+    if options.variant not in mi.variants():
+        known = ", ".join(mi.variants())
+        raise ValueError(f"variant={options.variant!r} is not one of Mitsuba's: {known}.")
+    if not options.scene.is_file():
+        raise ValueError(f"scene={str(options.scene)!r} is not a file.")
+    try:
+        mi.set_variant(options.variant)
+    except ImportError as error:
+        raise ValueError(
+            f"variant={options.variant!r} cannot be used on this machine ({error}); "
+            "use an LLVM variant, for example llvm_ad_rgb."
+        ) from error
+    mi.file_resolver().prepend(str(options.scene.resolve().parent))
+    overrides = dict(options.properties)
+    if options.time is not None:
+        overrides["timeout"] = options.time
+    if options.until_error is not None:
+        overrides |= {"until_error": options.until_error, "variance": True}
+
+    config = mi.parser.ParserConfig(options.variant)
+    state = mi.parser.parse_file(config, str(options.scene), **dict(options.defines))
+    # Nodes are in the order of the file: an integrator comes before those nested in it.
+    kind = mi.ObjectType.Integrator
+    node = next((node for node in state.nodes if node.type == kind), None)
+    if node is not None:
+        node.props = integrator_properties(node.props, options.integrator, overrides)
+    mi.parser.transform_all(config, state)
+    scene = mi.parser.instantiate(config, state)
+    if node is not None:
+        return scene, scene.integrator()
+    return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+
+
+def integrator_properties(
+    given: mi.Properties, kind: str | None, overrides: Mapping[str, bool | int | float | str]
+) -> mi.Properties:
+    """The `given` properties with `overrides`, for an integrator of another `kind` if it is set."""
+    if kind is None or kind == given.plugin_name():
+        properties = mi.Properties(given)
+    else:
+        properties = mi.Properties(kind)
+        properties.set_id(given.id())
+        for key in KEPT:
+            if key in given:
+                properties[key] = given[key]
+                # Not every integrator has all of them; that is no mistake of the user's.
+                properties.mark_queried(key)
+    for key, value in overrides.items():
+        properties[key] = value
+    return properties
+
+
+def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
+    """The sensor with this `index`."""
+    sensors = scene.sensors()
+    if not sensors:
+        raise ValueError("The scene has no sensor; add one to the scene file.")
+    if index >= len(sensors):
+        raise ValueError(f"sensor={index} is not in the scene; the last one is {len(sensors) - 1}.")
+    return sensors[index]

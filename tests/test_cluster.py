@@ -1,0 +1,150 @@
+"""Renders on a cluster: two worker processes on this machine."""
+
+import json
+import os
+import signal
+import threading
+import time
+from argparse import Namespace
+from pathlib import Path
+
+import distributed
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+from mitsuba_bdpt import cluster
+from mitsuba_bdpt.__main__ import main
+
+SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
+
+
+def arguments(workers, output, *others):
+    command = ["render", str(SCENE), "-D", "resolution=16", "--spp", "256", "--parts", "8", "-o", str(output)]
+    return [*command, "--scheduler", workers.scheduler_address, *others]
+
+
+def image(path):
+    file = OpenEXR.File(str(path), separate_channels=True)
+    pixels = np.stack([file.channels()[name].pixels for name in "RGB"], axis=-1)
+    return pixels, json.loads(file.header()["bdptStatistics"])
+
+
+def test_parts_cover_the_samples_with_seeds_of_their_own():
+    parts = cluster.parts_of(1000, 7, 3)
+    assert sum(spp for _, spp in parts) == 1000 and len(parts) == len({seed for seed, _ in parts}) == 7
+    assert parts[0] == (3, 143) and all(0 <= seed < 2**32 for seed, _ in parts)
+    assert len(cluster.parts_of(100, 64, 0)) == 6, "not below the least samples of a part"
+    assert cluster.parts_of(5, 64, 0) == [(0, 5)]
+    many, neighbour = cluster.parts_of(1 << 16, 1 << 12, 0), cluster.parts_of(1 << 16, 1 << 12, 1)
+    assert len({seed for seed, _ in many} | {seed for seed, _ in neighbour}) == 1 << 13
+
+
+def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
+    """Expected: the image is that of the same parts rendered here one after the other and joined; the pilot
+    ran once, its decisions are in the statistics. Tolerance: rounding of atomic sums and of half precision.
+    """
+    assert main(arguments(workers, tmp_path / "a.exr")) == 0
+    pixels, statistics = image(tmp_path / "a.exr")
+    assert sum(statistics["passes"]) == statistics["spp"] == 256
+    scene = mi.load_file(str(SCENE), resolution=16)
+    options = Namespace(
+        **{"scene": SCENE, "defines": [("resolution", "16")], "properties": [], "variant": mi.variant()},
+        **{"integrator": None, "sensor": 0, "time": None, "until_error": None, "seed": 0},
+    )
+    job = cluster._job(scene, scene.integrator(), options, 256)
+    merged = cluster.Merged()
+    for index, part in enumerate(cluster.parts_of(256, 8, 0)):
+        merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, *part)))
+    expected = np.array(scene.integrator().assemble(merged.snapshot, scene))[..., :3]
+    np.testing.assert_allclose(pixels, expected, rtol=2e-3, atol=1e-6)
+
+
+def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch):
+    """Expected: with a worker killed in the middle the render ends with the same image and the same counts of
+    rays: its part is made by another worker, with the same seed, and counted once."""
+    assert main(arguments(workers, tmp_path / "calm.exr")) == 0
+    killed = []
+    original = cluster.Merged.add
+
+    def add(self, index, snapshot):
+        original(self, index, snapshot)
+        if self.count == 2 and not killed:
+            with distributed.Client(workers.scheduler_address) as client:
+                pids = client.run(os.getpid)
+            killed.append(next(iter(pids.values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    monkeypatch.setattr(cluster.Merged, "add", add)
+    assert main(arguments(workers, tmp_path / "lost.exr")) == 0
+    assert killed
+    (expected, calm), (found, lost) = image(tmp_path / "calm.exr"), image(tmp_path / "lost.exr")
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
+    assert lost["rays"] == calm["rays"] and lost["passes"] == calm["passes"]
+
+
+def test_parts_are_added_in_their_order():
+    """Rationale: the sum of doubles depends on the order. Expected: whatever comes first, parts are joined
+    0, 1, 2, …; a second copy of one is ignored."""
+
+    class Text:
+        def __init__(self, text):
+            self.text = text
+
+        def joined(self, other):
+            return Text(self.text + other.text)
+
+    merged = cluster.Merged()
+    for index in (2, 0, 2, 0, 3, 1, 3):
+        merged.add(index, Text(str(index)))
+    assert merged.snapshot.text == "0123" and merged.count == 4
+
+
+def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
+    """Expected: with two workers of which one never ends its part, the other ends it in the end; each
+    index comes once."""
+    released = threading.Event()
+
+    class Future:
+        def __init__(self, value):
+            self.value = value
+
+        def result(self):
+            return self.value
+
+    class Client:
+        submitted = []
+
+        def submit(self, function, seed, pure):
+            self.submitted.append(seed)
+            return Future(seed)
+
+        def scheduler_info(self, n_workers):
+            return {"workers": {"fast": 0, "slow": 0}}
+
+        def cancel(self, futures, force):
+            released.set()
+
+    class Completed:
+        """The first future is never done; others are at once."""
+
+        def __init__(self):
+            self.futures = []
+
+        def add(self, future):
+            self.futures.append(future)
+
+        def __next__(self):
+            return self.futures.pop(1)
+
+    monkeypatch.setattr(distributed, "as_completed", Completed)
+    found = list(cluster.results(Client(), None, [(seed,) for seed in range(4)]))
+    assert sorted(found) == [(i, i) for i in range(4)] and released.is_set()
+    assert Client.submitted == [0, 1, 2, 3, 0]
+
+
+def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
+    original = distributed.Client
+    monkeypatch.setattr(distributed, "Client", lambda address, timeout: original(address, timeout="1s"))
+    started = time.monotonic()
+    assert main(["render", str(SCENE), "--scheduler", "127.0.0.1:1", "-o", str(tmp_path / "a.exr")]) == 1
+    assert "127.0.0.1:1" in capsys.readouterr().err and time.monotonic() - started < 60

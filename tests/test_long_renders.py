@@ -1,0 +1,134 @@
+"""``render`` with --checkpoint, --resume and --until-error."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from mitsuba_bdpt import checkpoints
+from mitsuba_bdpt.__main__ import build_parser, main
+from mitsuba_bdpt.snapshot import read
+
+SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
+ARGUMENTS = ["render", str(SCENE), "-D", "resolution=16", "-P", "spp_per_pass=4", "--seed", "5"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def image(path):
+    """All channels of an EXR file, and the statistics of its header."""
+    file = OpenEXR.File(str(path), separate_channels=True)
+    channels = file.channels()
+    pixels = np.stack([channels[name].pixels for name in sorted(channels)], axis=-1)
+    return pixels, json.loads(file.header()["bdptStatistics"])
+
+
+def test_a_killed_render_is_resumed():
+    """Rationale: machines are switched off. Expected: a render that got SIGKILL between its checkpoints goes
+    on with --resume and ends with the image and the counts of the uninterrupted one; the checkpoint is
+    removed. Tolerance: the rounding of atomic sums, and half precision in the file.
+    """
+    spp = ["--spp", "2000"]
+    assert main([*ARGUMENTS, *spp, "-o", "whole.exr"]) == 0
+    resumable = [*ARGUMENTS, *spp, "-o", "killed.exr", "--checkpoint", "0"]
+    process = subprocess.Popen([sys.executable, "-m", "mitsuba_bdpt", *resumable])
+    checkpoint, deadline = Path("killed.checkpoint.npz"), time.monotonic() + 120
+    while not (checkpoint.exists() and read(checkpoint).spp > 100):
+        assert process.poll() is None and time.monotonic() < deadline, "no checkpoint while it ran"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert 100 < read(checkpoint).spp < 2000 and not Path("killed.exr").exists()
+    assert main([*resumable, "--resume"]) == 0
+    assert not checkpoint.exists()
+    (expected, whole), (found, resumed) = image("whole.exr"), image("killed.exr")
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
+    for name in ("rays", "passes", "decisions"):
+        assert resumed[name] == whole[name], name
+
+
+def interrupt(monkeypatch, arguments, after=3):
+    """Run `arguments`; Ctrl-C comes after so many passes."""
+    original, passes = checkpoints.Checkpoints.after_pass, []
+
+    def after_pass(self, report):
+        original(self, report)
+        passes.append(report)
+        if len(passes) == after:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints.Checkpoints, "after_pass", after_pass)
+        assert main(arguments) == 130
+
+
+def test_an_interrupted_render_leaves_a_checkpoint_and_is_not_begun_anew(monkeypatch, capsys):
+    """Expected: Ctrl-C writes a checkpoint at once, whatever the minutes; another render to the same image
+    is refused until one says what to do with it; going on needs the same scene and parameters."""
+    arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
+    interrupt(monkeypatch, arguments)
+    assert read(Path("a.checkpoint.npz")).spp < 32
+    for others, words in (
+        ([], "go on by --resume, or delete it"),
+        (["--resume", "--seed", "6"], "its seed is 5, here it is 6"),
+        (["--resume", "--spp", "64"], "its spp is 32, here it is 64"),
+        (["--resume", "-P", "max_depth=3"], "its max_depth is"),
+        (["--resume", "-D", "resolution=8"], "is of another scene"),
+    ):
+        assert main([*arguments, *others]) == 1
+        assert words in capsys.readouterr().err
+    assert main([*arguments, "--resume"]) == 0
+    assert image("a.exr")[1]["spp"] == 32
+    assert main([*arguments, "--resume"]) == 1
+    assert "there is no checkpoint" in capsys.readouterr().err
+
+
+def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
+    arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
+    interrupt(monkeypatch, arguments)
+    file = Path("a.checkpoint.npz")
+    file.write_bytes(file.read_bytes()[:200])
+    assert main([*arguments, "--resume"]) == 1
+    error = capsys.readouterr().err
+    assert "'a.checkpoint.npz' is not a snapshot" in error and "Traceback" not in error
+
+
+def test_until_an_error(capsys):
+    """Expected: the render ends at 2^n * 32 spp with an estimate below what is asked for, and the image
+    has the layers of the variance."""
+    assert main([*ARGUMENTS, "--until-error", "0.02", "-o", "a.exr"]) == 0
+    channels = OpenEXR.File("a.exr", separate_channels=True).channels()
+    assert "variance.R" in channels
+    statistics = image("a.exr")[1]
+    assert statistics["error"] <= 0.02 and statistics["spp"] in (32, 64, 128, 256, 512)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--resume"], "resume needs --checkpoint"),
+        (["--parts", "3"], "parts needs --scheduler"),
+        (["--scheduler", "x:1", "--time", "1"], "scheduler together with time"),
+        (["--scheduler", "x:1", "--checkpoint", "1"], "scheduler together with checkpoint"),
+        (["--scheduler", "x:1", "--until-error", "1"], "scheduler together with until_error"),
+        (["--integrator", "path", "--checkpoint", "1"], "checkpoint is for the integrator bdpt"),
+        (["--integrator", "path", "--scheduler", "x:1"], "scheduler is for the integrator bdpt"),
+    ],
+)
+def test_contradictions_are_refused(arguments, words, capsys):
+    assert main([*ARGUMENTS, "-o", "a.exr", *arguments]) == 1
+    assert words in capsys.readouterr().err and not Path("a.exr").exists()
+
+
+def test_defaults_of_the_command_line():
+    options = build_parser().parse_args(["render", "a.xml"])
+    assert options.checkpoint is options.until_error is options.scheduler is options.parts is None
+    assert not options.resume
