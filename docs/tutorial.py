@@ -21,7 +21,7 @@ import mitsuba as mi  # isort: skip
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--size", type=int, default=128, help="width of the images")
-SIZE = parser.parse_args().size
+SIZE = parser.parse_known_args()[0].size  # a notebook has arguments of its own
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "renders" / "tutorial"
 OUT.mkdir(parents=True, exist_ok=True)
@@ -108,7 +108,6 @@ assert error <= 0.02
 # %%
 shown = mi.load_dict({"type": "bdpt", "max_depth": 3, "strategy_images": True})
 layers = np.array(shown.render(box, spp=64))
-names = ["R", "G", "B", *shown.aov_names()]
 layers = layers[..., -len(shown.aov_names()) :]
 three_edges = {}
 for s in range(5):

@@ -2,9 +2,9 @@
 
     python scripts/page.py results/small                    # writes results/small/page.html
 
-It holds what scripts/report.py puts into Markdown, and the images: for each scene those of the first seed at
-the deciding budget, in half precision, under a divider with exposure control, and error maps against the
-reference. What was skipped is said in words. scripts/page.html is its frame.
+It says for each scene how the first integrator does beside `path`, and why, and shows images:
+those of the first seed at the deciding budget, in half precision, under a divider with exposure control, and
+error maps against the reference. Then come all renders as a table, and plots. scripts/page.html is its frame.
 """
 
 from __future__ import annotations
@@ -57,15 +57,19 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
         return math.inf, f"path does not render this scene: {why}."
     except Refused as why:
         return math.nan, f"No figure: {why}."
-    span = f"({report.ratio(found.smallest)[:-1]} to {report.ratio(found.largest)})"
     if found.median >= 1:
+        span = f"({report.ratio(found.smallest)[:-1]} to {report.ratio(found.largest)})"
         return found.median, f"path takes {report.ratio(found.median)} the time for the same error {span}."
+    span = f"({report.ratio(1 / found.largest)[:-1]} to {report.ratio(1 / found.smallest)})"
     return found.median, f"path is ahead: its efficiency is {report.ratio(1 / found.median)} ours {span}."
 
 
 def why(results: Results, scene: str) -> str:
     """What the first render at the deciding budget did and left out, in words."""
-    row = results.of(scene, results.methods[0], results.deciding)[0]
+    rows = results.of(scene, results.methods[0], results.deciding)
+    if not rows:
+        return ""
+    row = rows[0]
     statistics = json.loads(row["statistics"] or "{}")
     decided = (statistics.get("decisions") or [None])[-1]
     if decided is None:

@@ -53,7 +53,8 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Lead links to source files to the pages of their docstrings."""
+    """Lead links to source files to the pages of their docstrings, and those to the tutorial to its page."""
+    markdown = markdown.replace("](tutorial.py)", "](tutorial.md)")
     up = "../" * page.file.src_uri.count("/")
 
     def replaced(match):

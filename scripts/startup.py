@@ -2,7 +2,7 @@
 
     python scripts/startup.py
 
-A process for each row, with an empty kernel cache: seconds to the first image of 64^2 pixels (compilation
+A process for each row, with an empty kernel cache: seconds to the first image of 128^2 pixels (compilation
 included), then of a second render (seed and samples changed: nothing is compiled, kernels are only recorded).
 """
 
@@ -24,7 +24,7 @@ import mitsuba_bdpt, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 T = mi.ScalarTransform4f
 kind, lamps, bsdfs = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-film = {"type": "hdrfilm", "width": 64, "height": 64}
+film = {"type": "hdrfilm", "width": 128, "height": 128}
 look = T().look_at([0, 3, 8], [0, 0, 0], [0, 1, 0])
 scene = {"type": "scene", "sensor": {"type": "perspective", "to_world": look, "film": film}}
 for i in range(lamps):
@@ -43,7 +43,7 @@ for i in range(bsdfs):
     scene[f"ball{i}"] = {"type": "sphere", "center": [x, 0, z], "radius": 0.4, "bsdf": bsdf}
 scene = mi.load_dict(scene)
 integrator = mi.load_dict({"type": kind, "max_depth": 6})
-for seed, spp in ((0, 4), (1, 8)):
+for seed, spp in ((0, 8), (1, 16)):  # long enough for a pilot
     start = time.perf_counter()
     dr.eval(integrator.render(scene, seed=seed, spp=spp))
     dr.sync_thread()

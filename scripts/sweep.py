@@ -31,7 +31,7 @@ import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import groupby
 from pathlib import Path
 
@@ -290,11 +290,13 @@ def measured(preset: str, scene: str, cells: list[dict]) -> list:
     """Row and image of each cell, or why it failed, as text; one after the other."""
     with cluster.one_at_a_time:
         mi.set_variant("llvm_ad_rgb")
-        bench, found = _bench(preset, scene), []
+        bench, found = _bench(preset, scene, cells[0]["scene_sha256"]), []
         for entry in cells:
             cell = Cell(**entry)
-            if cell.versions != tuple(software().items()):
-                raise ValueError(f"a worker has other software than the client: {software()}")
+            if cell.versions != _loaded_software():
+                raise ValueError(f"a worker has other software than the client: {dict(_loaded_software())}")
+            if cell.scene_sha256 != bench.cells.common["scene_sha256"]:
+                raise ValueError(f"a worker has another {scene}.xml, mesh or texture than the client")
             try:
                 found.append(measure(bench, cell))
             except Exception as error:  # one cell must not cost the others
@@ -302,14 +304,24 @@ def measured(preset: str, scene: str, cells: list[dict]) -> list:
         return found
 
 
+@cache
+def _loaded_software() -> tuple:
+    """`software` when this process first asked: files may change under a worker, not what it imported."""
+    return tuple(software().items())
+
+
 @lru_cache(maxsize=2)
-def _bench(preset: str, scene: str) -> Bench:
-    """The bench of a scene of the preset in a file of this text; kept, so that it stays warm."""
-    folder = Path(tempfile.mkdtemp(prefix="bdpt_sweep_"))
-    (folder / "preset.toml").write_text(preset)
-    whole = read_preset(folder / "preset.toml")
+def _bench(preset: str, scene: str, scene_sha256: str) -> Bench:
+    """The bench of a scene, of these contents, of the preset in a file of this text; kept, so that it stays
+    warm."""
+    folder = tempfile.TemporaryDirectory(prefix="bdpt_sweep_")
+    file = Path(folder.name) / "preset.toml"
+    file.write_text(preset)
+    whole = read_preset(file)
     subject = next(subject for subject in whole.subjects if subject.name == scene)
-    return Bench(Cells(whole, subject), folder)
+    bench = Bench(Cells(whole, subject), file.parent)
+    bench.folder = folder  # goes with the bench
+    return bench
 
 
 def errors(image, ref: reference.Reference, ref_sha256: str, flip: bool) -> dict:

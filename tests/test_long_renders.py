@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from mitsuba_bdpt import checkpoints
+from mitsuba_bdpt import checkpoints, rendering
 from mitsuba_bdpt.__main__ import build_parser, main
 from mitsuba_bdpt.snapshot import read
 
@@ -91,6 +91,68 @@ def test_an_interrupted_render_leaves_a_checkpoint_and_is_not_begun_anew(monkeyp
     assert "there is no checkpoint" in capsys.readouterr().err
 
 
+def test_an_interruption_inside_a_pass(monkeypatch):
+    """Rationale: Ctrl-C comes while a pass is being traced, not between two. Expected: what is written is the
+    state after the last whole pass (here also the end of a replicate), and the render that goes on from it
+    is the uninterrupted one, its estimate of the error included."""
+    arguments = [*ARGUMENTS, "--spp", "64", "-P", "variance=true"]
+    assert main([*arguments, "-o", "whole.exr"]) == 0
+    original, waits = rendering.Render._wait, []
+
+    def wait(self):
+        waits.append(len(self.accumulator.passes))
+        if waits[-1] == 5 and waits.count(5) == 1:
+            raise KeyboardInterrupt
+        original(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering.Render, "_wait", wait)
+        assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60"]) == 130
+    assert read(Path("cut.checkpoint.npz")).passes == (1, 4, 3, 4)  # the next one ends a replicate
+    assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60", "--resume"]) == 0
+    (expected, whole), (found, resumed) = image("whole.exr"), image("cut.exr")
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
+    assert resumed["passes"] == whole["passes"]
+    assert resumed["error"] == pytest.approx(whole["error"], rel=1e-3)
+
+
+def test_an_hour_a_night():
+    """Expected: a render that --time ends keeps its checkpoint and goes on the next time, where it was."""
+    arguments = [*ARGUMENTS, "--time", "0.2", "-o", "a.exr", "--checkpoint", "60"]
+    assert main(arguments) == 0
+    first = read(Path("a.checkpoint.npz")).spp
+    assert main([*arguments, "--resume"]) == 0
+    second = read(Path("a.checkpoint.npz")).spp
+    assert 0 < first < second == image("a.exr")[1]["spp"]
+
+
+def test_a_full_disk_does_not_cost_the_render(monkeypatch, capsys):
+    def full(number):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoints.os, "fsync", full)
+    assert main([*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "0"]) == 0
+    assert "warning: no checkpoint 'a.checkpoint.npz'" in capsys.readouterr().err
+    assert Path("a.exr").exists() and not Path("a.checkpoint.npz").exists()
+
+
+def test_a_render_that_had_reached_its_error_is_not_traced_on(monkeypatch):
+    """Rationale: killed between its last pass and the image. Expected: --resume writes the image of the
+    passes that there are."""
+    arguments = [*ARGUMENTS, "--until-error", "0.02", "-o", "a.exr", "--checkpoint", "0"]
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints.Checkpoints, "end", lambda self, finished: None)
+        assert main(arguments) == 0
+    kept = read(Path("a.checkpoint.npz"))
+    assert main([*arguments, "--resume"]) == 0
+    assert image("a.exr")[1]["spp"] == kept.spp and not Path("a.checkpoint.npz").exists()
+
+
+def test_an_error_that_is_not_reached_is_said(capsys):
+    assert main([*ARGUMENTS, "--until-error", "1e-9", "--spp", "32", "-o", "a.exr"]) == 0
+    assert "not the 1e-09 asked for" in capsys.readouterr().out
+
+
 def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
     arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     interrupt(monkeypatch, arguments)
@@ -119,12 +181,16 @@ def test_until_an_error(capsys):
         (["--scheduler", "x:1", "--time", "1"], "scheduler together with time"),
         (["--scheduler", "x:1", "--checkpoint", "1"], "scheduler together with checkpoint"),
         (["--scheduler", "x:1", "--until-error", "1"], "scheduler together with until_error"),
+        (["--scheduler", "x:1", "-P", "timeout=3"], "scheduler with timeout=3.0 is not possible"),
+        (["--scheduler", "x:1", "-P", "aovs=a:duv_dx"], "duv_dx depends on the samples per pixel of a part"),
+        (["--checkpoint", "1", "-P", "points=sampler"], "checkpoint with points=sampler"),
         (["--integrator", "path", "--checkpoint", "1"], "checkpoint is for the integrator bdpt"),
         (["--integrator", "path", "--scheduler", "x:1"], "scheduler is for the integrator bdpt"),
+        (["--integrator", "path", "--until-error", "1"], "until_error is for the integrator bdpt"),
     ],
 )
 def test_contradictions_are_refused(arguments, words, capsys):
-    assert main([*ARGUMENTS, "-o", "a.exr", *arguments]) == 1
+    assert main([*ARGUMENTS[:4], "-o", "a.exr", *arguments]) == 1
     assert words in capsys.readouterr().err and not Path("a.exr").exists()
 
 

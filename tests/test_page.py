@@ -38,12 +38,14 @@ view.draw();
 seen.halves = sums(view.image);
 set(view.split, 0);
 seen.rightOnly = sums(view.image);
+set(view.exposure, -4);
+seen.dark = sums(view.image);
+set(view.exposure, 0);
 set(view.split, 100);
 seen.leftOnly = sums(view.image);
 set(view.exposure, -4);
-seen.dark = sums(view.image);
 seen.darkLabel = view.shown.value;
-seen.errorMap = sums(view.error);
+seen.errorMap = [0, 1].map(row => shown(view.error).slice(64 * row, 64 * row + 4));
 set(view.right, "reference");
 seen.noError = shown(view.error).slice(0, 4);
 seen.label = view.image.getAttribute("aria-label");
@@ -124,7 +126,11 @@ def test_the_page_in_a_browser(tmp_path):
     level = round(255 * (1.055 * 0.25 ** (1 / 2.4) - 0.055)) * 3 * 8 * 8
     assert seen["halves"] == [0, level - level // 8 + white]
     assert seen["rightOnly"] == [level - level // 8 + white, level] and seen["leftOnly"] == [0, 0]
-    assert seen["darkLabel"] == "-4 stops" and seen["errorMap"][0] > 0
+    dark = round(255 * (1.055 * (0.25 / 16) ** (1 / 2.4) - 0.055)) * 3 * 8 * 8
+    assert dark == 34 * 192 and seen["dark"] == [dark - dark // 8 + white, dark]
+    assert seen["darkLabel"] == "-4 stops"
+    # Even rows of the reference are brighter by 1 than `bdpt`, odd ones equal it.
+    assert seen["errorMap"][1] == [68, 1, 84, 255] and seen["errorMap"][0][1] > 150
     assert seen["noError"] == [68, 1, 84, 255] and "reference right of it" in seen["label"]
     assert seen["rows"] == 3 and seen["sorted"] and seen["sort"] == "ascending"
     assert seen["filtered"] == ["cornell_box"]
@@ -154,7 +160,7 @@ def results(outcome, statistics):
     ("outcome", "ratio", "words"),
     [
         (Spread(24.0, 23, 25, 20.0, 30.0, 5), 24, "path takes 24x the time for the same error (20 to 30x)"),
-        (Spread(0.8, 0.7, 0.9, 0.5, 1.0, 5), 0.8, "path is ahead: its efficiency is 1.25x ours"),
+        (Spread(0.8, 0.7, 0.9, 0.5, 1.0, 5), 0.8, "path is ahead: its efficiency is 1.25x ours (1 to 2x)"),
         (Biased("all energy is missing"), np.inf, "path does not render this scene: all energy is missing"),
         (NotJudged("too noisy", 0.02), np.nan, "No figure: too noisy"),
     ],

@@ -550,7 +550,7 @@ def test_walks_without_a_finite_throughput_are_counted(light_paths):
     assert abs(bdpt.statistics["non_finite"] - expected) < 0.05 * expected
 
 
-def compiled_for(tmp_path, change):
+def compiled_for(tmp_path, change, skip="impossible", size=16, spp=4):
     """How many kernels a second render compiles after ``change`` (Python code) with an empty cache."""
     script = f"""
 import mitsuba_bdpt, mitsuba as mi
@@ -559,10 +559,10 @@ scene = mi.load_dict({{
     "type": "scene", "wall": {{"type": "sphere", "bsdf": {{"type": "twosided", "b": {{"type": "diffuse"}}}}}},
     "lamp": {{"type": "point"}},
     "sensor": {{"type": "perspective", "film": {{
-        "type": "hdrfilm", "width": 16, "height": 16, "rfilter": {{"type": "gaussian"}}}}}}}})
-bdpt = mi.load_dict({{"type": "bdpt", "max_depth": 4, "skip": "impossible"}})
+        "type": "hdrfilm", "width": {size}, "height": {size}, "rfilter": {{"type": "gaussian"}}}}}}}})
+bdpt = mi.load_dict({{"type": "bdpt", "max_depth": 4, "skip": "{skip}"}})
 params = mi.traverse(scene)
-spp, seed = 4, 1
+spp, seed = {spp}, 1
 bdpt.render(scene, spp=spp, seed=seed)
 first = bdpt.statistics["kernels"]["compiled"]
 {change}
@@ -594,6 +594,12 @@ def test_no_recompilation(tmp_path, change):
     positions and the film's size are run-time values. (A process of its own with an empty kernel cache.)
     """
     assert compiled_for(tmp_path, change) == 0
+
+
+@pytest.mark.parametrize("change", ["spp = 90", "params['sensor.film.size'] = [80, 72]"])
+def test_no_recompilation_with_a_pilot(tmp_path, change):
+    """Expected: the same with default parameters and a pilot, whose lanes follow the number of samples."""
+    assert compiled_for(tmp_path, change, skip="auto", size=64, spp=64) == 0
 
 
 def test_explain():

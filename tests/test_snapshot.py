@@ -173,8 +173,21 @@ def test_what_does_not_belong_together_is_refused():
         start.joined(start)
     with pytest.raises(ValueError, match="not a snapshot"):
         Snapshot.from_bytes(b"PK\x03\x04 and then nothing")
-    timed = bdpt(timeout=60)  # when a render is looked at is not what is in it
-    assert sum(timed.render(target, seed=0, spp=16, start=start).shape) > 0
+    with pytest.raises(ValueError, match="only assemble"):
+        bdpt().render(target, seed=0, spp=16, start=start.image_only())
+    # When a render is looked at is not what is in it.
+    timed = np.array(bdpt(timeout=60.0).render(target, seed=0, spp=16, start=start))
+    np.testing.assert_allclose(timed, np.array(bdpt().render(target, seed=0, spp=16)), **ROUNDING)
+
+
+def test_only_the_newest_report_has_a_snapshot():
+    """Rationale: reports that are kept must not keep the sums of their time. Expected: older ones refuse."""
+    reports, integrator = [], bdpt()
+    integrator.on_pass = reports.append
+    integrator.render(scene(), spp=16, develop=False)
+    assert reports[-1].snapshot().spp == 16
+    with pytest.raises(ValueError, match="after 1 passes came too late"):
+        reports[0].snapshot()
 
 
 def test_decide_is_the_pilot_of_a_render():

@@ -63,7 +63,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "stop after the pass in which this time is over; without --spp, only the time limits"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE; without --spp, only it limits; adds the layers of the variance"
-    add("--until-error", type=number(float, 0), metavar="X", help=text)
+    add("--until-error", type=number(float, 1e-12), metavar="X", help=text)
     text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
     add("--resume", action="store_true", help="go on from the checkpoint of an earlier, unfinished render")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import sys
 import time
 from argparse import Namespace
 from dataclasses import replace
@@ -61,11 +63,26 @@ class Checkpoints:
             self.write()
 
     def write(self) -> None:
-        """Write what the last report knows, if there was one."""
+        """Write what the last report knows, if there was one. A full disk must not cost the render: it is
+        said on standard error, and the former checkpoint stays."""
         if self._report is None:
             return
         snapshot = self._report.snapshot()
         whole = replace(snapshot, progress=snapshot.progress | {"scene": self._scene})
-        with replacing(self.path) as temporary:
-            temporary.write_bytes(whole.to_bytes())
+        try:
+            with replacing(self.path) as temporary, temporary.open("wb") as file:
+                file.write(whole.to_bytes())
+                file.flush()
+                os.fsync(
+                    file.fileno()
+                )  # before the name: it must not stand for half a file after a power cut
+        except OSError as error:
+            print(f"warning: no checkpoint {str(self.path)!r}: {error}", file=sys.stderr)
         self._last = time.monotonic()
+
+    def end(self, finished: bool) -> None:
+        """The last checkpoint of a render that can go on; none of one that is ``finished``."""
+        if finished:
+            self.path.unlink(missing_ok=True)
+        else:
+            self.write()

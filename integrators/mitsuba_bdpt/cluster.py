@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+import uuid
 from argparse import Namespace
 from collections import deque
 from collections.abc import Callable
@@ -33,6 +34,19 @@ LEAST_SPP = 16
 STRIDE = 0x9E3779B9
 
 one_at_a_time = threading.Lock()
+
+
+def check_settings(settings) -> None:
+    """Raise ``ValueError`` for parameters that would mean something else in each part."""
+    for name in ("timeout", "until_error"):
+        value = getattr(settings, name)
+        if value > 0 or name == "timeout" and value == 0:
+            raise ValueError(f"scheduler with {name}={value} is not possible: each part would end by itself.")
+    if found := [name for name in ("duv_dx", "duv_dy") if name in settings.aovs]:
+        raise ValueError(
+            f"scheduler with aovs={settings.aovs!r} is not possible: {found[0]} depends on the samples per "
+            "pixel of a part; render it apart."
+        )
 
 
 def parts_of(spp: int, count: int, seed: int) -> list[tuple[int, int]]:
@@ -92,6 +106,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
         properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "until_error")
     kept = {name: getattr(options, name) for name in names}
+    kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
 
 
@@ -111,7 +126,7 @@ def results(client, function, arguments):
         pending.add(future)
 
     def fill():
-        workers = worker_count(client)
+        workers = max(1, worker_count(client))  # none for a moment: another one may come
         while len(running) < workers and to_do:
             submit(to_do.popleft())
         for index in [i for i in running.values() if i not in done]:
@@ -124,9 +139,17 @@ def results(client, function, arguments):
         index = running.pop(future)
         if index not in done:
             done.add(index)
-            yield index, future.result()
+            yield index, _result(future, index)
         fill()
     client.cancel(list(running), force=True)
+
+
+def _result(future, index: int):
+    try:
+        return future.result()
+    except Exception as error:
+        text = str(error) or type(error).__name__
+        raise RuntimeError(f"part {index} failed on the cluster: {text}") from error
 
 
 def worker_count(client) -> int:

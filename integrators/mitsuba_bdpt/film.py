@@ -83,30 +83,31 @@ class Replicates:
 
     def __init__(self):
         self.count, self.mean, self._squares = 0, None, None
-        self._spp, self._sums = 0, None
+        self.spp, self._sums = 0, None
 
     def add(self, sums, spp: int, develop):
         """Add an image: ``sums`` and ``spp`` are those of all images so far, ``develop(camera, light,
         spp)`` makes an image of the difference."""
-        n = spp - self._spp
+        n = spp - self.spp
         new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
         x = develop(*new, n)
         before = np.zeros_like(x) if self.mean is None else self.mean
         self._squares = np.zeros_like(x) if self._squares is None else self._squares
         mean = before + (x - before) * (n / spp)
         self._squares = self._squares + n * (x - before) * (x - mean)
-        self.count, self.mean, self._spp, self._sums = self.count + 1, mean, spp, sums
+        self.count, self.mean, self.spp, self._sums = self.count + 1, mean, spp, sums
 
-    def store(self, arrays: dict) -> dict:
-        """Put what `restore` needs into ``arrays`` of a `Snapshot`; the rest is returned."""
+    def store(self) -> tuple[dict, dict]:
+        """Arrays of a `Snapshot`, and the numbers that `restore` needs beside them."""
+        arrays = {}
         if self.count:
-            arrays |= {"replicates.mean": self.mean, "replicates.squares": self._squares}
+            arrays = {"replicates.mean": self.mean, "replicates.squares": self._squares}
             arrays |= {f"replicates.last.{i}": sums for i, sums in enumerate(self._sums)}
-        return {"count": self.count, "spp": self._spp}
+        return arrays, {"count": self.count, "spp": self.spp}
 
     def restore(self, progress: dict, arrays: dict):
         """Go on from what `store` gave."""
-        self.count, self._spp = progress["count"], progress["spp"]
+        self.count, self.spp = progress["count"], progress["spp"]
         if self.count:
             self.mean, self._squares = arrays["replicates.mean"], arrays["replicates.squares"]
             self._sums = [arrays[n] for n in sorted(arrays) if n.startswith("replicates.last.")]
@@ -194,11 +195,16 @@ class Accumulator:
         for b in blocks:
             b.clear()
 
-    def store(self) -> tuple[dict, dict | None]:
-        """Arrays of a `Snapshot`, and what it has to know of the replicates, if there are any."""
-        sums = self._done[0] or []
-        arrays = {name: np.array(s) for name, s in zip(_NAMES, sums, strict=False)}
-        return arrays, self.replicates.store(arrays) if self.replicates else None
+    def store(self) -> tuple[tuple, dict, dict | None]:
+        """What a `Snapshot` needs: passes, arrays (of Dr.Jit or NumPy, none of which changes any more), and
+        numbers about the replicates, if there are any."""
+        sums, passes = self._done
+        arrays, replicates = self.replicates.store() if self.replicates else ({}, None)
+        return passes, arrays | dict(zip(_NAMES, sums or [], strict=False)), replicates
+
+    def ends_replicates(self) -> bool:
+        """Whether all passes belong to whole replicates."""
+        return self.replicates is not None and self.replicates.spp == sum(self.passes) > 0
 
     def restore(self, passes: tuple, arrays: dict, replicates: dict | None):
         """Go on from what `store` gave after these ``passes``."""

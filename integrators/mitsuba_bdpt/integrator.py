@@ -210,6 +210,8 @@ def _make_class():
 def _check_resumable(start, settings):
     if not isinstance(start, Snapshot):
         raise TypeError(f"bdpt: start={type(start).__name__} must be a snapshot from a PassReport")
+    if not start.progress["whole"]:
+        raise ValueError("bdpt: start=... was joined or reduced for joining; only assemble() can use it")
     if settings.points == "sampler":
         raise ValueError(
             "bdpt: start with points=sampler is not possible: a scene's sampler cannot start in the middle "

@@ -29,14 +29,18 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     overrides = dict(options.properties)
     if options.time is not None:
         overrides["timeout"] = options.time
-    if options.until_error is not None:
-        overrides |= {"until_error": options.until_error, "variance": True}
-
     config = mi.parser.ParserConfig(options.variant)
     state = mi.parser.parse_file(config, str(options.scene), **dict(options.defines))
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     kind = mi.ObjectType.Integrator
     node = next((node for node in state.nodes if node.type == kind), None)
+    if options.until_error is not None:
+        used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
+        if used != "bdpt":
+            raise ValueError(
+                f"until_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
+            )
+        overrides |= {"until_error": options.until_error, "variance": True}
     if node is not None:
         node.props = integrator_properties(node.props, options.integrator, overrides)
     mi.parser.transform_all(config, state)

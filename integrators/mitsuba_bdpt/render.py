@@ -62,15 +62,13 @@ def run(options: Namespace) -> int:
             return INTERRUPTED
         attributes = {"bdptSettings": settings(options, spp), "bdptStatistics": report(outcome)}
         write_images(sensor.film(), output, attributes, options.exposure)
-        if options.checkpoint is not None and not outcome.interrupted:
-            checkpoints.path_of(output).unlink(missing_ok=True)
     except KeyboardInterrupt:
         print("interrupted; no image written", file=sys.stderr)
         return INTERRUPTED
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         print(f"error: {message(error)}", file=sys.stderr)
         return 1
-    print(summary(output, outcome, sensor.film().crop_size()))
+    print(summary(output, outcome, sensor.film().crop_size(), options.until_error))
     return INTERRUPTED if outcome.interrupted else 0
 
 
@@ -114,13 +112,20 @@ def check_options(options: Namespace, output: Path) -> None:
 
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
-    """Raise ``ValueError`` for options that only ``bdpt`` can follow."""
-    for name in ("checkpoint", "until_error", "scheduler"):
+    """Raise ``ValueError`` for options that only ``bdpt`` can follow, and for what these cannot."""
+    for name in ("checkpoint", "scheduler"):
         if getattr(options, name) is not None and not hasattr(integrator, "assemble"):
             raise ValueError(
-                f"{name} is for the integrator bdpt, not for {integrator.class_name()}; add --integrator "
-                "bdpt."
+                f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "
+                "--integrator bdpt."
             )
+    if options.checkpoint is not None and integrator.settings.points == "sampler":
+        raise ValueError(
+            "checkpoint with points=sampler is not possible: a scene's sampler cannot start in the middle of "
+            "its samples; use points=sobol."
+        )
+    if options.scheduler is not None:
+        cluster.check_settings(integrator.settings)
 
 
 def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, output: Path) -> Outcome:
@@ -129,7 +134,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
         started = time.perf_counter()
         with progress_bar() as bar:
             statistics = cluster.render(scene, integrator, options, spp, show_pass(bar, None))
-        return Outcome(time.perf_counter() - started, spp, False, statistics)
+        return Outcome(time.perf_counter() - started, sum(statistics["passes"]), False, statistics)
     if options.time is not None and not hasattr(integrator, "on_pass"):
         return render_repeatedly(scene, integrator, options, spp)
     return render_here(scene, integrator, options, spp, output)
@@ -137,16 +142,17 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
 
 def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -> Outcome:
     """Render in one go, with checkpoints if they are wanted."""
-    started, interrupted, arguments = time.perf_counter(), False, {}
-    watchers, kept = [], None
+    started, interrupted, asked, arguments = time.perf_counter(), False, spp, {}
+    watchers, kept, limit = [], None, options.time
     if options.checkpoint is not None:
         kept = checkpoints.Checkpoints(options, output)
         watchers.append(kept.after_pass)
     if options.resume:
         arguments["start"] = checkpoints.start(options, output)
+        limit = limit and limit + arguments["start"].progress["seconds"]
     with progress_bar() as bar:
         if hasattr(integrator, "on_pass"):
-            watchers.append(show_pass(bar, options.time))
+            watchers.append(show_pass(bar, limit))
             integrator.on_pass = lambda report: [watch(report) for watch in watchers]
         try:
             integrator.render(
@@ -155,15 +161,20 @@ def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -
             dr.sync_thread()
         except KeyboardInterrupt:
             interrupted = True
-            if kept is not None:
-                kept.write()
     statistics = getattr(integrator, "statistics", None) or {}
     if "passes" in statistics:
         spp = int(sum(statistics["passes"]))
     elif interrupted:
         # Mitsuba's own integrators leave nothing behind.
         spp = 0
+    if kept is not None:
+        kept.end(finished=not interrupted and (spp == asked or reached(options, statistics)))
     return Outcome(time.perf_counter() - started, spp, interrupted, statistics)
+
+
+def reached(options: Namespace, statistics: Mapping) -> bool:
+    """Whether the error that was asked for is reached."""
+    return options.until_error is not None and statistics["error"] <= options.until_error
 
 
 def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
@@ -285,7 +296,7 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
         bitmap.write(str(temporary), file_format)
 
 
-def summary(output: Path, outcome: Outcome, size: Iterable[int]) -> str:
+def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: float | None) -> str:
     """The closing line."""
     width, height = size
     parts = [
@@ -296,6 +307,10 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int]) -> str:
     if rays:
         kinds = ", ".join(f"{kind} {readable(count)}" for kind, count in rays.items())
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
+    if "error" in outcome.statistics:
+        error = outcome.statistics["error"]
+        missed = until_error is not None and error > until_error
+        parts.append(f"relMSE about {error:.2g}" + (f", not the {until_error:g} asked for" if missed else ""))
     if outcome.statistics.get("non_finite"):
         parts.append(f"{outcome.statistics['non_finite']} samples without a finite value count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))

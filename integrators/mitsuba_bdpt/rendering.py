@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +20,7 @@ from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
 from .objects import nothing_freed, step_by_step
 from .parameters import check_film, check_scene, check_variant, integer
-from .passes import Step, batches, schedule
+from .passes import REPLICATES, Step, batches, schedule
 from .plan import Settings, plan
 from .sinks import Image
 from .snapshot import Snapshot
@@ -45,9 +46,9 @@ STRATEGY_MEMORY = 2 << 30
 
 @dataclass(frozen=True)
 class PassReport:
-    """Progress after a pass: samples per pixel, seconds and rays so far; ``error`` the relMSE estimated when
-    ``until_error`` was last looked at, else ``None``; ``snapshot()`` gives what a later render can start
-    from."""
+    """Progress after a pass: samples per pixel, seconds and rays so far; ``error`` the relMSE estimated
+    when ``until_error`` was last looked at, else ``None``; ``snapshot()``, of the newest report, gives what a
+    later render can start from."""
 
     spp_done: int
     spp_total: int
@@ -92,10 +93,8 @@ class Render:
         self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
         self._left_out, self._small_first, self._error, self._earlier = [], None, None, 0.0
-        self._resumed = (
-            0,
-            0.0,
-        )  # spp, and seconds of compiling and pilots, of the render that this one goes on from
+        # Samples per pixel, and seconds of compiling and pilots, of the render that this one goes on from.
+        self._resumed_at, self._resumed_idle = 0, 0.0
 
     def decide(self) -> list:
         """Adopt what the scene alone or a pilot says, if there is a choice and the render is long enough to
@@ -191,6 +190,8 @@ class Render:
             if not self.accumulator.passes:
                 self.decide()
             for number, step in enumerate(self._steps()):
+                if self._resumed_at and not number and self._was_exact_enough():
+                    break
                 self._decide_before(step)
                 self._pass(step)
                 # The second pass is recorded while the first, a short one, runs.
@@ -227,6 +228,11 @@ class Render:
                 yield replace(step, done=done, size=size, last=last, judged=step.judged and last)
                 done += size
 
+    def _was_exact_enough(self) -> bool:
+        """Whether the render that this one goes on from had reached ``until_error``."""
+        whole = self.accumulator.ends_replicates() and self.accumulator.replicates.count % REPLICATES == 0
+        return whole and self._is_exact_enough()
+
     def _is_exact_enough(self) -> bool:
         """Whether the estimated error is what ``until_error`` asks for."""
         if not self.settings.until_error:
@@ -238,8 +244,8 @@ class Render:
         if not 0 <= self.settings.timeout < math.inf or self.settings.points == "sampler":
             return size
         spp, idle = sum(self.accumulator.passes), self.compile_seconds + self.pilot_seconds
-        busy = time.perf_counter() - self.started - (idle - self._resumed[1])
-        rate = (spp - self._resumed[0]) / max(busy, 1e-3)
+        busy = time.perf_counter() - self.started - (idle - self._resumed_idle)
+        rate = (spp - self._resumed_at) / max(busy, 1e-3)
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
 
     def _pass(self, step: Step):
@@ -294,10 +300,10 @@ class Render:
 
     def report(self) -> PassReport:
         """Progress so far, for ``on_pass``."""
-        rays = sum(self._rays().values())
-        return PassReport(
-            sum(self.accumulator.passes), self.spp, self._seconds(), rays, self._error, self.snapshot
-        )
+        self._state = self._freeze()
+        passes, rays = self.accumulator.passes, sum(self._rays().values())
+        snapshot = partial(self._snapshot, len(passes))
+        return PassReport(sum(passes), self.spp, self._seconds(), rays, self._error, snapshot)
 
     def _seconds(self) -> float:
         """So far, those of the render that this one goes on from included."""
@@ -320,21 +326,21 @@ class Render:
         }
         return json.loads(json.dumps(values))
 
-    def snapshot(self) -> Snapshot:
-        """The passes that are done, for `resume`."""
-        self._wait()
-        arrays, replicates = self.accumulator.store()
+    def _freeze(self) -> tuple:
+        """Passes, progress and arrays of a snapshot of now, also when the next pass has begun: an
+        interruption may come between any two of its steps. Nothing is copied yet."""
+        passes, arrays, replicates = self.accumulator.store()
         moments = None
         if self._moments is not None:
             moments = {name: getattr(self._moments, name) for name in ("mean", "rays", "lanes")}
             arrays |= {f"moments.{name}": getattr(self._moments, name) for name in ("base", "light", "draw")}
         progress = {
+            "whole": True,
             "decisions": [decision.record() for decision in self.decisions],
-            "left_out": self._left_out,
+            "left_out": list(self._left_out),
             "moments": moments,
             "pilots": [self._pilots, self._next_pilot],
             "small_first": self._small_first,
-            "inverse_threshold": str(self.kernel.inverse_threshold[0]),  # may be infinite
             "replicates": replicates,
             "counts": dict(self._counts),
             "compiled": self.compiled,
@@ -343,7 +349,20 @@ class Render:
             "compile_seconds": self.compile_seconds,
             "pilot_seconds": self.pilot_seconds,
         }
-        return Snapshot(self.identity(), self.accumulator.passes, progress, arrays)
+        return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
+
+    def _snapshot(self, reported: int) -> Snapshot:
+        """The snapshot of the report after so many passes; raises ``ValueError`` if a later one was made
+        (each would keep the sums of its time)."""
+        passes, progress, arrays = self._state
+        if len(passes) != reported:
+            raise ValueError(
+                f"bdpt: snapshot() of the report after {reported} passes came too late; only the newest "
+                "report has one"
+            )
+        return Snapshot(
+            self.identity(), passes, progress, {n: np.array(a, dtype=np.float64) for n, a in arrays.items()}
+        )
 
     def resume(self, snapshot: Snapshot, apart_from=()):
         """Go on after the passes of a snapshot, which raises ``ValueError`` if it is of another render (see
@@ -358,12 +377,12 @@ class Render:
             self._moments = pilot.Moments(**parts, **progress["moments"])
         self._pilots, self._next_pilot = progress["pilots"]
         self._small_first = progress["small_first"]
-        self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(progress["inverse_threshold"]))
+        self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))
         self._counts = dict(progress["counts"])
         self.compiled, self.cached = progress["compiled"], progress["cached"]
         self.compile_seconds, self.pilot_seconds = progress["compile_seconds"], progress["pilot_seconds"]
         self._earlier = progress["seconds"]
-        self._resumed = snapshot.spp, self.compile_seconds + self.pilot_seconds
+        self._resumed_at, self._resumed_idle = snapshot.spp, self.compile_seconds + self.pilot_seconds
 
     def _rays(self):
         rays = {name: self._counts[name] for name in RAYS}

@@ -21,8 +21,8 @@ class Snapshot:
     ``identity`` says of which render: variant, parameters, seed, samples per pixel, film; plain values, as
     ``progress`` (decisions, counts, seconds, …). ``passes``: samples per pixel of each. ``arrays``, all in
     double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums, see
-    `film.Accumulator`; flat), ``moments.*`` of the pilots, ``replicates.*`` of the variance. The scene is
-    not part of it: whoever goes on has to bring the same one.
+    `film.Accumulator`; flat), ``inverse_threshold`` of roulette, ``moments.*`` of the pilots,
+    ``replicates.*`` of the variance. The scene is not part of it: whoever goes on has to bring the same one.
     """
 
     identity: dict
@@ -62,18 +62,18 @@ class Snapshot:
             name: self.arrays[name] + other.arrays[name]
             for name in ("camera", "light", "strategies")
             if name in self.arrays
-        }
+        } | {"inverse_threshold": self.arrays["inverse_threshold"]}
         return Snapshot(
             identity=self.identity | {"seed": seeds + others, "spp": spp},
             passes=self.passes + other.passes,
-            progress=progress | {"replicates": _joined_replicates(self, other, arrays)},
+            progress=progress | {"whole": False, "replicates": _joined_replicates(self, other, arrays)},
             arrays=arrays,
         )
 
     def image_only(self) -> Snapshot:
         """What an image is made of, to be sent elsewhere and joined; a render cannot go on from it."""
         kept = {n: a for n, a in self.arrays.items() if not n.startswith(("moments.", "replicates.last"))}
-        return replace(self, arrays=kept)
+        return replace(self, progress=self.progress | {"whole": False}, arrays=kept)
 
     def to_bytes(self) -> bytes:
         """As a file of NumPy's ``npz`` format, without pickled objects."""
