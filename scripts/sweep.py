@@ -444,26 +444,29 @@ class Sweep:
         """The cells of a further seed, none if the interval is narrow enough, or there are enough of them."""
         if not cells.fewest():
             return []
-        for seeds in range(cells.fewest(), cells.more.at_most + 1):
-            found = [c for seed in range(seeds) for c in cells.further(seed)]
-            if not all(cell_file(self.output, c).exists() for c in found):
-                return []  # one of them failed
-            try:
-                widths = analysis.widths(read_rows(self.output, found), cells.more.methods)
-            except ValueError as error:
-                self.failed.append(f"further seeds in {cells.subject.name}: {error}")
-                return []
-            if max(widths.values()) < cells.more.width or seeds == cells.more.at_most:
-                return []
-            missing = [c for c in cells.further(seeds) if not cell_file(self.output, c).exists()]
-            if missing:
-                if not self._tried.isdisjoint(keys := {c.key for c in missing}):
-                    return []  # one of them failed
-                self._tried |= keys
-                total = self.progress.tasks[self._task].total
-                self.progress.update(self._task, total=total + len(missing))
-                return missing
-        return []
+        seeds = cells.fewest()
+        while seeds < cells.more.at_most and self._are_there(cells.further(seeds)):
+            seeds += 1
+        found = [c for seed in range(seeds) for c in cells.further(seed)]
+        if not self._are_there(found):
+            return []  # one of them failed
+        try:
+            widths = analysis.widths(read_rows(self.output, found), cells.more.methods)
+        except ValueError as error:
+            self.failed.append(f"further seeds in {cells.subject.name}: {error}")
+            return []
+        if max(widths.values()) < cells.more.width or seeds == cells.more.at_most:
+            return []
+        missing = [c for c in cells.further(seeds) if not cell_file(self.output, c).exists()]
+        if not self._tried.isdisjoint(keys := {c.key for c in missing}):
+            return []  # one of them failed
+        self._tried |= keys
+        total = self.progress.tasks[self._task].total
+        self.progress.update(self._task, total=total + len(missing))
+        return missing
+
+    def _are_there(self, cells: list[Cell]) -> bool:
+        return all(cell_file(self.output, cell).exists() for cell in cells)
 
 
 def _description(cell: Cell) -> str:
