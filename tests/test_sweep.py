@@ -320,7 +320,7 @@ def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers):
     monkeypatch.setattr(sweep, "software", lambda: {"mitsuba-bdpt": "other"})
     there = ["sweep.py", str(preset_file(folder)), "-o", str(folder / "out")]
     monkeypatch.setattr(sys, "argv", [*there, "--scheduler", workers.scheduler_address])
-    with pytest.raises(ValueError, match="a worker has other software"):
+    with pytest.raises(RuntimeError, match="failed on the cluster: a worker has other software"):
         sweep.main()
 
 
