@@ -75,7 +75,7 @@ def why(results: Results, scene: str) -> str:
     if decided is None:
         said = "No pilot: the render was too short for one, or there was nothing to choose."
     elif not decided["light_paths"]:
-        said = "A pilot chose camera subpaths alone."
+        said = "Camera subpaths alone."
     else:
         joined = {
             "none": "light tracing, no inner connections",

@@ -181,5 +181,5 @@ def test_reasons_in_words():
     assert "one light subpath per 4 camera subpaths, one inner connection drawn" in text
     assert "Left out: inner (1.5 times as long)." in text and "t=0" not in text
     alone = page.why(results(None, {"decisions": [decision | {"light_paths": 0.0}]}), "a")
-    assert alone == "A pilot chose camera subpaths alone."
+    assert alone == "Camera subpaths alone."
     assert "No pilot" in page.why(results(None, {"decisions": []}), "a")
