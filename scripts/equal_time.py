@@ -10,6 +10,7 @@ against the scene's reference in references/; windows are where they differ most
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import reference
-from metrics import TRIM, rel_mse, rel_mse_epsilon
+from metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from mitsuba_bdpt.__main__ import number, property_
 from mitsuba_bdpt.files import replacing
 from preset import benchmark_depth
@@ -102,23 +103,17 @@ def windows(found: list[Shot], shape) -> list[tuple[int, int, int]]:
     return chosen
 
 
-def displayed(image: np.ndarray, gain: float) -> np.ndarray:
-    """sRGB values in [0, 1]."""
-    x = np.clip(image * gain, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-
-
 def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
     """A column per image and one of the reference: image, windows, error map."""
     chosen = windows(found, target.shape[:2])
-    gain = 0.9 / max(float(np.quantile(target.max(axis=-1), 0.95)), 1e-9)
+    exposure = math.log2(0.9 / max(float(np.quantile(target.max(axis=-1), 0.95)), 1e-9))
     images = [(shot.image, shot.caption, shot.errors) for shot in found] + [(target, "reference", None)]
     columns = len(images)
     figure, axes = plt.subplots(
         3, columns, figsize=(2.9 * columns, 7.3), height_ratios=(2, 1, 2), layout="constrained"
     )
     for (image, caption, errors), (top, middle, bottom) in zip(images, axes.T, strict=True):
-        shown = displayed(image, gain)
+        shown = tone_map(image, exposure)
         top.imshow(shown, interpolation="nearest")
         top.set_title(caption, fontsize=9)
         for (left, up, side), colour in zip(chosen, COLOURS, strict=True):

@@ -73,9 +73,8 @@ class Checkpoints:
             with replacing(self.path) as temporary, temporary.open("wb") as file:
                 file.write(whole.to_bytes())
                 file.flush()
-                os.fsync(
-                    file.fileno()
-                )  # before the name: it must not stand for half a file after a power cut
+                # Before the name, which would stand for half a file after a power cut.
+                os.fsync(file.fileno())
         except OSError as error:
             print(f"warning: no checkpoint {str(self.path)!r}: {error}", file=sys.stderr)
         self._last = time.monotonic()

@@ -100,8 +100,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     """What a worker needs to know of each part, as JSON: the scene file by its absolute path, the options
     that `loading.load` reads, the pilot's decisions."""
     properties, settings = dict(options.properties), integrator.settings
-    by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
-    if settings.decisions is None and not by_hand:
+    if settings.decisions is None:  # an empty list where there is nothing to choose
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "until_error")
