@@ -49,7 +49,7 @@ from .emitter_kinds import (
 )
 from .emitter_tables import Placement, Projectors, SmoothMeshes, inverse_table, placement
 from .infinity import Disks
-from .objects import children, living_emitters, number
+from .objects import children, living_emitters, number, share_functions
 
 
 @dataclass
@@ -135,6 +135,7 @@ class Emitters:
         self.left_out = [text for e, k in zip(emitters, kinds, strict=True) for text in left_out(e, k)]
         if not kinds:
             return
+        share_functions([*emitters, *filter(None, (e.get_shape() for e in emitters))])
         self._pointers = scene.emitters_dr()
         sampling_weight = mi.Float([number(e.sampling_weight()) for e in emitters])
         self._kind, self._pmf = mi.UInt32(kinds), sampling_weight / dr.sum(sampling_weight)
