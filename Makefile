@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test lint gallery pictures docs package references benchmark slow sweep
+.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -62,6 +62,10 @@ sweep: $(INSTALLED)
 	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
 	$(VENV)/bin/python scripts/report.py results/small
 	$(VENV)/bin/python scripts/page.py results/small
+
+# What was tried to break it, under twenty minutes on two cores: docs/stress.md.
+stress: $(INSTALLED)
+	$(VENV)/bin/python scripts/stress.py
 
 # The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)

@@ -110,12 +110,13 @@ def lines(name: str, depth: int) -> list:
 
 
 def stability(name: str, depth: int, seeds: int) -> list:
-    """A row about what ``seeds`` renders choose."""
+    """A row about what ``seeds`` renders choose; where none asks a pilot, why."""
     scene = reference.load_scene(name, resolution=RESOLUTION)
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     judge = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
-    if not choice.is_open(judge.plan, settings):
-        raise ValueError(f"scene={name!r} leaves nothing to choose: light subpaths are impossible in it")
+    settled = not choice.is_open(judge.plan, settings)
+    if settled or choice.by_scene(judge.world, judge.plan, settings, SPP * RESOLUTION**2):
+        return [f"`{name}`", judge.why_no_pilot(), "–", "–"]
     possible = choice.candidates(judge.world, judge.plan, settings)
     table_of_judge = choice.choose(predicted(scene, settings), possible, True)
     times = {row.candidate: row.time for row in table_of_judge}

@@ -3,8 +3,8 @@
     python scripts/compare.py bdpt "path sampler=multijitter" --scenes open_sky veach_mis --spp 16 --pairs 12
     python scripts/compare.py "bdpt stored_vertices=3" bdpt --scenes cornell_box uplight_room
 
-At 128^2, the depth of the benchmark: medians over pairs of renders of different seeds, after one that compiles;
-of the efficiency the quartiles too. Errors are relMSE, trimmed of the worst 0.1 % and raw.
+At 128^2, the depth of the benchmark: medians over pairs of renders of different seeds, after one that
+compiles; of the efficiency the quartiles too. Errors are relMSE, trimmed of the worst 0.1 % and raw.
 """
 
 from __future__ import annotations

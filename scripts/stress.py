@@ -1,0 +1,124 @@
+"""Try to break the renderer, and write what happened into a table.
+
+    python scripts/stress.py             # all cases, under twenty minutes; writes docs/stress.json and docs/stress.md
+    python scripts/stress.py NAME ...    # some of them, printed
+    python scripts/stress.py --list      # names of all
+
+Each case runs in a process of its own, so that a crash or a hang is an outcome too. The table is written
+between the lines `<!-- stress -->` and `<!-- end -->` of docs/stress.md. Exit status 1 if a case did not go
+as expected.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+
+import reference
+from mitsuba_bdpt.files import replacing
+from report import table
+from stress_cases import cases
+from stress_cases.case import Case, Outcome
+
+import mitsuba as mi  # isort: skip
+
+RECORD = reference.ROOT / "docs" / "stress.json"
+PAGE = reference.ROOT / "docs" / "stress.md"
+
+# Seconds after which a case counts as hanging: several times what the longest takes on two busy cores.
+LIMIT = 600
+
+BEGIN, END = "<!-- stress -->\n", "<!-- end -->"
+
+
+def here(name: str) -> Outcome:
+    """The outcome of a case, run in this process."""
+    mi.set_variant("llvm_ad_rgb")
+    return next(case for case in cases() if case.name == name).run()
+
+
+def apart(name: str, limit: float = LIMIT) -> Outcome:
+    """The outcome of a case in a process of its own; a crash or a hang is not what is expected."""
+    command = [sys.executable, __file__, "--here", name]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=False)
+    except subprocess.TimeoutExpired:
+        return Outcome(False, f"does not end within {limit} s")
+    try:
+        return Outcome(**json.loads(done.stdout.splitlines()[-1]))
+    except (IndexError, ValueError, TypeError):
+        tail = done.stderr.strip().splitlines()[-1:] or ["nothing on stderr"]
+        return Outcome(False, f"ends with status {done.returncode}: {tail[0]}")
+
+
+def page(record: list[dict]) -> str:
+    """The tables of all sections, as Markdown."""
+    texts = []
+    for section in dict.fromkeys(row["section"] for row in record):
+        rows = [
+            [
+                row["tried"],
+                row["expected"],
+                ("" if row["ok"] else "**no**: ") + row["happened"],
+                f"`{row['name']}`",
+            ]
+            for row in record
+            if row["section"] == section
+        ]
+        texts.append(f"### {section}\n\n" + table(["tried", "expected", "what happened", "case"], rows))
+    return "\n\n".join(texts) + "\n\n"
+
+
+def write(record: list[dict]) -> None:
+    """The record as data, and as tables in the page."""
+    with replacing(RECORD) as temporary:
+        temporary.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    text = PAGE.read_text()
+    before, rest = text.split(BEGIN)
+    after = rest[rest.index(END) :]
+    with replacing(PAGE) as temporary:
+        temporary.write_text(before + BEGIN + "\n" + page(record) + after)
+
+
+def tried(case: Case) -> dict:
+    """Run a case, say so, and return its row."""
+    started = time.perf_counter()
+    outcome = apart(case.name)
+    seconds = round(time.perf_counter() - started, 1)
+    print(f"{'ok' if outcome.ok else 'NO':3} {case.name} ({seconds} s): {outcome.happened}", flush=True)
+    words = {name: getattr(case, name) for name in ("name", "section", "tried", "expected")}
+    return words | {"ok": outcome.ok, "happened": outcome.happened, "seconds": seconds}
+
+
+def main(arguments=None) -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    known = {case.name: case for case in cases()}
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="cases; default: all, and the page is written"
+    )
+    parser.add_argument("--list", action="store_true", help="print the names of all cases")
+    parser.add_argument("--here", metavar="NAME", help=argparse.SUPPRESS)
+    args = parser.parse_args(arguments)
+    if unknown := {*args.names, *filter(None, [args.here])} - set(known):
+        parser.error(f"no case is named {sorted(unknown)}; --list shows all")
+    if args.list:
+        print("\n".join(known))
+        return 0
+    if args.here:
+        outcome = here(args.here)
+        print(json.dumps({"ok": bool(outcome.ok), "happened": outcome.happened}))
+        return 0
+    record = [tried(known[name]) for name in args.names or known]
+    if not args.names:
+        write(record)
+    return 0 if all(row["ok"] for row in record) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

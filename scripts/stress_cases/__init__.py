@@ -1,0 +1,17 @@
+"""What was tried to break the method: cases by section, run by scripts/stress.py and tests/test_stress.py."""
+
+from importlib import import_module
+
+from .case import Case
+
+# Modules of this package, in the order of the table; each has a tuple ``CASES``.
+SECTIONS = ("place",)
+
+
+def cases() -> list[Case]:
+    """All of them, in the order of the table. Raises ``ValueError`` if two have the same name."""
+    found = [case for section in SECTIONS for case in import_module(f".{section}", __name__).CASES]
+    names = [case.name for case in found]
+    if twins := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"stress cases with the same name: {sorted(twins)}")
+    return found

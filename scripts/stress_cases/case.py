@@ -1,0 +1,30 @@
+"""What a case of the stress table is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """``ok``: whether that happened which the case expects; ``happened``: what did, with its figures, a few
+    words of Markdown for the table."""
+
+    ok: bool
+    happened: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """Something tried: its ``name`` (lower case, words with hyphens, unique), the heading ``section`` of the
+    table, what is ``tried`` and what is ``expected`` with the reason of every tolerance, in a few words of
+    Markdown; ``run`` does it, in a process of its own with the variant ``llvm_ad_rgb`` set. ``quick`` cases,
+    of a few seconds each, are tests too."""
+
+    name: str
+    section: str
+    tried: str
+    expected: str
+    run: Callable[[], Outcome]
+    quick: bool = False
