@@ -58,7 +58,6 @@ package: $(INSTALLED)
 
 # A small sweep of time against error, under ten minutes on two cores; goes on where it was stopped.
 sweep: $(INSTALLED)
-	-$(VENV)/bin/python scripts/reference.py cornell_box glass_caustics --resolution 64 --spp 128 --seconds 120
 	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
 	$(VENV)/bin/python scripts/report.py results/small
 	$(VENV)/bin/python scripts/page.py results/small

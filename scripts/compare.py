@@ -4,7 +4,9 @@
     python scripts/compare.py "bdpt stored_vertices=3" bdpt --scenes cornell_box uplight_room
 
 At 128^2, the depth of the benchmark: medians over pairs of renders of different seeds, after one that
-compiles; of the efficiency the quartiles too. Errors are relMSE, trimmed of the worst 0.1 % and raw.
+compiles; of the efficiency the quartiles too. Errors are relMSE, trimmed of the worst 0.1 % and raw; the
+last column is what the reference's own error adds to the trimmed one, of that side where it is more (ratios
+are off by as much).
 """
 
 from __future__ import annotations
@@ -24,7 +26,16 @@ from report import table
 
 import mitsuba as mi  # isort: skip
 
-HEADS = ("scene", "spp", "time", "error", "raw error", "efficiency (quartiles)", "raw efficiency")
+HEADS = (
+    "scene",
+    "spp",
+    "time",
+    "error",
+    "raw error",
+    "efficiency (quartiles)",
+    "raw efficiency",
+    "reference",
+)
 
 
 @dataclass(frozen=True)
@@ -44,15 +55,16 @@ class Side:
         made = integrator(" ".join(w for w in words if not w.startswith("sampler=")), benchmark_depth(name))
         return Side(made, reference.load_scene(name, resolution=RESOLUTION, sampler=sampler))
 
-    def measured(self, target, spp: int, seed: int) -> tuple[float, float, float]:
-        """Seconds and errors, trimmed and raw, of a render."""
+    def measured(self, target: reference.Reference, spp: int, seed: int) -> tuple[float, ...]:
+        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render."""
         image, seconds = timed(self.scene, self.made, spp, seed)
-        return seconds, rel_mse(image, target, TRIM), rel_mse(image, target)
+        trimmed = rel_mse(image, target.image, TRIM)
+        return seconds, trimmed, rel_mse(image, target.image), target.share_of(image, TRIM) / trimmed
 
 
 def line(name: str, sides: list[str], spp: int, pairs: int) -> list[str]:
     """A scene's line of the table."""
-    target = reference.load_reference(name, RESOLUTION, benchmark_depth(name)).image
+    target = reference.load_reference(name, RESOLUTION, benchmark_depth(name))
     made, found = [Side.of(words, name) for words in sides], []
     for seed in range(pairs + 1):
         pair = [None, None]
@@ -60,11 +72,19 @@ def line(name: str, sides: list[str], spp: int, pairs: int) -> list[str]:
             pair[i] = made[i].measured(target, spp, seed)
         found.append(pair)
     first, second = np.array(found[1:]).transpose(1, 2, 0)
-    time, error, raw = first / second
+    time, error, raw, _ = first / second
+    share = max(np.median(first[3]), np.median(second[3]))
     low, middle, high = np.quantile(1 / (time * error), (0.25, 0.5, 0.75))
     cells = [*np.median([time, error, raw], axis=1), np.median(1 / (time * raw))]
     text = [f"{x:.3g}" for x in cells]
-    return [f"`{name}`", str(spp), *text[:3], f"{middle:.3g} ({low:.3g}–{high:.3g})", text[3]]
+    return [
+        f"`{name}`",
+        str(spp),
+        *text[:3],
+        f"{middle:.3g} ({low:.3g}–{high:.3g})",
+        text[3],
+        f"{100 * share:.1f} %",
+    ]
 
 
 def main(arguments=None) -> int:

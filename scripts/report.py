@@ -290,8 +290,14 @@ def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
         return f"{why} (against their error all the same: {', '.join(found)})"
 
 
+# Pairs that are asked for near 1 until the interval of their median is so narrow.
+MANY, NARROW = 20, 0.04
+
+
 def _near(found: Spread) -> str:
-    return f"{found.median:.3f}x, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
+    wide = found.count >= MANY and found.high - found.low > NARROW
+    text = f"{found.median:.3f}x, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
+    return text + (f" (not narrower than {NARROW})" if wide else "")
 
 
 def _near_one(results: Results, scene: str) -> str:
@@ -327,7 +333,11 @@ def _against_none(results: Results) -> str:
             continue
     if not medians:
         raise Refused("no scene can be judged")
-    return f"{ratio(geometric_mean(medians))}, {len(medians)} of {len(results.scenes)} scenes"
+    others = len(results.scenes) - len(medians)
+    text = f"{ratio(geometric_mean(medians))}, {len(medians)} of {len(results.scenes)} scenes"
+    return text + (
+        f" ({ratio(geometric_mean(medians + [1] * others))} with 1x for the others)" if others else ""
+    )
 
 
 def _alone(results: Results, scene: str) -> str:

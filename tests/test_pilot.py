@@ -8,6 +8,7 @@ know.
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -167,13 +168,42 @@ def test_choice(make, light, monkeypatch):
 
 
 def test_few_pixels():
-    """Rationale: two samples of one pixel say nothing. Expected: for a film of 2 x 2 pixels the pilot has as
-    many samples as for any other."""
+    """Rationale: two samples of one pixel say nothing, and the splats of one pixel have a mean that counts.
+    Expected: for a film of 8 x 2 pixels a pilot has as many samples as for any other; renders ask none, have
+    a light subpath for each camera subpath, and say why."""
     target = caustic(2)
     render = of(target)
     seed = dr.opaque(mi.UInt32, 3)
     found = pilot.measure(render.world, render.plan, render.settings, seed, 2048)
     assert found.lanes == 2048 and (found.base[:, -1] > 0).all()
+    integrator = bdpt()
+    integrator.render(target, spp=1 << 15)
+    statistics = integrator.statistics
+    assert statistics["decisions"] == [] and statistics["rays"]["light"] > statistics["rays"]["camera"] / 2
+    assert "fewer than 64 pixels" in integrator.explain(target, spp=1 << 15)
+
+
+def test_rare_paths_count_by_how_often_they_are_made():
+    """Rationale: a small coefficient does not make a strategy rare. A path of size 1, of which light tracing
+    has a share of 1/160 and connections the rest. Expected: without connections its second moment is 160, at
+    any coefficient of light tracing; with a share of 1/10240 it counts as if it were made once in 1,024
+    times."""
+    sink = pilot.Pilot(of(sky()).world.camera.region, 16, pilot.RAREST)
+    for share, expected in ((1 / 160, 160), (1 / 10240, 1024)):
+        shares = mi.Vector4f(*({"light": share, "inner": 1 - share}.get(kind, 0) for kind in mis.CLASSES))
+        _, parts = sink._parts(mi.Float(1), SimpleNamespace(shares=shares, kind="inner"))
+        lit = [w for w in pilot.WEIGHTINGS if w.light]
+        found = [p[0] for w, p in zip(lit, parts["light"], strict=True) if not w.inner]
+        assert len(found) > 1 and found == pytest.approx([expected] * len(found), rel=1e-4)
+
+
+def test_open_ends_are_not_counted_on():
+    """Expected: a render whose samples are only a bound gets the pilot of 2^20, and rare paths count by
+    that."""
+    for parameters in ({"timeout": 5.0}, {"until_error": 0.1, "variance": True}):
+        assert choice.expected_samples(bdpt(**parameters).settings, 1 << 30) == 1 << 20
+        assert choice.expected_samples(bdpt(**parameters).settings, 1 << 18) == 1 << 18
+    assert choice.expected_samples(bdpt().settings, 1 << 30) == 1 << 30
 
 
 def test_narrow_spot_is_not_noisier_than_path():
@@ -211,17 +241,24 @@ def test_a_pilot_that_sees_nothing():
         assert integrator.statistics["decisions"] == []
 
 
-def test_pixels_of_a_pilot():
-    """Rationale: every 16th pixel of a wide film is in the same columns. Expected: the pixels of a batch
-    with a stride are one of each 16 in turn, and a tenth of them at least in each eighth of the width."""
+@pytest.mark.parametrize("chosen", [1024, 3000, 9000, 16384])
+def test_pixels_of_a_pilot(chosen):
+    """Rationale: every 16th pixel of a wide film is in the same columns, and a number that does not divide
+    that of the pixels must not leave out the last rows. Expected: the pixels of a batch that is spread over a
+    film are one of each equal part in turn, have random numbers of their own, and at least nine tenths of
+    their share in each eighth of the width and of the height (parts are narrower than those)."""
     target = sky(128)
     kernel = of(target).kernel
-    place = _Places(kernel, Batch(0, 1024, 0, 2, 16), 2)
-    slot = dr.arange(mi.UInt32, 2048)
+    place = _Places(kernel, Batch(0, chosen, 0, 2, 128 * 128), 2)
+    slot = dr.arange(mi.UInt32, 2 * chosen)
     pixel, sample = (np.array(x) for x in place._split(slot))
-    np.testing.assert_array_equal(pixel // 16, np.arange(2048) // 2)
-    np.testing.assert_array_equal(sample, np.arange(2048) % 2)
-    assert (np.bincount(pixel % 128 // 16, minlength=8) / 2048).min() > 0.1
+    part = 128 * 128 / chosen
+    number = np.arange(2 * chosen) // 2
+    assert (pixel >= np.floor(number * part)).all() and (pixel < np.ceil((number + 1) * part)).all()
+    np.testing.assert_array_equal(sample, np.arange(2 * chosen) % 2)
+    assert len(np.unique(np.array(place.index(slot)))) == 2 * chosen
+    for line in (pixel % 128, pixel // 128):
+        assert (np.bincount(line // 16, minlength=8) / (2 * chosen)).min() > 0.9 / 8
 
 
 def test_decisions_in_explain():
@@ -401,6 +438,14 @@ def test_asked_again_in_long_renders():
     np.testing.assert_allclose(np.array(again), image, rtol=1e-3, atol=1e-4)
 
 
+def test_replicates_have_one_decision():
+    """Rationale: images that are made in different ways do not say how far one of them is off. Expected: with
+    `variance` a long render asks one pilot, also when its first replicate has passes after 32 samples."""
+    integrator = bdpt(variance=True, spp_per_pass=8)
+    integrator.render(caustic(64), spp=512)
+    assert [d["pass"] for d in integrator.statistics["decisions"]] == [0]
+
+
 def test_changed_decisions_change_the_points():
     """Rationale: what follows must not depend on the numbers that were decided from.
 
@@ -413,6 +458,9 @@ def test_changed_decisions_change_the_points():
         render._adopt(made)
         changes.append(render._changes)
     assert changes == [0, 0, 1, 1, 2]
+    late = of(cornell())
+    late._adopt(replace(path, first_pass=2))  # after passes without a decision
+    assert late._changes == 1
     step = passes.Step(0, 0, 1, 64, False)
     batch = passes.batches(render.world.camera, 0, 1, render.settings)[0]
     seeds = {int(render._points(step, batch).seed[0])}
@@ -495,6 +543,16 @@ def test_outliers_of_all_do_not_count_and_of_one_do():
     values = np.ones((16, 44))
     values[5, :3] = 1000
     assert choice._robust_mean(values)[0] > 50 and choice._robust_mean(values)[9] == 1
+
+
+def test_losing_light_counts_beside_outliers():
+    """Rationale: infinite variance is light that a candidate cannot make. Expected: it stays infinite
+    although the group in which it was seen is left out as an outlier of all others."""
+    values = np.ones((16, 44))
+    values[3] = 1000
+    values[3, 7] = np.inf
+    found = choice._robust_mean(values)
+    assert np.isinf(found[7]) and found[8] == 1
 
 
 def test_outliers_of_the_draw_do_not_decide():

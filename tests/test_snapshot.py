@@ -8,6 +8,7 @@ import pytest
 from mitsuba_bdpt import choice
 from mitsuba_bdpt.passes import REPLICATES, _replicates
 from mitsuba_bdpt.snapshot import Snapshot
+from mitsuba_bdpt.spread import restored
 
 # Sums of a pass are made by atomic additions, whose order differs from run to run.
 ROUNDING = {"rtol": 2e-4, "atol": 1e-6}
@@ -143,10 +144,10 @@ def test_joined_variance_is_that_of_all_replicates():
     image = np.array(bdpt(skip="impossible", variance=True).assemble(a.joined(b), target))
     swapped = np.array(bdpt(skip="impossible", variance=True).assemble(b.joined(a), target))
     np.testing.assert_allclose(image, swapped, **ROUNDING)
-    means = [s.arrays["replicates.mean"] for s in (a, b)]
-    squares = [s.arrays["replicates.squares"] for s in (a, b)]
-    mean = (16 * means[0] + 32 * means[1]) / 48
-    total = sum(squares) + 16 * (means[0] - mean) ** 2 + 32 * (means[1] - mean) ** 2
+    halves = [half for s in (a, b) for half in restored(s.progress["replicates"], s.arrays)]
+    assert [(half.count, half.spp) for half in halves] == [(4, 8), (4, 8), (4, 16), (4, 16)]
+    mean = sum(half.spp * half.mean for half in halves) / 48
+    total = sum(half.squares + half.spp * (half.mean - mean) ** 2 for half in halves)
     np.testing.assert_allclose(image[..., 3:], total / (48 * 15), rtol=1e-3, atol=1e-9)
 
 

@@ -25,6 +25,9 @@ PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 17, 1 << 24
 
+# What a render is taken for whose number of samples is only a bound, see `expected_samples`.
+PROVISIONAL_SAMPLES = 1 << 20
+
 # kappa of s = 1 under an even sky, where s = 0 has hardly any noise of its own. Efficiency over path with
 # multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in `open_sky`, 1.02, 1.00, 0.95 in
 # `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`.
@@ -59,7 +62,8 @@ DIRECT_GAIN = 3.0
 # renders a plain scene should not notice that they were an option.
 LIGHT_GAIN = 1.15
 
-# Films of fewer pixels have a light subpath for each camera subpath.
+# Films of fewer pixels ask no pilot, which takes splats for as noisy as those of an image of many pixels, and
+# have a light subpath for each camera subpath, since those that share one are correlated.
 FEW_PIXELS = 64
 
 # Contributions below a share of the image's mean play roulette before their ray is traced: below this one,
@@ -225,6 +229,14 @@ class Choice:
         return self.cost * self.variance
 
 
+def expected_samples(settings: Settings, samples: int) -> int:
+    """Samples of a render of so many at most: under ``timeout`` and ``until_error`` nobody knows how many it
+    will be, and a pilot that takes half of them would be as bad as one that sees rare paths which they do not
+    meet."""
+    open_end = settings.until_error > 0 or 0 <= settings.timeout < math.inf
+    return min(samples, PROVISIONAL_SAMPLES) if open_end else samples
+
+
 def lanes(samples: int) -> int:
     """Samples of the pilot of a render of so many, 0 for none."""
     if samples < LEAST_SAMPLES:
@@ -283,11 +295,8 @@ def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
         example = Candidate(number, 1, kinds[0]).decided(0, 1, 0, 0)
         if lost_without_arrival(example.plan(full)) != lost:
             continue
-        # A coefficient beyond the count is of no use; where there are few pixels, the camera subpaths that a
-        # light subpath serves are correlated.
-        most = 1 / weighting.light if weighting.light else 1
-        few = world.camera.region.size.prod() < FEW_PIXELS
-        counts = [n for n in SERVED if n <= (1 if few else most)]
+        most = 1 / weighting.light if weighting.light else 1  # a coefficient beyond the count is of no use
+        counts = [n for n in SERVED if n <= most]
         found += [Candidate(number, served, kind) for served in counts for kind in kinds]
     return found
 
@@ -347,6 +356,7 @@ def _robust_mean(values):
     finite = np.isfinite(values).all(axis=0)
     if not finite.any():
         return values.mean(axis=0)
+    values = np.where(finite, values, np.inf)  # losing light in one group is losing light
     usual = values[:, finite] / np.maximum(np.median(values[:, finite], axis=0), LEAST_VARIANCE)
     order = np.argsort(usual.min(axis=1), kind="stable")
     return values[order[: len(order) * 3 // 4]].mean(axis=0)

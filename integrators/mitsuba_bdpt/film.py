@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .spread import Spread, restored, stored
 from .strategies import layer_names, strategies, strategy_count, strategy_index
 
 # The blocks of sums, as `Snapshot.arrays` calls them.
@@ -75,41 +76,42 @@ class Block:
 
 
 class Replicates:
-    """Mean and squared deviations of independent images of the scene, weighted by their samples.
-
-    With n_b samples per pixel in image x_b, N in all, and B images, the variance of the weighted mean
-    is estimated by sum_b n_b (x_b - mean)^2 / (N (B - 1)).
-    """
+    """Independent images of the scene, in turn in one of two `Spread`: what one half of them says about the
+    error can be put beside what the other says about the image."""
 
     def __init__(self):
-        self.count, self.mean, self._squares = 0, None, None
-        self.spp, self._sums = 0, None
+        self.halves, self._sums = (Spread(), Spread()), None
+
+    @property
+    def count(self) -> int:
+        """How many images."""
+        return sum(half.count for half in self.halves)
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel of all of them."""
+        return sum(half.spp for half in self.halves)
 
     def add(self, sums, spp: int, develop):
         """Add an image: ``sums`` and ``spp`` are those of all images so far, ``develop(camera, light,
         spp)`` makes an image of the difference."""
-        n = spp - self.spp
         new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
-        x = develop(*new, n)
-        before = np.zeros_like(x) if self.mean is None else self.mean
-        self._squares = np.zeros_like(x) if self._squares is None else self._squares
-        mean = before + (x - before) * (n / spp)
-        self._squares = self._squares + n * (x - before) * (x - mean)
-        self.count, self.mean, self.spp, self._sums = self.count + 1, mean, spp, sums
+        n, halves = spp - self.spp, list(self.halves)
+        which = self.count % 2
+        halves[which] = halves[which].joined(Spread.of(develop(*new, n), n))
+        self.halves, self._sums = tuple(halves), sums
 
     def store(self) -> tuple[dict, dict]:
         """Arrays of a `Snapshot`, and the numbers that `restore` needs beside them."""
-        arrays = {}
+        arrays, progress = stored(self.halves)
         if self.count:
-            arrays = {"replicates.mean": self.mean, "replicates.squares": self._squares}
             arrays |= {f"replicates.last.{i}": sums for i, sums in enumerate(self._sums)}
-        return arrays, {"count": self.count, "spp": self.spp}
+        return arrays, progress
 
     def restore(self, progress: dict, arrays: dict):
         """Go on from what `store` gave."""
-        self.count, self.spp = progress["count"], progress["spp"]
+        self.halves = restored(progress, arrays)
         if self.count:
-            self.mean, self._squares = arrays["replicates.mean"], arrays["replicates.squares"]
             self._sums = [arrays[n] for n in sorted(arrays) if n.startswith("replicates.last.")]
 
     def variance(self, spp: int, shape=()):
@@ -117,7 +119,31 @@ class Replicates:
         finished included); infinite, in the given shape, with fewer than two replicates."""
         if self.count < 2:
             return np.full(shape, np.inf)
-        return self._squares / (spp * (self.count - 1))
+        first, second = self.halves
+        both = first.joined(second)
+        return both.variance() * (both.spp / spp)
+
+    def error(self, spp: int, unit) -> float:
+        """Estimated relMSE of the mean of ``spp`` samples per pixel, colours in multiples of ``unit``;
+        infinite with fewer than two replicates in a half.
+
+        The variance that one half shows is divided by r^2 + 0.01 mean(image)^2 with r from the other half:
+        beside a mean that has the same firefly no value could count for more than 1. The noise of r alone
+        would add 1 + V (3 r^2 - e) / (r^2 + e)^2 in the mean (second order), with V the variance of r
+        and e = 0.01 mean(image)^2; it is divided by that.
+        """
+        first, second = self.halves
+        if min(first.count, second.count) < 2:
+            return inf
+        epsilon = 0.01 * (first.joined(second).mean / unit).mean() ** 2 + 1e-300
+        found = 0.0
+        for own, other in ((first, second), (second, first)):
+            variance = own.variance() / unit**2 * (own.spp / spp)
+            square, noise = (other.mean / unit) ** 2, other.variance() / unit**2
+            below = square + epsilon
+            surplus = 1 + noise * np.maximum(3 * square - epsilon, 0) / below**2
+            found += float((variance / (below * surplus)).mean()) / 2
+        return found
 
 
 class Accumulator:
@@ -222,14 +248,8 @@ class Accumulator:
         self.replicates.add([np.array(s) for s in sums[:2]], sum(passes), self._image)
 
     def error(self) -> float:
-        """Estimated relMSE of the image, variance / (mean^2 + 0.01 mean(image)^2) averaged over pixels
-        and colours, each in its unit; infinite with fewer than two replicates."""
-        if self.replicates.mean is None:
-            return inf
-        unit = np.array(self.colour.unit)
-        mean = self.replicates.mean / unit
-        variance = self.replicates.variance(sum(self.passes)) / unit**2
-        return float((variance / (mean**2 + 0.01 * mean.mean() ** 2 + 1e-300)).mean())
+        """Estimated relMSE of the image, see `Replicates.error`."""
+        return self.replicates.error(sum(self.passes), np.array(self.colour.unit))
 
     def _image(self, camera, light, spp: int):
         """Image (height, width, colours) of sums over ``spp`` samples per pixel."""

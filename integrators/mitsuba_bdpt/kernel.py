@@ -65,14 +65,14 @@ class Shared:
 @dataclass(frozen=True)
 class Batch:
     """The samples of one pass: pixels ``first_pixel`` and on, ``pixels`` of them (row by row in
-    the film region, one by chance of each ``stride``), samples ``first_sample`` and on, ``samples`` of
-    each pixel."""
+    the film region), samples ``first_sample`` and on, ``samples`` of each pixel. With ``spread`` the pixels
+    are not neighbours, but one by chance in each of equal parts of the first so many."""
 
     first_pixel: int
     pixels: int
     first_sample: int
     samples: int
-    stride: int = 1
+    spread: int = 0
 
 
 class Kernel:
@@ -181,7 +181,9 @@ class _Places:
     def __init__(self, kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
-        self._stride = dr.opaque(mi.UInt32, batch.stride) if batch.stride > 1 else None
+        spread = batch.spread > batch.pixels
+        self._spread = dr.opaque(mi.UInt64, batch.spread) if spread else None
+        self._pixels = dr.opaque(mi.UInt64, batch.pixels)
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
         self._spp = dr.opaque(mi.UInt64, spp)
@@ -189,11 +191,14 @@ class _Places:
     def _split(self, slot):
         pixel = slot // self._samples
         sample = slot - pixel * self._samples + self._first_sample
-        if self._stride is not None:  # not the same one of each: strides that divide the width miss columns
-            pixel = pixel * self._stride + sobol.mix(pixel + 1) % self._stride
+        if self._spread is not None:  # by chance: one in so many would miss columns of films that wide
+            within = mi.UInt64(sobol.mix(pixel + 1)) % self._spread
+            pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // self._pixels)
         return pixel + self._first_pixel, sample
 
     def index(self, slot):
+        if self._spread is not None:  # two parts may meet in a pixel
+            return mi.UInt64(slot)
         pixel, sample = self._split(slot)
         return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)
 

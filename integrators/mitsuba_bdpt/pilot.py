@@ -248,9 +248,10 @@ class Pilot:
             total = _dot(w, shares, 1)
             # With inner connections every class is in use; what cannot make the path is ruled out.
             possible = mi.Bool(True) if w.inner else total > 0
-            bounded = dr.maximum(total, self._least)
-            scale = size / bounded
-            square = dr.square(scale) * (bounded / total)
+            # How often it makes the path when the pilot does once: see `RAREST`.
+            seldom = dr.maximum(1, self._least / _dot(w, shares, 0))
+            scale = size / (total * seldom)
+            square = dr.square(scale) * seldom
             moment = dr.select(possible, square * _dot(w, shares | {"light": 0}, 2), lost)
             if w.of(c.kind):
                 estimate = scale if w.of(c.kind) == 1 else w.of(c.kind) * scale
@@ -297,8 +298,7 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
     pixels = int(region.size.prod())
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
-    stride = pixels // chosen
-    batch = Batch(0, chosen, 0, samples, stride)
+    batch = Batch(0, chosen, 0, samples, spread=pixels)
     pilot = Pilot(region, chosen * samples, max(stands_for, RAREST))
     # Independent numbers: the squared mean follows from products of samples.
     counts = trace(kernel, pilot, batch, Points("independent", seed), samples)
@@ -330,8 +330,8 @@ def _sums(total: list, more: list) -> list:
 
 
 def _dot(w: Weighting, shares, power: int):
-    """sum_i kappa_i^power share_i."""
-    terms = [(w.of(kind) ** power, share) for kind, share in shares.items()]
+    """sum_i kappa_i^power share_i over the classes in use."""
+    terms = [(w.of(kind) and w.of(kind) ** power, share) for kind, share in shares.items()]
     used = [
         share if factor == 1 else factor * share
         for factor, share in terms

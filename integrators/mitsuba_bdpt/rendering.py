@@ -102,11 +102,14 @@ class Render:
         if not choice.is_open(self._full, self.settings):
             return []
         pixels, done = int(self.world.camera.region.size.prod()), sum(self.accumulator.passes)
-        if decision := choice.by_scene(self.world, self._full, self.settings, self.spp * pixels):
+        if pixels < choice.FEW_PIXELS:
+            self._use(replace(self.plan, served=1))
+            return []
+        if decision := choice.by_scene(self.world, self._full, self.settings, self._samples()):
             if not done:
                 self._adopt(decision, choice.BY_SCENE)
             return []
-        samples = (self.spp - done) * pixels
+        samples = choice.expected_samples(self.settings, (self.spp - done) * pixels)
         count = choice.lanes(samples)
         if not count:
             return []
@@ -132,14 +135,20 @@ class Render:
 
     def why_no_pilot(self) -> str:
         """Why none is asked at first, as a sentence."""
-        samples = self.spp * int(self.world.camera.region.size.prod())
+        samples = self._samples()
         if not choice.is_open(self._full, self.settings):
             return "no pilot: there is nothing to choose, by the scene or by hand"
+        if self.world.camera.region.size.prod() < choice.FEW_PIXELS:
+            return f"no pilot: it says nothing about films of fewer than {choice.FEW_PIXELS} pixels"
         if choice.by_scene(self.world, self._full, self.settings, samples):
             return "no pilot: the scene alone decides in a render as short as this"
         if not choice.lanes(samples):
             return f"no pilot: {samples} samples are too few, it takes {choice.LEAST_SAMPLES} (2^17)"
         return "no pilot: it saw nothing, or no finite value"
+
+    def _samples(self) -> int:
+        """Of the whole render, as far as that is known."""
+        return choice.expected_samples(self.settings, self.spp * int(self.world.camera.region.size.prod()))
 
     def _has_stratified_points(self) -> bool:
         if self.settings.points == "sampler":
@@ -150,7 +159,9 @@ class Render:
         """Render as decided from now on; if that differs from before, with points of their own: lanes serve
         other samples, and what was half done of the old sequence would not be finished."""
         adopted = replace(decision.plan(self._full), skipped=(*self._full.skipped, *left_out))
-        if self.decisions and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
+        if (self.decisions or decision.first_pass) and replace(adopted, skipped=()) != replace(
+            self.plan, skipped=()
+        ):
             self._changes += 1
         self.decisions.append(decision)
         self._left_out = list(left_out)
@@ -174,7 +185,7 @@ class Render:
         number = len(self.accumulator.passes)
         if self.settings.decisions:
             self.replay(number)
-        elif number and step.done >= self._next_pilot and not step.replicate:
+        elif number and step.done >= self._next_pilot and not self.settings.variance:
             while self._next_pilot <= step.done:
                 self._next_pilot *= 4
             # A scene's sampler cannot start again in the middle of its samples.
@@ -296,7 +307,9 @@ class Render:
             if entry["type"] == dr.KernelType.JIT:
                 self.cached += bool(entry["cache_hit"])
                 self.compiled += not entry["cache_hit"]
-                self.compile_seconds += (entry["codegen_time"] + entry["backend_time"]) / 1000
+                # What is in the cache is still assembled, which is not compiling.
+                new = not entry["cache_hit"]
+                self.compile_seconds += new * (entry["codegen_time"] + entry["backend_time"]) / 1000
 
     def report(self) -> PassReport:
         """Progress so far, for ``on_pass``."""

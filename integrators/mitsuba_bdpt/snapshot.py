@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .spread import restored, stored
+
 # What is added up where snapshots are joined, and what is kept as the first one has it.
 _SUMMED = ("counts", "compiled", "cached", "seconds", "compile_seconds", "pilot_seconds")
 
@@ -112,20 +114,11 @@ def _added(a, b):
 
 
 def _joined_replicates(a: Snapshot, b: Snapshot, arrays: dict):
-    """Replicates of both, whose mean and squares go to ``arrays``: squares about the common mean (T. Chan,
-    G. Golub, R. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances", 1979,
-    eq. 2.1)."""
+    """Replicates of both, whose means and squares go to ``arrays``."""
     first, second = a.progress["replicates"], b.progress["replicates"]
     if first is None:
         return None
-    parts = [(s, r) for s, r in ((a, first), (b, second)) if r["count"]]
-    if not parts:
-        return first
-    spp = sum(r["spp"] for _, r in parts)
-    mean = sum(r["spp"] / spp * s.arrays["replicates.mean"] for s, r in parts)
-    arrays["replicates.mean"] = mean
-    arrays["replicates.squares"] = sum(
-        s.arrays["replicates.squares"] + r["spp"] * (s.arrays["replicates.mean"] - mean) ** 2
-        for s, r in parts
-    )
-    return {"count": sum(r["count"] for _, r in parts), "spp": spp}
+    halves = zip(restored(first, a.arrays), restored(second, b.arrays), strict=True)
+    found, progress = stored([mine.joined(other) for mine, other in halves])
+    arrays |= found
+    return progress

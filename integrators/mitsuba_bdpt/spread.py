@@ -1,0 +1,62 @@
+"""How far independent images of one scene lie apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Mean and squared deviations of ``count`` independent images, weighted by their samples.
+
+    With n_b samples per pixel in image x_b, N = ``spp`` in all, and B images, ``squares`` are
+    sum_b n_b (x_b - mean)^2, and the variance of the weighted mean is estimated by squares / (N (B - 1)).
+    That is exact for images of one size; of several, if variance falls as 1 / n (where points let it fall as
+    n^-1.2, and each eight images have as many samples as all before, it is 14 % too large).
+    """
+
+    count: int = 0
+    spp: int = 0
+    mean: np.ndarray | None = None
+    squares: np.ndarray | None = None
+
+    @staticmethod
+    def of(image: np.ndarray, spp: int) -> Spread:
+        """A single image."""
+        return Spread(1, spp, image, np.zeros_like(image))
+
+    def joined(self, other: Spread) -> Spread:
+        """Both: squares about the common mean (T. Chan, G. Golub, R. LeVeque, "Updating formulae and a
+        pairwise algorithm for computing sample variances", 1979, eq. 2.1)."""
+        if not (self.count and other.count):
+            return self if self.count else other
+        spp, apart = self.spp + other.spp, other.mean - self.mean
+        return Spread(
+            self.count + other.count,
+            spp,
+            self.mean + apart * (other.spp / spp),
+            self.squares + other.squares + apart**2 * (self.spp * other.spp / spp),
+        )
+
+    def variance(self) -> np.ndarray:
+        """Of the mean; there must be two images."""
+        return self.squares / (self.spp * (self.count - 1))
+
+
+def stored(halves) -> tuple[dict, dict]:
+    """Several `Spread` as arrays and plain numbers of a snapshot."""
+    arrays = {}
+    for i, half in enumerate(halves):
+        if half.count:
+            arrays |= {f"replicates.{i}.mean": half.mean, f"replicates.{i}.squares": half.squares}
+    return arrays, {"halves": [[half.count, half.spp] for half in halves]}
+
+
+def restored(progress: dict, arrays: dict) -> tuple[Spread, ...]:
+    """What was `stored`."""
+    return tuple(
+        Spread(count, spp, arrays.get(f"replicates.{i}.mean"), arrays.get(f"replicates.{i}.squares"))
+        for i, (count, spp) in enumerate(progress["halves"])
+    )
