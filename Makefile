@@ -12,8 +12,9 @@ SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
 
+# Two processes, since much of a test is compiling kernels, on one core.
 test: $(INSTALLED)
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
 slow: $(INSTALLED)
 	$(VENV)/bin/python -m pytest -m slow

@@ -46,6 +46,7 @@ from metrics import (
 
 import mitsuba as mi  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
+from mitsuba_bdpt.files import replacing  # isort: skip
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = ROOT / "references"
@@ -270,7 +271,7 @@ class Halves:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         kept = {"sums": self.sums, "counts": self.counts, "columns": np.array(self.columns)}
         kept |= {"earlier": json.dumps(_kept(self.earlier))} if self.earlier else {}
-        with render.replacing(self.path) as temporary, temporary.open("wb") as file:
+        with replacing(self.path) as temporary, temporary.open("wb") as file:
             np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
 
     def mean(self):
@@ -461,7 +462,7 @@ def write(path: Path, reference: Reference):
 
 
 def write_exr(path: Path, layers: dict, header: dict, dtype=np.float16):
-    """An EXR of layers {prefix: (height, width, 3)}, written by `render.replacing`."""
+    """An EXR of layers {prefix: (height, width, 3)}, written by `replacing`."""
     channels = {
         f"{layer}{c}": np.ascontiguousarray(pixels[..., i]).astype(dtype)
         for layer, pixels in layers.items()
@@ -469,7 +470,7 @@ def write_exr(path: Path, layers: dict, header: dict, dtype=np.float16):
     }
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
     path.parent.mkdir(parents=True, exist_ok=True)
-    with render.replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+    with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
         file.write(str(temporary))
 
 

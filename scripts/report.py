@@ -41,7 +41,7 @@ from analysis import (
     spread,
 )
 from metrics import rel_mse_epsilon
-from mitsuba_bdpt import render
+from mitsuba_bdpt.files import replacing
 
 
 def load(folder: Path) -> tuple[Results, dict]:
@@ -442,8 +442,8 @@ def replace_part(text: str, name: str, part: str) -> str:
 
 
 def write_text(path: Path, text: str):
-    """Written by `render.replacing`."""
-    with render.replacing(path) as temporary:
+    """Written by `replacing`."""
+    with replacing(path) as temporary:
         temporary.write_text(text)
 
 

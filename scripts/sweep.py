@@ -47,6 +47,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 from mitsuba_bdpt import cluster, render  # isort: skip
+from mitsuba_bdpt.files import replacing  # isort: skip
 
 CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up
@@ -354,7 +355,7 @@ def errors(image, ref: reference.Reference, ref_sha256: str, flip: bool) -> dict
 def write_json(path: Path, value) -> None:
     """Write at once: a process that is killed leaves the whole file or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with render.replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1) + "\n")
 
 
@@ -541,14 +542,14 @@ def write_tables(table: list[dict], output: Path) -> None:
 
     columns = list(dict.fromkeys(key for row in table for key in row))
     table = [{key: row.get(key) for key in columns} for row in table]
-    with render.replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
+    with replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(table)
     arrays = pa.Table.from_pylist(table)
     place = columns.index("tile_means")
     means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits were written
-    with render.replacing(output / "rows.parquet") as temporary:
+    with replacing(output / "rows.parquet") as temporary:
         pyarrow.parquet.write_table(
             arrays.set_column(place, "tile_means", means), temporary, compression="zstd"
         )

@@ -28,7 +28,7 @@ ORDER = (
     ("emitter_kinds",),
     ("bsdf", "rays", "mis", "sobol"),
     ("objects",),
-    ("llvm", "files", "_version"),
+    ("llvm", "files", "spread", "_version"),
 )
 
 
