@@ -53,7 +53,11 @@ class NotJudged(Refused):
 
 
 class Biased(Refused):
-    """An efficiency over an integrator that fails the bias check; the text says what it lacks."""
+    """An efficiency over integrators that fail the bias check; ``lacks``: what each of them does, by name."""
+
+    def __init__(self, lacks: dict[str, str]):
+        super().__init__("; ".join(f"{name}: {what}" for name, what in lacks.items()))
+        self.lacks = lacks
 
 
 @dataclass(frozen=True)
@@ -227,21 +231,24 @@ class Results:
         except Refused:
             check = None
         if check is not None and not check.passed:
-            raise Biased(missing(check))
+            raise Biased({rival: missing(check)})
         return self.efficiency(scene, rival, error, budget)
 
     def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Spread:
         """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
         that pass the bias check; raises `Biased` if neither does."""
-        found, biased = [], []
+        found, biased = [], {}
         for rival in RIVALS:
             try:
                 found.append(self.fair_efficiency(scene, rival, error, budget))
             except Biased as why:
-                biased.append(f"{rival}: {why}")
+                biased |= why.lacks
         if not found:
-            raise Biased("; ".join(biased))
+            raise Biased(biased)
         return min(found, key=lambda ratio: ratio.median)
+
+
+NOTHING = "all energy is missing"
 
 
 def missing(check: BiasCheck) -> str:
@@ -249,7 +256,7 @@ def missing(check: BiasCheck) -> str:
     share = check.missing
     low, high = sorted((abs(100 * share.low), abs(100 * share.high)))
     if low > 99.95:
-        return "all energy is missing"
+        return NOTHING
     if share.low <= 0 <= share.high:
         where = (
             "the whole image"

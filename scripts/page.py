@@ -21,7 +21,7 @@ import figures
 import numpy as np
 import reference
 import report
-from analysis import RIVALS, Biased, Refused, Results
+from analysis import NOTHING, RIVALS, Biased, Refused, Results
 from mitsuba_bdpt.files import replacing
 
 FRAME = Path(__file__).with_suffix(".html")
@@ -54,7 +54,8 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
     try:
         found = results.against_path(scene)
     except Biased as why:
-        return math.inf, f"path does not render this scene: {why}."
+        lost = all(what == NOTHING for what in why.lacks.values())
+        return (math.inf if lost else math.nan), f"path fails the bias check here: {why}."
     except Refused as why:
         return math.nan, f"No figure: {why}."
     if found.median >= 1:

@@ -129,7 +129,7 @@ def gallery(results: Results) -> str:
         try:
             figure = ranged(results.against_path(scene))
         except Biased as why:
-            figure = f"`path`: {str(why).split('; ')[-1].split(': ')[-1]}"
+            figure = f"`path`: {list(why.lacks.values())[-1]}"
         except NotJudged:
             figure = "not judged"
         except Refused as why:
@@ -192,7 +192,7 @@ def _chosen(row) -> str:
 
 def _pilot_share(row) -> float:
     """Share of a render that its pilots and decisions took."""
-    return json.loads(row["statistics"])["seconds"]["pilot"] / row["seconds"]
+    return json.loads(row["statistics"]).get("seconds", {}).get("pilot", 0) / row["seconds"]
 
 
 def _rays_per_sample(rows) -> str:
@@ -214,7 +214,10 @@ def choices_table(results: Results) -> str:
     for scene in results.scenes:
         rows = results.of(scene, results.methods[0], results.deciding)
         chosen = Counter(_chosen(row) for row in rows).most_common()
-        skipped = json.loads(rows[0]["statistics"])["skipped"]
+        if not rows:
+            lines.append([f"`{scene}`", "not rendered", *["–"] * (len(head) - 2)])
+            continue
+        skipped = json.loads(rows[0]["statistics"]).get("skipped", [])
         left_out = [s for s in skipped if s["level"] == "not worth its cost here"]
         lines.append(
             [

@@ -531,7 +531,7 @@ def beside(table: list[dict], preset: Preset, output: Path) -> list[dict]:
     file, done = output / "rows.parquet", {row["scene"] for row in table}
     others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
     order = [subject.name for subject in preset.subjects]
-    found = table + [row for row in others if row["scene"] not in done]
+    found = table + [row for row in others if row["scene"] in order and row["scene"] not in done]
     return sorted(found, key=lambda row: order.index(row["scene"]))
 
 

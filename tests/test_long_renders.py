@@ -198,3 +198,14 @@ def test_defaults_of_the_command_line():
     options = build_parser().parse_args(["render", "a.xml"])
     assert options.checkpoint is options.until_error is options.scheduler is options.parts is None
     assert not options.resume
+
+
+def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):
+    """Expected: with the parameters instead of --until-error the checkpoint goes as well when the error is
+    reached, and the closing line says so when it is not."""
+    asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "variance=true", "-o", "a.exr"]
+    assert main([*asked, "--spp", "1024", "-P", "until_error=0.5"]) == 0
+    assert not Path("a.checkpoint.npz").exists() and "asked for" not in capsys.readouterr().out
+    assert image("a.exr")[1]["spp"] < 1024
+    assert main([*asked, "--spp", "32", "-P", "until_error=1e-6"]) == 0
+    assert "not the 1e-06 asked for" in capsys.readouterr().out

@@ -70,6 +70,20 @@ def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
         assert resumed.statistics["error"] == pytest.approx(whole.statistics["error"], rel=1e-3)
 
 
+def test_few_pixels_go_on():
+    """Rationale: a film of few pixels has a light subpath for each camera subpath, which no decision says.
+    Expected: it has them too when it goes on, and when its decisions (none) are replayed."""
+    target, whole = scene(size=4), bdpt(spp_per_pass=16)
+    expected = np.array(whole.render(target, seed=1, spp=256))
+    start = stopped(bdpt(spp_per_pass=16), target, 3, seed=1, spp=256)
+    assert 0 < start.spp < 256 and whole.statistics["decisions"] == []
+    for parameters, begun in (({}, {"start": start}), ({"decisions": "[]"}, {})):
+        again = bdpt(spp_per_pass=16, **parameters)
+        image = np.array(again.render(target, seed=1, spp=256, **begun))
+        np.testing.assert_allclose(image, expected, **ROUNDING)
+        assert again.statistics["rays"] == whole.statistics["rays"]
+
+
 @pytest.mark.parametrize("blind", [False, True])
 def test_pilots_and_decisions_go_on(monkeypatch, blind):
     """Rationale: later pilots are joined with earlier ones, and a changed decision starts a new point

@@ -415,7 +415,7 @@ def test_no_reference_no_renders(folder, monkeypatch):
 
 def test_files_are_replaced_at_once(folder, monkeypatch):
     """Expected: if a process ends before the last step, the old file is still whole and nothing is left
-    beside it but a hidden one.
+    beside it.
     """
     file = folder / "kept.json"
     sweep.write_json(file, [1, 2])
@@ -429,6 +429,7 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
     for write in (lambda: sweep.write_json(file, [3]), lambda: before.add([np.zeros((4, 4, 3))] * 2)):
         with pytest.raises(SystemExit):
             write()
+    assert not list(folder.glob(".*"))
     assert json.loads(file.read_text()) == [1, 2]
     assert reference.Halves(folder / "sums.npz", "key").rounds == 1
 

@@ -61,6 +61,11 @@ def test_the_estimated_error_sees_fireflies():
     assert error == pytest.approx((999 / 8) ** 2 / (1 + epsilon) / 100, rel=0.02)
 
 
+def test_the_estimated_error_of_a_black_image():
+    """Expected: 0, so that `until_error` stops, not 0 / 0."""
+    assert replicates(np.zeros((8, 4)), 4).error(32, 1.0) == 0
+
+
 @pytest.mark.parametrize(("shape", "most"), [(4.0, 1.03), (0.5, 2.0)])
 def test_the_estimated_error_is_that_of_skewed_images(shape, most):
     """Expected: for images whose pixels have a gamma distribution (mean 1, variance 1 / (2 ``shape``) of

@@ -60,9 +60,9 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("-o", "--output", type=Path, help=text)
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
     add("--spp", type=number(int, 1), help="samples per pixel; default: the scene's")
-    text = "stop after the pass in which this time is over; without --spp, only the time limits"
+    text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
-    text = "stop at this estimated relMSE; without --spp, only it limits; adds the layers of the variance"
+    text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
     add("--until-error", type=number(float, 1e-12), metavar="X", help=text)
     text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)

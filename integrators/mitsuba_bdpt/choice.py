@@ -244,6 +244,13 @@ def lanes(samples: int) -> int:
     return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
 
 
+def begun(full: Plan, settings: Settings, pixels: int) -> Plan:
+    """``full`` with a light subpath for each camera subpath on films of few pixels, if nothing is given by
+    hand."""
+    auto = settings.skip == "auto" and settings.light_paths == settings.connections == "auto"
+    return replace(full, served=1) if auto and pixels < FEW_PIXELS else full
+
+
 def is_open(full: Plan, settings: Settings) -> bool:
     """Whether there is something to choose: nothing is given by hand, and light subpaths are possible.
     (Strategy images want all strategies.)"""

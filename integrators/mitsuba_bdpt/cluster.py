@@ -21,7 +21,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from .loading import load
-from .rendering import PassReport
+from .rendering import RAYS, PassReport
 from .snapshot import Snapshot
 
 # Parts for each worker: the last one that is waited for then takes a quarter of what a worker does in all.
@@ -89,7 +89,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
             merged.add(index, Snapshot.from_bytes(data))
             done = merged.snapshot
             if done is not None:
-                rays = sum(done.progress["counts"].values())
+                rays = sum(done.progress["counts"][name] for name in RAYS)
                 seconds = time.perf_counter() - started
                 on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
     integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)

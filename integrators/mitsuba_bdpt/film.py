@@ -135,7 +135,7 @@ class Replicates:
         first, second = self.halves
         if min(first.count, second.count) < 2:
             return inf
-        epsilon = 0.01 * (first.joined(second).mean / unit).mean() ** 2 + 1e-300
+        epsilon = 0.01 * (first.joined(second).mean / unit).mean() ** 2 + 1e-150  # whose square is not 0 yet
         found = 0.0
         for own, other in ((first, second), (second, first)):
             variance = own.variance() / unit**2 * (own.spp / spp)

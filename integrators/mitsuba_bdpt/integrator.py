@@ -293,7 +293,7 @@ def _log(statistics: dict):
     if statistics.get("error") == math.inf:
         mi.Log(
             mi.LogLevel.Warn,
-            "bdpt: the render ended before two of the parts that the variance follows from were whole; ask "
+            "bdpt: the render ended before four of the parts that the error follows from were whole; ask "
             "for no more samples per pixel than timeout allows",
         )
     if statistics["non_finite"]:

@@ -51,15 +51,13 @@ def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) 
 @dataclass(frozen=True)
 class Step:
     """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate, whose last it
-    may be; ``replicate`` counts the independent images that `variance` needs, else 0. ``judged``: after it
-    ``until_error`` is looked at."""
+    may be; ``replicate`` counts the independent images that `variance` needs, else 0."""
 
     replicate: int
     done: int
     size: int
     of: int
     last: bool
-    judged: bool = False
 
 
 def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[Step]:
@@ -69,10 +67,9 @@ def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) ->
         parts = _replicates(spp, bool(settings.until_error))
     steps = []
     for replicate, part in enumerate(parts):
-        done, closes = 0, replicate % REPLICATES == REPLICATES - 1
+        done = 0
         for size in pass_sizes(camera, part, settings, small_first and replicate == 0):
-            last = done + size == part
-            steps.append(Step(replicate, done, size, part, last, last and closes))
+            steps.append(Step(replicate, done, size, part, done + size == part))
             done += size
     return steps
 

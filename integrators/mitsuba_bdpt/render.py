@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import re
 import sys
 import time
@@ -68,7 +69,7 @@ def run(options: Namespace) -> int:
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         print(f"error: {message(error)}", file=sys.stderr)
         return 1
-    print(summary(output, outcome, sensor.film().crop_size(), options.until_error))
+    print(summary(output, outcome, sensor.film().crop_size(), asked_error(integrator)))
     return INTERRUPTED if outcome.interrupted else 0
 
 
@@ -168,13 +169,18 @@ def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -
         # Mitsuba's own integrators leave nothing behind.
         spp = 0
     if kept is not None:
-        kept.end(finished=not interrupted and (spp == asked or reached(options, statistics)))
+        kept.end(finished=not interrupted and (spp == asked or reached(asked_error(integrator), statistics)))
     return Outcome(time.perf_counter() - started, spp, interrupted, statistics)
 
 
-def reached(options: Namespace, statistics: Mapping) -> bool:
-    """Whether the error that was asked for is reached."""
-    return options.until_error is not None and statistics["error"] <= options.until_error
+def asked_error(integrator) -> float:
+    """The parameter ``until_error``, from wherever it comes; 0 for other integrators than `bdpt`."""
+    return getattr(getattr(integrator, "settings", None), "until_error", 0)
+
+
+def reached(asked: float, statistics: Mapping) -> bool:
+    """Whether the error that was ``asked`` for, if not 0, is reached."""
+    return 0 < asked and statistics["error"] <= asked
 
 
 def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
@@ -245,8 +251,11 @@ def report(outcome: Outcome) -> str:
         "interrupted": outcome.interrupted,
         "versions": versions(),
     }
+    found = own | outcome.statistics
+    if found.get("error") == math.inf:  # which JSON does not know
+        found["error"] = None
     # A value that JSON does not know must not cost a finished image.
-    return json.dumps(own | outcome.statistics, default=str)
+    return json.dumps(found, default=str)
 
 
 def versions() -> dict[str, str]:
@@ -296,7 +305,7 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
         bitmap.write(str(temporary), file_format)
 
 
-def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: float | None) -> str:
+def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: float) -> str:
     """The closing line."""
     width, height = size
     parts = [
@@ -309,7 +318,7 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: fl
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
     if "error" in outcome.statistics:
         error = outcome.statistics["error"]
-        missed = until_error is not None and error > until_error
+        missed = 0 < until_error < error
         parts.append(f"relMSE about {error:.2g}" + (f", not the {until_error:g} asked for" if missed else ""))
     if outcome.statistics.get("non_finite"):
         parts.append(f"{outcome.statistics['non_finite']} samples without a finite value count as zero")

@@ -76,7 +76,8 @@ class Render:
         self.started = time.perf_counter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.world = World(scene, sensor)
-        self._full = self.plan = plan(self.world, settings)
+        self._pixels = int(self.world.camera.region.size.prod())
+        self._full = self.plan = choice.begun(plan(self.world, settings), settings, self._pixels)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)
@@ -99,20 +100,13 @@ class Render:
     def decide(self) -> list:
         """Adopt what the scene alone or a pilot says, if there is a choice and the render is long enough to
         pay for a pilot; returns all candidates of the pilot, the best first."""
-        if not choice.is_open(self._full, self.settings):
+        settled, decision = self._settled()
+        if decision and not self.accumulator.passes:
+            self._adopt(decision, choice.BY_SCENE)
+        if settled:
             return []
-        pixels, done = int(self.world.camera.region.size.prod()), sum(self.accumulator.passes)
-        if pixels < choice.FEW_PIXELS:
-            self._use(replace(self.plan, served=1))
-            return []
-        if decision := choice.by_scene(self.world, self._full, self.settings, self._samples()):
-            if not done:
-                self._adopt(decision, choice.BY_SCENE)
-            return []
-        samples = choice.expected_samples(self.settings, (self.spp - done) * pixels)
+        samples = self._samples(sum(self.accumulator.passes))
         count = choice.lanes(samples)
-        if not count:
-            return []
         self._wait()  # earlier passes are not the pilot's time
         started, compiled = time.perf_counter(), self.compile_seconds
         self._pilots += 1
@@ -134,21 +128,26 @@ class Render:
         return table
 
     def why_no_pilot(self) -> str:
-        """Why none is asked at first, as a sentence."""
-        samples = self._samples()
-        if not choice.is_open(self._full, self.settings):
-            return "no pilot: there is nothing to choose, by the scene or by hand"
-        if self.world.camera.region.size.prod() < choice.FEW_PIXELS:
-            return f"no pilot: it says nothing about films of fewer than {choice.FEW_PIXELS} pixels"
-        if choice.by_scene(self.world, self._full, self.settings, samples):
-            return "no pilot: the scene alone decides in a render as short as this"
-        if not choice.lanes(samples):
-            return f"no pilot: {samples} samples are too few, it takes {choice.LEAST_SAMPLES} (2^17)"
-        return "no pilot: it saw nothing, or no finite value"
+        """Why there is no table of a pilot's, as a sentence."""
+        return f"no pilot: {self._settled()[0] or 'it saw nothing, or no finite value'}"
 
-    def _samples(self) -> int:
-        """Of the whole render, as far as that is known."""
-        return choice.expected_samples(self.settings, self.spp * int(self.world.camera.region.size.prod()))
+    def _settled(self) -> tuple[str, choice.Decision | None]:
+        """Why no pilot is asked about the rest of the render, empty if one is; and the decision, if there is
+        one."""
+        if not choice.is_open(self._full, self.settings):
+            return "there is nothing to choose, by the scene or by hand", None
+        if self._pixels < choice.FEW_PIXELS:
+            return f"it says nothing about films of fewer than {choice.FEW_PIXELS} pixels", None
+        if decision := choice.by_scene(self.world, self._full, self.settings, self._samples()):
+            return "the scene alone decides in a render as short as this", decision
+        samples = self._samples(sum(self.accumulator.passes))
+        if not choice.lanes(samples):
+            return f"{samples} samples are too few, it takes {choice.LEAST_SAMPLES}", None
+        return "", None
+
+    def _samples(self, done: int = 0) -> int:
+        """Of the render after ``done`` samples per pixel, as far as that is known."""
+        return choice.expected_samples(self.settings, (self.spp - done) * self._pixels)
 
     def _has_stratified_points(self) -> bool:
         if self.settings.points == "sampler":
@@ -201,7 +200,7 @@ class Render:
             if not self.accumulator.passes:
                 self.decide()
             for number, step in enumerate(self._steps()):
-                if self._resumed_at and not number and self._was_exact_enough():
+                if not number and self._is_exact_enough():  # the one that it goes on from was
                     break
                 self._decide_before(step)
                 self._pass(step)
@@ -210,7 +209,7 @@ class Render:
                     self._wait()
                 if step.last and self.settings.variance:
                     self.accumulator.close_replicate()
-                exact = step.judged and self._is_exact_enough()
+                exact = self._is_exact_enough()
                 if on_pass is not None:
                     on_pass(self.report())
                 if exact or 0 <= timeout <= time.perf_counter() - self.started or cancelled():
@@ -236,17 +235,14 @@ class Render:
             while done < end:
                 size = min(end - done, self._affordable(step.size))
                 last = step.last and done + size == end
-                yield replace(step, done=done, size=size, last=last, judged=step.judged and last)
+                yield replace(step, done=done, size=size, last=last)
                 done += size
 
-    def _was_exact_enough(self) -> bool:
-        """Whether the render that this one goes on from had reached ``until_error``."""
-        whole = self.accumulator.ends_replicates() and self.accumulator.replicates.count % REPLICATES == 0
-        return whole and self._is_exact_enough()
-
     def _is_exact_enough(self) -> bool:
-        """Whether the estimated error is what ``until_error`` asks for."""
-        if not self.settings.until_error:
+        """Whether a group of replicates is whole and its error is what ``until_error`` asks for."""
+        if not self.settings.until_error or not self.accumulator.ends_replicates():
+            return False
+        if self.accumulator.replicates.count % REPLICATES:
             return False
         self._error = self.accumulator.error()
         return self._error <= self.settings.until_error
@@ -333,7 +329,7 @@ class Render:
             "variant": mi.variant(),
             "seed": int(self.seed[0]),
             "spp": self.spp,
-            "film": [type(film).__name__, *self.accumulator.size, *self.accumulator.offset],
+            "film": [film.class_name(), *self.accumulator.size, *self.accumulator.offset],
             "filter": str(film.rfilter()),
             "colours": list(self.accumulator.colour.names),
         }
@@ -400,7 +396,7 @@ class Render:
     def _rays(self):
         rays = {name: self._counts[name] for name in RAYS}
         if self.accumulator.features is not None:  # one per camera sample
-            rays["features"] = sum(self.accumulator.passes) * int(self.world.camera.region.size.prod())
+            rays["features"] = sum(self.accumulator.passes) * self._pixels
         return rays
 
     def statistics(self) -> dict:
