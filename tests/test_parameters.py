@@ -737,6 +737,27 @@ def test_strategy_images_check_their_memory():
 # -- refusals ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "words"),
+    [
+        (0, 8, "of 0 x 8 has no pixels"),
+        (8, 0, "of 8 x 0 has no pixels"),
+        (1 << 16, 1 << 14, "of 65536 x 16384 takes .* GiB and 4294967296 numbers"),
+        (100_000, 100_000, "of 100000 x 100000 takes .* crop windows"),
+    ],
+)
+def test_films_that_are_refused(width, height, words):
+    """Rationale: none has a pixel, or its sums are more than the machine has memory for, or than Dr.Jit's
+    indices of 32 bits can count. Expected: said before anything is rendered; a small crop window of a large
+    film is fine."""
+    with pytest.raises(ValueError, match=f"bdpt: the film {words}"):
+        integrator().render(glowing_sphere(width=width, height=height), spp=1)
+    if width > 1000:
+        crop = {"crop_offset_x": 500, "crop_width": 4, "crop_offset_y": 600, "crop_height": 3}
+        scene = glowing_sphere(width=width, height=height, **crop)
+        assert image(integrator(), scene, spp=1).shape == (3, 4, 3)
+
+
 def test_scenes_that_are_refused():
     """Expected: one sentence that names the object and what to do."""
     bdpt = integrator()
