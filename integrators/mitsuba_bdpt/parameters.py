@@ -242,7 +242,7 @@ def _check_size(film, colours: int):
     if needed > there or numbers >= MOST_NUMBERS:
         raise ValueError(
             f"bdpt: the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
-            f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render it in crop windows"
+            f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render crop windows"
         )
 
 
