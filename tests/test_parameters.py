@@ -844,6 +844,27 @@ def test_endpoints_that_are_refused(name, tmp_path):
         integrator().render(scene, spp=1)
 
 
+def test_a_broken_emitting_mesh_is_refused():
+    """Rationale: Mitsuba loads faces of vertices that do not exist, and reads beyond its memory. Expected:
+    said in words where we read the mesh ourselves, which is where it emits and has normals of its own."""
+    mesh = mi.Mesh("bent", 3, 1, has_vertex_normals=True, props=emitting())
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [0.0, 0, 0, 1, 0, 0, 0, 1, 0]
+    params["vertex_normals"] = [0.0, 0, 1, 0, 1, 0, 0, 0, 1]
+    params["faces"] = [0, 1, 3]
+    params.update()
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": mesh})
+    with pytest.raises(ValueError, match="bdpt: the emitting mesh 'mesh' has a face with vertex 3 of 3"):
+        integrator().render(scene, spp=1)
+
+
+def emitting():
+    """Properties of a shape that emits."""
+    props = mi.Properties()
+    props["emitter"] = mi.load_dict({"type": "area"})
+    return props
+
+
 def test_derivatives_are_refused():
     """Expected: a sentence that names what to use, for both modes."""
     scene, bdpt = lamp_in_a_sphere(), integrator()
