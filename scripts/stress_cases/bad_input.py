@@ -38,6 +38,16 @@ ANYTHING = st.one_of(
     ),
 )
 SENSIBLE = {
+    "max_depth": (-1, 0, 1, 2, 5, 9),
+    "rr_depth": (1, 3, 100),
+    "hide_emitters": (False, True),
+    "light_paths": ("auto", 0, 1, "1/2", 0.25, "1/16"),
+    "stored_vertices": (1, 2, 64),
+    "strategy_images": (False, True),
+    "variance": (False, True),
+    "until_error": (0.0, 0.1),
+    "spp_per_pass": (0, 1, 3),
+    "timeout": (-1.0, 0.0, 1e9),
     "heuristic": ("balance", "power", "maximum", "uniform"),
     "skip": ("auto", "impossible", "none"),
     "connections": ("auto", "all", "one", "none"),
@@ -48,15 +58,11 @@ SENSIBLE = {
 NAMES = tuple(Settings.__dataclass_fields__)
 
 
-def _value(name: str):
-    """Mostly anything; where a word is wanted, its words as well."""
-    words = SENSIBLE.get(name)
-    return ANYTHING | st.sampled_from(words) if words else ANYTHING
-
-
-PARAMETERS = st.fixed_dictionaries({}, optional={name: _value(name) for name in NAMES}).map(
-    # Few at a time: nearly all of many would be refused for the first of them.
-    lambda values: dict(sorted(values.items(), key=lambda item: repr(item))[:3])
+# Sensible values, and among them mostly one that is not: of many the first alone would be tried.
+PARAMETERS = st.builds(
+    lambda sensible, wild: sensible | wild,
+    st.fixed_dictionaries({}, optional={name: st.sampled_from(SENSIBLE[name]) for name in NAMES}),
+    st.just({}) | st.sampled_from(NAMES).flatmap(lambda name: ANYTHING.map(lambda value: {name: value})),
 )
 
 
@@ -314,9 +320,10 @@ CROPS = {
 
 HUGE = """
 import resource
-resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[4]), int(sys.argv[4])))
+width, height, memory = map(int, sys.argv[2:])
+resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
 scene = mi.load_dict({"type": "scene", "wall": {"type": "sphere", "emitter": {"type": "area"}}, "sensor": {
-    "type": "perspective", "film": {"type": "hdrfilm", "width": int(sys.argv[2]), "height": int(sys.argv[3])}}})
+    "type": "perspective", "film": {"type": "hdrfilm", "width": width, "height": height}}})
 integrator = mi.load_dict({"type": sys.argv[1], "max_depth": 2})
 try:
     image = integrator.render(scene, spp=1)
@@ -356,7 +363,9 @@ PLACES = """
     <integrator type="$integrator"><integer name="max_depth" value="5"/></integrator>
     <sensor type="perspective">
         <float name="fov" value="45"/>
-        <transform name="to_world"><lookat origin="0, 2, 5" target="0, 0.5, 0" up="0, 1, 0"/>{camera}</transform>
+        <transform name="to_world">
+            <lookat origin="0, 2, 5" target="0, 0.5, 0" up="0, 1, 0"/>{camera}
+        </transform>
         <film type="hdrfilm">
             <integer name="width" value="$resolution"/><integer name="height" value="$resolution"/>
         </film>
@@ -517,11 +526,14 @@ def _case(name: str, tried: str, expected: str, run: Callable[[], Outcome], quic
     return Case(name, SECTION, tried, expected, run, quick)
 
 
-OR_WORDS = "a finite image, or an error whose words name what is wrong; no crash, no hang"
+OR_WORDS = (
+    "a finite image, or an error whose words name what is wrong; where a process dies or does not end, or an "
+    "image is not finite, `path` does alike"
+)
 AS_PATH = (
-    f"{OR_WORDS}; where `path` renders it too, its mean, within ten standard errors of four seeds and 2 % (so few "
-    "seeds have heavy tails; a lost lamp or a doubled light is off by far more). Where a process dies or does not "
-    "end, or an image is not finite, `path` does alike"
+    f"{OR_WORDS}. Where `path` renders it too, its mean: within ten standard errors of four seeds and 2 % "
+    "(so "
+    "few seeds have heavy tails; a lost lamp or a doubled light is off by far more)"
 )
 VARIED = tuple(path.stem for path in sorted((reference.ROOT / "scenes").glob("*.xml")))
 # Scenes whose light `path` finds as well.
@@ -530,10 +542,11 @@ EASY = ("cornell_box", "many_lights", "open_sky", "veach_mis", "window_room")
 CASES = (
     _case(
         "fuzz-parameters",
-        "400 dictionaries of parameters, by hypothesis: words, numbers, NaN, infinities, 10^5 letters; 10 that are "
-        "accepted are rendered",
+        "400 dictionaries of parameters, by hypothesis, most with one value that is anything: a word, a "
+        "number, "
+        "NaN, an infinity, 10^5 letters; 24 that are accepted are rendered",
         "accepted, or refused in words that name a parameter; images are finite",
-        partial(_parameters, 400, 10),
+        partial(_parameters, 400, 24),
     ),
     _case(
         "fuzz-arguments",
@@ -544,9 +557,10 @@ CASES = (
     ),
     _case(
         "fuzz-scene-file",
-        "10 changes by chance of `cornell_box.xml`: elements left out, doubled, of another kind, numbers that are "
-        "none, huge, negative or words",
-        AS_PATH,
+        "10 changes by chance of `cornell_box.xml`: elements left out, doubled, of another kind; NaN, "
+        "infinite, "
+        "huge, negative numbers; words for numbers",
+        OR_WORDS,
         partial(_scene_files, ("cornell_box",), 10, False),
         True,
     ),
@@ -565,8 +579,9 @@ CASES = (
     _case(
         "film-sizes",
         "films of 0, 1 x 1, 1 x 4097, 40000 x 2, ... pixels in a room of radiance 1",
-        "refused in words, or an image of that size and radiance: within 20 %, for roulette leaves noise, and a row "
-        "or a side that is lost costs more; path tracing alone",
+        "refused in words, or an image of that size and radiance: within 20 %, for roulette leaves noise "
+        "in one "
+        "pixel, and a row or a side that is lost costs more; path tracing alone",
         partial(_films, SIZES, {"light_paths": 0}),
         True,
     ),
@@ -578,7 +593,8 @@ CASES = (
     ),
     _case(
         "crop-windows",
-        "crop windows of one pixel, of a row, of nothing, beyond the film; of 16 x 16 in a film of 10^10 pixels",
+        "crop windows of one pixel, of a row, of nothing, beyond the film; of 16 x 16 in a film of 10^10 "
+        "pixels",
         "as for films of that size",
         partial(_films, CROPS, {"skip": "none"}),
     ),
@@ -608,13 +624,15 @@ CASES = (
     ),
     _case(
         "no-number-textures",
-        "one pixel of the same, or -1, in textures of reflectance, radiance, roughness, sky, bump and normal map",
+        "one pixel of the same, or -1, in textures: reflectance, radiance, roughness, sky, bump and normal "
+        "map",
         AS_PATH,
         partial(_non_finite, TEXTURES, _write_textures),
     ),
     _case(
         "no-number-meshes",
-        "the same as coordinates and normals of a vertex, faces without area, faces of vertices that don't exist",
+        "the same as coordinate or normal of a vertex, faces without area, faces of vertices that don't "
+        "exist",
         AS_PATH,
         partial(_non_finite, {"mesh": {"mesh": MESH}, "emitting mesh": {"mesh": GLOWING}}, _write_meshes),
     ),
