@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress
+.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress endurance
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -66,6 +66,10 @@ sweep: $(INSTALLED)
 # What was tried to break it, under twenty minutes on two cores: docs/stress.md.
 stress: $(INSTALLED)
 	$(VENV)/bin/python scripts/stress.py
+
+# Hours of renders that look for values that are not finite; can be interrupted, and adds to docs/endurance.json.
+endurance: $(INSTALLED)
+	$(VENV)/bin/python scripts/endurance.py
 
 # The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)

@@ -47,6 +47,7 @@ from metrics import (
 import mitsuba as mi  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
 from mitsuba_bdpt.files import replacing  # isort: skip
+from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = ROOT / "references"
@@ -439,14 +440,6 @@ class Window:
         if halves.counts is None:
             return False
         return halves.counts[self.slices].min() < FOCUS_TIMES * halves.counts.min()
-
-
-def raise_interrupt(error: BaseException | None):
-    """Raise the ``KeyboardInterrupt`` that an error comes from, if any: `mitsuba.render` wraps them."""
-    while error is not None:
-        if isinstance(error, KeyboardInterrupt):
-            raise error
-        error = error.__cause__ or error.__context__
 
 
 def write(path: Path, reference: Reference):

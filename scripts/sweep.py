@@ -48,6 +48,7 @@ import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 from mitsuba_bdpt import cluster, render  # isort: skip
 from mitsuba_bdpt.files import replacing  # isort: skip
+from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
 
 CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up
@@ -407,7 +408,7 @@ class Sweep:
         try:
             self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
-            reference.raise_interrupt(error)
+            raise_interrupt(error)
             self.failed.append(f"{_description(cell)}: {error}")
         self.progress.advance(self._task)
 

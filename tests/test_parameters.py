@@ -16,7 +16,7 @@ import mitsuba as mi
 import mitsuba_bdpt
 import numpy as np
 import pytest
-from mitsuba_bdpt import passes, rendering
+from mitsuba_bdpt import connect, passes, rendering
 
 T = mi.ScalarTransform4f
 
@@ -411,6 +411,32 @@ def test_interruption_keeps_what_is_done(rfilter):
         assert sum(bdpt.statistics["passes"]) == 20
 
 
+def test_an_interruption_while_a_kernel_is_recorded(monkeypatch):
+    """Rationale: every pass records its loops anew, and Dr.Jit makes a RuntimeError of all that is raised
+    there; the command took that for a mistake and wrote no image. Expected: KeyboardInterrupt, and the first
+    of the passes (radiance 1 within 5 %, see above) in the film; the next render is whole, the same as by an
+    integrator that was not interrupted, up to rounding.
+    """
+    original, calls = connect.splat, []
+
+    def splat(*arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return original(*arguments)
+
+    scene = lamp_in_a_sphere(size=32)
+    bdpt, parameters = integrator(skip="none", spp_per_pass=4), {"seed": 2, "spp": 12}
+    with monkeypatch.context() as patch:
+        patch.setattr(connect, "splat", splat)
+        with pytest.raises(KeyboardInterrupt):
+            bdpt.render(scene, **parameters)
+    assert bdpt.statistics["passes"] == [4]
+    assert abs(np.array(scene.sensors()[0].film().develop()).mean() - 1) < 0.05
+    expected = image(integrator(skip="none", spp_per_pass=4), scene, **parameters)
+    np.testing.assert_allclose(image(bdpt, scene, **parameters), expected, rtol=1e-4)
+
+
 # -- one integrator, many renders -------------------------------------------------------------
 
 
@@ -737,6 +763,27 @@ def test_strategy_images_check_their_memory():
 # -- refusals ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "words"),
+    [
+        (0, 8, "of 0 x 8 has no pixels"),
+        (8, 0, "of 8 x 0 has no pixels"),
+        (1 << 16, 1 << 14, "of 65536 x 16384 takes .* GiB and 4294967296 numbers"),
+        (100_000, 100_000, "of 100000 x 100000 takes .* crop windows"),
+    ],
+)
+def test_films_that_are_refused(width, height, words):
+    """Rationale: none has a pixel, or its sums are more than the machine has memory for, or than Dr.Jit's
+    indices of 32 bits can count. Expected: said before anything is rendered; a small crop window of a large
+    film is fine."""
+    with pytest.raises(ValueError, match=f"bdpt: the film {words}"):
+        integrator().render(glowing_sphere(width=width, height=height), spp=1)
+    if width > 1000:
+        crop = {"crop_offset_x": 500, "crop_width": 4, "crop_offset_y": 600, "crop_height": 3}
+        scene = glowing_sphere(width=width, height=height, **crop)
+        assert image(integrator(), scene, spp=1).shape == (3, 4, 3)
+
+
 def test_scenes_that_are_refused():
     """Expected: one sentence that names the object and what to do."""
     bdpt = integrator()
@@ -821,6 +868,27 @@ def test_endpoints_that_are_refused(name, tmp_path):
     scene = mi.load_dict(scene)
     with pytest.raises((NotImplementedError, ValueError), match=message):
         integrator().render(scene, spp=1)
+
+
+def test_a_broken_emitting_mesh_is_refused():
+    """Rationale: Mitsuba loads faces of vertices that do not exist, and reads beyond its memory. Expected:
+    said in words where we read the mesh ourselves, which is where it emits and has normals of its own."""
+    mesh = mi.Mesh("bent", 3, 1, has_vertex_normals=True, props=emitting())
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [0.0, 0, 0, 1, 0, 0, 0, 1, 0]
+    params["vertex_normals"] = [0.0, 0, 1, 0, 1, 0, 0, 0, 1]
+    params["faces"] = [0, 1, 3]
+    params.update()
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": mesh})
+    with pytest.raises(ValueError, match="bdpt: the emitting mesh 'mesh' has a face with vertex 3 of 3"):
+        integrator().render(scene, spp=1)
+
+
+def emitting():
+    """Properties of a shape that emits."""
+    props = mi.Properties()
+    props["emitter"] = mi.load_dict({"type": "area"})
+    return props
 
 
 def test_derivatives_are_refused():

@@ -5,6 +5,8 @@ that paints the film one colour: what is tested is the command, not the light.
 """
 
 import json
+import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -280,6 +282,42 @@ def test_a_file_of_another_format_is_not_overwritten(scene, capsys, name):
     assert "would overwrite" in capsys.readouterr().err
     Path(name).unlink()
     assert [main(["render", str(scene), "-o", "a.exr"]) for _ in range(2)] == [0, 0]
+
+
+@pytest.mark.parametrize("missing", [1, 100, 5000])
+def test_a_full_disk_leaves_the_former_image(tmp_path, monkeypatch, missing):
+    """Rationale: Mitsuba closes a file without a look at what could not be written; a PNG of which only the
+    last bytes do not fit passed for whole. Expected: an error, however few bytes are missing, the former
+    image as it was and nothing beside it."""
+    pixels = (np.random.default_rng(1).random((64, 64, 3)) * 255).astype(np.uint8)
+    image, png, path = mi.Bitmap(pixels), mi.Bitmap.FileFormat.PNG, tmp_path / "a.png"
+    render.write_whole(image, path, png)
+    size = path.stat().st_size
+    path.write_bytes(b"former")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size - missing, before[1]))
+    try:
+        with pytest.raises(OSError):
+            render.write_whole(image, path, png)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"] and path.read_bytes() == b"former"
+
+
+@pytest.mark.parametrize("kind", ["folder", "folder.png", "pipe", "name", "checkpoint"])
+def test_an_output_that_cannot_be_written_is_refused_before_the_render(scene, capsys, monkeypatch, kind):
+    """Rationale: what can be known at once must not come out after hours; opening a pipe would wait for
+    ever. Expected: an error before anything is rendered."""
+    monkeypatch.setattr(render, "render", lambda *arguments: pytest.fail("rendered"))
+    output = Path("a.exr") if kind != "name" else Path("a" * 251 + ".exr")
+    if kind == "pipe":
+        os.mkfifo(output)
+    elif kind != "name":
+        Path({"folder.png": "a.png", "checkpoint": "a.checkpoint.npz"}.get(kind, "a.exr")).mkdir()
+    more = ["--checkpoint", "1"] if kind == "checkpoint" else []
+    before = sorted(Path().iterdir())
+    assert main(["render", str(scene), "-o", str(output), *more]) == 1
+    assert capsys.readouterr().err.startswith("error: ") and sorted(Path().iterdir()) == before
 
 
 def test_a_failing_write_leaves_the_former_image(scene, tmp_path):

@@ -11,7 +11,7 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
-from .files import replacing
+from .files import check_writable, replacing
 from .snapshot import Snapshot, read
 
 
@@ -27,8 +27,11 @@ def digest(options: Namespace) -> str:
 
 
 def check(options: Namespace, output: Path) -> None:
-    """Raise ``ValueError`` if a checkpoint would be overwritten unasked."""
+    """Raise ``ValueError`` if a checkpoint would be overwritten unasked, ``OSError`` if none can be
+    written."""
     path = path_of(output)
+    if options.checkpoint is not None:
+        check_writable(path)
     if options.checkpoint is not None and path.exists() and not options.resume:
         raise ValueError(
             f"checkpoint={str(path)!r} of an unfinished render exists; go on by --resume, or delete it."

@@ -225,6 +225,11 @@ def _curved_faces(shape):
     faces = np.array(params["faces"]).reshape(-1, 3)
     p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     n = np.array(params["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+    if faces.max(initial=0) >= len(p):
+        raise ValueError(
+            f"bdpt: the emitting mesh '{shape.id()}' has a face with vertex {faces.max()} of {len(p)}; "
+            "mend the file that it comes from"
+        )
     a, b, c = p[faces].transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-300)[:, None]

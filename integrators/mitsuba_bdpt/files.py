@@ -7,11 +7,27 @@ import os
 from pathlib import Path
 
 
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def check_writable(path: Path) -> None:
+    """Raise ``OSError`` now if `replacing` could not write `path` later, ``ValueError`` if it is something
+    else than a file."""
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{str(path)!r} is no file; name another output.")
+    try:
+        _temporary(path).touch()
+    finally:
+        with contextlib.suppress(OSError):
+            _temporary(path).unlink()
+
+
 @contextlib.contextmanager
 def replacing(path: Path):
     """Name of a file beside `path` that takes its place at the end: whoever looks at `path` never sees half a
     file, and an error leaves what was there."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _temporary(path)
     try:
         yield temporary
         os.replace(temporary, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 from fractions import Fraction
 from numbers import Integral, Real
 
@@ -24,6 +25,9 @@ MEANING = {
     "spp": "samples per pixel, 0 for the sampler's sample_count",
     "seed": "any number from 0 to 2^32 - 1",
 }
+
+# Of one array.
+MOST_NUMBERS = 1 << 32
 
 
 def integer(value, name: str, low: int, high: int = UNLIMITED) -> int:
@@ -213,11 +217,37 @@ def check_scene(scene, sensor):
 
 
 def check_film(sensor, settings: Settings):
-    """Raise ``NotImplementedError`` for layers that the film cannot have; returns its colours."""
+    """Raise ``NotImplementedError`` for layers that the film cannot have, ``ValueError`` for a film without
+    pixels or too large; returns its colours."""
     colour = film_colours(sensor)
     if settings.strategy_images and isinstance(colour, Bands):
         raise NotImplementedError(
             f"bdpt: strategy_images=True is not possible with film '{sensor.film().id()}' of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
+    _check_size(sensor.film(), len(colour.names))
     return colour
+
+
+def _check_size(film, colours: int):
+    width, height = (int(x) for x in film.crop_size())
+    if width < 1 or height < 1:
+        raise ValueError(f"bdpt: the film of {width} x {height} has no pixels; it needs one at least")
+    # Sums of a pass, of all passes and, while they are added, of both (see `film.Accumulator`).
+    camera, light = (
+        n + n % 2 for n in (colours + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + 1, colours)
+    )
+    numbers = width * height * max(camera, light)
+    needed, there = width * height * (camera * (4 + 16) + light * (8 + 16)), _memory()
+    if needed > there or numbers >= MOST_NUMBERS:
+        raise ValueError(
+            f"bdpt: the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
+            f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render crop windows"
+        )
+
+
+def _memory() -> float:
+    """What the machine has, in bytes."""
+    if mi.variant().startswith("cuda"):
+        return math.inf  # what a GPU has is not known here
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -22,7 +22,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 import mitsuba_bdpt
 
 from . import checkpoints, cluster
-from .files import replacing
+from .files import check_writable, replacing
 from .loading import choose_sensor, load
 
 UNLIMITED_SPP = 1 << 16
@@ -80,11 +80,11 @@ def message(error: Exception) -> str:
 
 
 def prepare_output(output: Path) -> None:
-    """Refuse an `output` that cannot be written in the end; create its directory."""
+    """Refuse an `output` that cannot be written in the end, which may be in hours; create its directory."""
     if output.suffix.lower() != ".exr":
         raise ValueError(f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case.")
     for path in (output, output.with_suffix(".png")):
-        if not path.exists():
+        if not path.is_file():  # of a pipe nothing must be read
             continue
         kind = path.suffix.lower()
         with path.open("rb") as file:
@@ -95,6 +95,8 @@ def prepare_output(output: Path) -> None:
                 f"{kind[1:].upper()}. Move it away, or name another output."
             )
     output.parent.mkdir(parents=True, exist_ok=True)
+    for path in (output, output.with_suffix(".png")):
+        check_writable(path)
 
 
 def check_options(options: Namespace, output: Path) -> None:
@@ -300,9 +302,12 @@ def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
 
 
 def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
-    """Write an image by `replacing`."""
+    """Write an image by `replacing`. (Mitsuba's own files are closed without a look at what could not be
+    written: on a full disk the end of a PNG is missing, and nobody hears of it.)"""
+    stream = mi.MemoryStream()
+    bitmap.write(stream, file_format)
     with replacing(path) as temporary:
-        bitmap.write(str(temporary), file_format)
+        temporary.write_bytes(stream.raw_buffer())
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: float) -> str:

@@ -214,6 +214,9 @@ class Render:
                     on_pass(self.report())
                 if exact or 0 <= timeout <= time.perf_counter() - self.started or cancelled():
                     break
+        except RuntimeError as error:
+            raise_interrupt(error)
+            raise
         finally:
             try:
                 self._wait()
@@ -421,6 +424,16 @@ class Render:
             **({"error": self.accumulator.error()} if self.settings.variance else {}),
             "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
         }
+
+
+def raise_interrupt(error: BaseException):
+    """Raise the ``KeyboardInterrupt`` that is behind ``error``, if one is: Dr.Jit makes a ``RuntimeError`` of
+    all that comes while it records a loop or a call."""
+    cause = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from None
+        cause = cause.__cause__ or cause.__context__
 
 
 def _check_strategy_memory(depth: int, film):

@@ -1,0 +1,58 @@
+"""Load scene files and render each, saying what happened: one line of JSON per file. A process for what may
+crash or hang.
+
+    python -m stress_cases.attempt INTEGRATOR FILE ...
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+
+import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
+import numpy as np
+
+import mitsuba as mi  # isort: skip
+
+SEEDS, SIZE, SPP = range(1, 5), 16, 32
+
+# A film of a mutated size must not take the whole machine.
+MEMORY = 16 << 30
+
+
+def attempt(path: str, integrator: str) -> dict:
+    """``stage`` that was reached (``load``, ``render`` or ``image``), and an exception's ``kind`` and
+    ``text``, or of the images of all seeds: their ``means``, the number of values that are not ``finite``."""
+    stage = "load"
+    try:
+        scene = mi.load_file(path, parallel=False, resolution=SIZE, integrator=integrator)
+        used = scene.integrator()
+        if not scene.sensors():
+            raise ValueError("no sensor")
+        stage = "render"
+        images = [np.array(used.render(scene, 0, seed=seed, spp=SPP), dtype=np.float64) for seed in SEEDS]
+    except Exception as error:
+        text = " ".join(str(error).split())
+        return {"stage": stage, "kind": type(error).__name__, "text": text}
+    bad = sum(int((~np.isfinite(image)).sum()) for image in images)
+    statistics = getattr(used, "statistics", {})
+    return {
+        "stage": "image",
+        "means": [float(image.mean()) for image in images],
+        "bad": bad,
+        "counted": statistics.get("non_finite", 0),
+    }
+
+
+def main():
+    """Run the command line."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)
+    for path in sys.argv[2:]:
+        print(json.dumps(attempt(path, sys.argv[1])), flush=True)
+
+
+if __name__ == "__main__":
+    main()

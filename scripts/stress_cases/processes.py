@@ -1,0 +1,438 @@
+"""Many renders in one process, renders that are interrupted, processes side by side, caches on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+import reference
+
+import mitsuba as mi  # isort: skip
+
+from . import child
+from .case import Case, Outcome
+
+SECTION = "Processes"
+
+# Sums of the same numbers in another order, in single precision.
+ROUNDING = 1e-4
+
+
+def _room(lamp=(0, 0.9, 0), light=1.0, wall=0.5, eye=(0, 0, 2.5), size=8, moved=0.0, texture=0.5):
+    """A room of two textured walls, a ball, a mesh, a lamp with area and a point light."""
+    at = mi.ScalarTransform4f()
+    bitmap = mi.Bitmap(np.full((2, 2, 3), texture, dtype=np.float32))
+    return {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "to_world": at.look_at(list(eye), [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.1 * light}},
+        "floor": {
+            "type": "rectangle",
+            "to_world": at.translate([0, -1, 0]).rotate([1, 0, 0], -90),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap}},
+        },
+        "wall": {
+            "type": "rectangle",
+            "to_world": at.translate([0, 0, -1]),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": wall}},
+        },
+        "ball": {"type": "sphere", "radius": 0.3, "center": [0.4, -0.6, 0], "bsdf": {"type": "dielectric"}},
+        "block": {"type": "cube", "to_world": at.translate([-0.5 + moved, -0.7, 0]).scale(0.2)},
+        "lamp": {
+            "type": "rectangle",
+            "to_world": at.translate(list(lamp)).rotate([1, 0, 0], 90).scale(0.2),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5 * light}},
+        },
+        "spark": {"type": "point", "position": [0.5, 0.5, 0.5], "intensity": {"type": "rgb", "value": light}},
+    }
+
+
+def _image(integrator, scene, **keywords) -> np.ndarray:
+    return np.array(integrator.render(scene, **keywords), dtype=np.float64)
+
+
+def _off(image, expected) -> float:
+    """The largest difference of two images, as a share of the expected one's mean."""
+    return float(np.abs(image - expected).max() / expected.mean())
+
+
+# -- many renders in one process --------------------------------------------------------------
+
+
+def _resident() -> int:
+    """Memory of this process in bytes: what it has now, not the most it had."""
+    gc.collect()
+    text = Path("/proc/self/statm")
+    if text.exists():
+        return int(text.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _kept_by_dr_jit() -> int:
+    """Variables that exist."""
+    gc.collect()
+    dr.sync_thread()
+    return len(dr.whos(True).splitlines())
+
+
+def _in_a_row(count: int) -> Outcome:
+    """Render ``count`` times after a tenth of that as warm-up."""
+    scene = mi.load_dict(_room())
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 4})
+    grown, more, compiled = _growth(count, lambda number: _once(scene, bdpt, number))
+    return Outcome(grown < GROWTH and more <= 0 and compiled == 0, _grown(grown, more, compiled))
+
+
+def _scenes_in_a_row(count: int) -> Outcome:
+    """Render ``count`` times, each time another scene by another integrator; and by `path`."""
+
+    def once(kind, number):
+        scene = mi.load_dict(_room(light=1 + number % 7, wall=0.1 + 0.1 * (number % 5)))
+        return _once(scene, mi.load_dict({"type": kind, "max_depth": 4}), number)
+
+    grown, more, compiled = _growth(count, partial(once, "bdpt"))
+    theirs = _growth(count, partial(once, "path"))
+    text = f"{_grown(grown, more, compiled)} (`path`: {_grown(*theirs)})"
+    return Outcome(grown < GROWTH and more <= 0 and compiled <= 0.01 * count, text)
+
+
+# A film of 8 x 8 and its sums are 10 KB, and pages come and go in hundreds of KB.
+GROWTH = 2 << 20
+
+
+def _once(scene, integrator, number: int) -> int:
+    """Render one sample per pixel; the number of kernels that were compiled for it."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        integrator.render(scene, seed=number, spp=1)
+        dr.sync_thread()
+        history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
+    if hasattr(integrator, "statistics"):
+        return integrator.statistics["kernels"]["compiled"]
+    return sum(not entry["cache_hit"] for entry in history)
+
+
+def _growth(count: int, once: Callable[[int], int]) -> tuple[int, int, int]:
+    """Bytes that this process has more and variables of Dr.Jit that there are more at the end of ``count``
+    calls than after half of them, and kernels compiled after a tenth of them."""
+    compiled = 0
+    for number in range(count):
+        made = once(number)
+        compiled += made if number >= count // 10 else 0
+        if number == count // 2:
+            before, variables = _resident(), _kept_by_dr_jit()
+    return _resident() - before, _kept_by_dr_jit() - variables, compiled
+
+
+def _grown(grown: int, more: int, compiled: int) -> str:
+    return f"{grown / 2**20:.1f} MiB and {more} variables of Dr.Jit more, {compiled} kernels compiled"
+
+
+# -- one after the other ----------------------------------------------------------------------
+
+
+def _alternating() -> Outcome:
+    """Two scenes under two variants in turn, each with one integrator object for all."""
+    first, worst = {}, 0.0
+    made = {}
+    for variant in ("llvm_ad_rgb", "llvm_ad_spectral"):
+        mi.set_variant(variant)
+        scenes = [mi.load_dict(_room()), reference.load_scene("glass_caustics", resolution=8)]
+        made[variant] = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.5}), scenes
+    for _ in range(3):
+        for variant, (bdpt, scenes) in made.items():
+            mi.set_variant(variant)
+            for index, scene in enumerate(scenes):
+                image = _image(bdpt, scene, seed=3, spp=8)
+                key = variant, index
+                worst = max(worst, _off(image, first.setdefault(key, image)))
+    mi.set_variant("llvm_ad_rgb")
+    return Outcome(worst < ROUNDING, f"largest difference {worst:.1g} of the mean, 4 images rendered 3 times")
+
+
+def _edit(key: str, change) -> Callable:
+    """Set what `mi.traverse` calls so; ``change`` makes the value of the one that is there."""
+
+    def edit(params):
+        (name,) = [name for name in params.keys() if name.endswith(key)]  # noqa: SIM118 (not a dict)
+        params[name] = change(params[name])
+        params.update()
+
+    return edit
+
+
+def _move(by: float, params):
+    positions = mi.Point3f(dr.unravel(mi.Point3f, params["block.vertex_positions"]))
+    params["block.vertex_positions"] = dr.ravel(positions + mi.Vector3f(by, 0, 0))
+    params.update()
+
+
+def _edits() -> dict[str, tuple[Callable, dict]]:
+    """What is edited, and the room that is made so."""
+    at = mi.Transform4f()
+    return {
+        "intensity of a point light": (_edit("spark.intensity.value", lambda v: v * 3), {}),
+        "reflectance": (_edit("wall.bsdf.reflectance.value", lambda v: type(v)(0.8)), {"wall": 0.8}),
+        "texture": (_edit("floor.bsdf.reflectance.data", lambda v: v * 0 + 0.9), {"texture": 0.9}),
+        "camera": (
+            _edit("sensor.to_world", lambda v: at.look_at([0.3, 0.2, 2.0], [0, 0, 0], [0, 1, 0])),
+            {"eye": (0.3, 0.2, 2.0)},
+        ),
+        "size of the film": (_edit("sensor.film.size", lambda v: mi.ScalarPoint2u(11, 11)), {"size": 11}),
+        "place of a lamp": (
+            _edit("lamp.to_world", lambda v: at.translate([0.2, 0.5, 0.3]).rotate([1, 0, 0], 90).scale(0.2)),
+            {"lamp": (0.2, 0.5, 0.3)},
+        ),
+        "vertices of a mesh": (partial(_move, 0.4), {"moved": 0.4}),
+    }
+
+
+def _edited(parameters: dict) -> Outcome:
+    """Render, edit, render: the image of a scene that was made so."""
+    wrong, worst = [], 0.0
+    for words, (edit, room) in _edits().items():
+        scene = mi.load_dict(_room())
+        bdpt = mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters})
+        before = _image(bdpt, scene, seed=1, spp=4)
+        edit(mi.traverse(scene))
+        built = _room(**room)
+        if words.startswith("intensity"):
+            built["spark"]["intensity"]["value"] = 3.0
+        image, expected = _image(bdpt, scene, seed=2, spp=16), mi.load_dict(built)
+        expected = _image(
+            mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters}), expected, seed=2, spp=16
+        )
+        off = _off(image, expected) if image.shape == expected.shape else np.inf
+        # Numbers made along another way differ in their last bits, and few paths take another turn by it.
+        changed = image.shape != before.shape or _off(before, expected) > 0.01
+        outliers = (
+            float((np.abs(image - expected) > ROUNDING * expected.mean()).mean()) if off < np.inf else 1
+        )
+        worst = max(worst, outliers)
+        if outliers > 0.05 or abs(image.mean() / expected.mean() - 1) > 0.01 or not changed:
+            wrong.append(
+                f"{words}: {outliers:.1%} of the values differ, the largest by {off:.2g}; {changed=}"
+            )
+    return Outcome(not wrong, "; ".join(wrong) or f"at most {worst:.1%} of values differ in rounding")
+
+
+def _interrupted(times: int) -> Outcome:
+    """SIGINT at some moment of a render, then the same again."""
+    # Short passes: recording them takes as long as tracing them, and may be interrupted as well.
+    scene = reference.load_scene("cornell_box", resolution=32)
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 2})
+    keywords = {"seed": 5, "spp": 32}
+    whole = _image(bdpt, scene, **keywords)
+    started = time.perf_counter()
+    _image(bdpt, scene, **keywords)
+    seconds = time.perf_counter() - started
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    hit, kept, worst, wrong = 0, set(), 0.0, []
+    for number in range(times):
+        timer = threading.Timer(seconds * (number + 0.5) / times, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        try:
+            bdpt.render(scene, **keywords)
+            timer.join()
+            time.sleep(0.01)  # the signal may have come after the render
+        except KeyboardInterrupt:
+            hit += 1
+            kept.add(sum(bdpt.statistics["passes"]))
+            film = np.array(scene.sensors()[0].film().develop())
+            if bdpt.statistics["passes"] and not 0.5 < film.mean() / whole.mean() < 2:
+                wrong.append(f"film of {bdpt.statistics['passes']}: mean {film.mean():.3g}")
+        timer.join()
+        worst = max(worst, _off(_image(bdpt, scene, **keywords), whole))
+    signal.signal(signal.SIGINT, previous)
+    text = f"{hit} of {times} met it, after {min(kept, default=0)} to {max(kept, default=0)} of 32 samples; "
+    text += "; ".join(wrong) + f"then off by {worst:.1g} of the mean at most"
+    return Outcome(not wrong and hit >= times // 2 and worst < ROUNDING, text)
+
+
+# -- kernel caches ----------------------------------------------------------------------------
+
+RENDER = """
+scene = mi.load_dict(mi.cornell_box() | {"sensor": {"type": "perspective", "film": {
+    "type": "hdrfilm", "width": 16, "height": 16}, "to_world": mi.ScalarTransform4f().look_at(
+    [0, 0, 4], [0, 0, 0], [0, 1, 0])}})
+bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6})
+image = np.array(bdpt.render(scene, spp=16, seed=3), dtype=np.float64)
+print(bdpt.statistics["kernels"]["compiled"], image.mean(), image.std(), np.isfinite(image).all())
+"""
+
+
+def _told(done: subprocess.CompletedProcess) -> tuple[int, np.ndarray]:
+    """Kernels compiled, and mean and spread of the image; raises ``ValueError`` if there is none."""
+    words = done.stdout.split()
+    if done.returncode or len(words) != 4 or words[3] != "True":
+        raise ValueError(f"status {done.returncode}: {(done.stdout + done.stderr).strip()[-160:]}")
+    return int(words[0]), np.array([float(word) for word in words[1:3]])
+
+
+def _same(image, expected) -> bool:
+    return bool(np.all(np.abs(image / expected - 1) < ROUNDING))
+
+
+def _side_by_side() -> Outcome:
+    """Two processes fill an empty kernel cache together, a third one uses it."""
+    with tempfile.TemporaryDirectory() as cache:
+        env = child.environment(DRJIT_CACHE_DIR=cache)
+        command = [sys.executable, "-c", child.PRELUDE + RENDER]
+        both = [
+            subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env)
+            for _ in range(2)
+        ]
+        texts = [process.communicate(timeout=200) for process in both]
+        try:
+            made = [
+                _told(subprocess.CompletedProcess(command, process.returncode, *text))
+                for process, text in zip(both, texts, strict=True)
+            ]
+            compiled, image = _told(child.python(RENDER, env=env))
+        except ValueError as error:
+            return Outcome(False, str(error))
+        same = all(_same(image, other) for _, other in made)
+        return Outcome(
+            same and compiled == 0,
+            f"{made[0][0]} and {made[1][0]} kernels compiled, then {compiled}; images equal: {same}",
+        )
+
+
+def _without_cache(made: Callable) -> Outcome:
+    """Render with the cache as ``made`` leaves it, a context manager of an environment and further keywords,
+    and with one that works."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            _, expected = _told(child.python(RENDER, env=child.environment(DRJIT_CACHE_DIR=folder)))
+            with made() as (changes, keywords):
+                if changes is None:
+                    return Outcome(True, "not tried: this user can't make such a folder")
+                done = child.python(RENDER, env=child.environment(**changes), **keywords)
+                compiled, image = _told(done)
+        except ValueError as error:
+            return Outcome(False, str(error))
+    warned = "a warning" if done.stderr.strip() else "nothing said"
+    return Outcome(_same(image, expected), f"{compiled} kernels compiled, {warned}, the same image")
+
+
+@contextlib.contextmanager
+def _no_folder():
+    """A cache that is a file, which nobody can make a folder of."""
+    with tempfile.NamedTemporaryFile() as file:
+        yield {"DRJIT_CACHE_DIR": str(Path(file.name) / "cache")}, {}
+
+
+@contextlib.contextmanager
+def _read_only():
+    with child.read_only_folder() as folder:
+        yield ({"DRJIT_CACHE_DIR": str(folder)} if folder else None), {}
+
+
+@contextlib.contextmanager
+def _full():
+    """Room for no kernel, which take some 100 KB."""
+    with child.small_disk(16 << 10) as (folder, keywords, _):
+        yield {"DRJIT_CACHE_DIR": str(folder)}, keywords
+
+
+@contextlib.contextmanager
+def _no_home():
+    yield {"HOME": None, "DRJIT_CACHE_DIR": None, "XDG_CACHE_HOME": None}, {}
+
+
+@contextlib.contextmanager
+def _spoiled():
+    """The kernels of the cache cut in half, as a power cut may leave them."""
+    with tempfile.TemporaryDirectory() as folder:
+        child.python(RENDER, env=child.environment(DRJIT_CACHE_DIR=folder))
+        for file in Path(folder).rglob("*.bin"):
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        yield {"DRJIT_CACHE_DIR": folder}, {}
+
+
+def _case(name: str, tried: str, expected: str, run: Callable[[], Outcome], quick: bool = False) -> Case:
+    return Case(name, SECTION, tried, expected, run, quick)
+
+
+SAME = "the same image, up to the rounding of sums in another order (1e-4 of the mean)"
+STAYS = (
+    "after a tenth of them no kernel is compiled; in the second half no variable of Dr.Jit more and less "
+    "than 2 MiB "
+    "(a film of 8 x 8 and its sums take 10 KB, 500 of them 5 MB; pages come and go in hundreds of KB)"
+)
+
+
+def _cache_case(name: str, tried: str, made: Callable) -> Case:
+    return _case(
+        f"cache-{name}", f"the folder of compiled kernels: {tried}", SAME, partial(_without_cache, made)
+    )
+
+
+CASES = (
+    _case("renders-100", "100 renders of 8 x 8 in one process", STAYS, partial(_in_a_row, 100), True),
+    _case("renders-1000", "1,000 of them", STAYS, partial(_in_a_row, 1000)),
+    _case(
+        "scenes-400",
+        "400 of them, each of another scene object by another integrator object",
+        f"{STAYS}; kernels for at most 1 %: Dr.Jit numbers what it calls anew in each scene, and now and "
+        "then "
+        "compiles a kernel of `path`, too",
+        partial(_scenes_in_a_row, 400),
+    ),
+    _case(
+        "alternating-scenes-and-variants",
+        "two scenes under `llvm_ad_rgb` and `llvm_ad_spectral` in turn, three times",
+        SAME,
+        _alternating,
+    ),
+    _case(
+        "edited-scenes",
+        "a scene edited by `mi.traverse` between two renders: light, reflectance, texture, camera, film, "
+        "lamp, mesh",
+        "the image of a scene that was made so: the mean within 1 %, at most 5 % of values other than in "
+        "rounding "
+        "(numbers made along another way differ in the last bits, and few paths take another turn)",
+        partial(_edited, {}),
+        True,
+    ),
+    _case(
+        "edited-scenes-skip-none", "the same with `skip=none`", "the same", partial(_edited, {"skip": "none"})
+    ),
+    _case(
+        "interrupted",
+        "SIGINT at 12 moments of a render, each time the render again",
+        "`KeyboardInterrupt`, in the film the passes that were done (mean within a factor of 2: of one "
+        "sample per "
+        f"pixel); then {SAME}",
+        partial(_interrupted, 12),
+    ),
+    _case(
+        "two-processes",
+        "two processes fill an empty folder of compiled kernels at once, a third one follows",
+        f"{SAME}; the third one compiles nothing",
+        _side_by_side,
+    ),
+    _cache_case("in-a-file", "below a file", _no_folder),
+    _cache_case("read-only", "can't be written", _read_only),
+    _cache_case("full-disk", "on a full disk", _full),
+    _cache_case("no-home", "no `HOME` to put it in", _no_home),
+    _cache_case("spoiled", "kernels cut in half", _spoiled),
+)
