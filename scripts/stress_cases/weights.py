@@ -1,0 +1,174 @@
+"""The weights of all strategies that could have made one path: they sum to 1.
+
+Two layers. Chains: densities drawn at random, all weights by the recursion. Paths of the kernel: vertices of
+paths that it made in random scenes, the weight it gave them, and those of all other strategies by the
+recursion from densities that are asked of the scene anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, seed, settings
+
+import mitsuba as mi  # isort: skip
+
+from . import oracle
+from .capture import Capture
+from .case import Case, Outcome
+from .chains import COEFFICIENTS, random_paths, recursion
+from .oracle import Paths
+from .random_scenes import renders
+
+SECTION = "Weights"
+TOLERANCE = 1e-3
+LENGTH = 6  # edges of the longest path of the kernel
+
+
+@dataclass
+class Tally:
+    """What the weights of ``paths`` were: sums that are ``off`` by more than the tolerance and the ``worst``
+    error of one; paths with a weight that is negative, above 1 or not finite are ``bad``; ``ties``: left out
+    because two densities are equal but for rounding; ``span``: most orders of magnitude between two densities
+    of one path, ``wide`` paths with more than 60. Of the kernel: ``differ``: its largest difference from the
+    weight by explicit densities; ``unsure`` see `capture.Made`."""
+
+    paths: int = 0
+    off: int = 0
+    worst: float = 0.0
+    bad: int = 0
+    ties: int = 0
+    span: float = 0.0
+    wide: int = 0
+    differ: float = 0.0
+    unsure: int = 0
+
+    def add(self, weights, used, tied=None):
+        """Weights of paths, (n, k + 2); which strategies can make them; which paths do not count."""
+        self.bad += int((used & ~((weights >= 0) & (weights <= 1))).any(1).sum())
+        counted = used.any(1) if tied is None else used.any(1) & ~tied
+        error = np.abs(np.where(used, weights, 0).sum(1) - 1)[counted]
+        self.ties += 0 if tied is None else int((tied & used.any(1)).sum())
+        self.paths += len(error)
+        self.off += int((~(error <= TOLERANCE)).sum())
+        self.worst = max(self.worst, float(error.max(initial=0)))
+
+    def outcome(self, more="") -> Outcome:
+        """Whether all sums are 1, and what was seen."""
+        text = (
+            f"{self.paths:,} paths, sums off by {self.worst:.1e} at most, {self.bad} weights outside [0, 1]"
+        )
+        text += f", {self.off} sums off by more than {TOLERANCE}" if self.off else ""
+        text += f", {self.ties} ties left out" if self.ties else ""
+        return Outcome(self.bad == self.off == 0 and self.paths > 0, text + more)
+
+
+# -- chains ---------------------------------------------------------------------------------------
+
+
+def wide_paths(rng, n: int, k: int) -> Paths:
+    """Random paths, each density over twelve orders of magnitude at most, but larger from one end than from
+    the other all along a path, so that those of its strategies are far apart."""
+    paths = random_paths(rng, n, k, decades=rng.choice([1.0, 3.0, 6.0]))
+    drift = 10 ** rng.uniform(-5, 5, (n, 1))
+    paths.to_camera = (paths.to_camera * drift).astype(np.float32)
+    paths.to_light = (paths.to_light / drift).astype(np.float32)
+    return paths
+
+
+def span(size) -> np.ndarray:
+    """Orders of magnitude between the largest and the smallest of the logarithms in each row."""
+    used = np.isfinite(size)
+    low, high = np.where(used, size, np.inf).min(1), np.where(used, size, -np.inf).max(1)
+    return np.where(used.any(1), high - low, 0) / np.log(10)
+
+
+def chains(heuristic: str, batches: int, size: int) -> Outcome:
+    """Sums of the recursion's weights over ``batches`` of so many chains of 1 to 8 edges."""
+    rng, tally, kappas = np.random.default_rng(7), Tally(), list(COEFFICIENTS.values())
+    for batch in range(batches):
+        k, kappa = 8 - batch % 8, kappas[batch % len(kappas)]
+        paths = wide_paths(rng, size, k)
+        weights = recursion(paths, kappa, heuristic)
+        explicit = oracle.Explicit(paths, kappa)
+        tally.add(weights, explicit.used, explicit.tied if heuristic == "maximum" else None)
+        orders = span(explicit.size)
+        tally.span, tally.wide = max(tally.span, orders.max()), tally.wide + int((orders > 60).sum())
+    more = f"; densities of a path up to 10^{tally.span:.0f} apart, more than 10^60 in {tally.wide:,} paths"
+    return tally.outcome(more)
+
+
+EXTREMES = ("to_camera", "to_light", "first", "second", "direct", "sensor_pdf")
+
+
+def extremes(batches: int, size: int) -> Outcome:
+    """Every density 1e-30, 1 or 1e30: weights of all heuristics are numbers in [0, 1]."""
+    rng, tally = np.random.default_rng(8), Tally()
+    for batch in range(batches):
+        paths = random_paths(rng, size, 8 - batch % 8)
+        for field in EXTREMES:
+            shape = getattr(paths, field).shape
+            setattr(paths, field, rng.choice(np.float32([1e-30, 1, 1e30]), shape))
+        kappa = COEFFICIENTS["odd"]
+        used = oracle.Explicit(paths, kappa).used
+        tally.add(recursion(paths, kappa, ("balance", "power", "maximum", "uniform")[batch // 8 % 4]), used)
+    share = tally.off / tally.paths
+    text = f"{tally.paths:,} paths, {tally.bad} weights outside [0, 1]; {share:.0%} of the sums are not 1"
+    return Outcome(tally.bad == 0, text)
+
+
+# -- paths of the kernel --------------------------------------------------------------------------
+
+
+def weigh(tally: Tally, capture: Capture, heuristic: str):
+    """Add the paths of a run: the kernel's own weight of the strategy that made a path, with those of the
+    others by the recursion."""
+    made = [m for m in capture.made() if len(m.weights)]
+    for k in sorted({m.paths.k for m in made}):
+        group = [m for m in made if m.paths.k == k]
+        paths = Paths.joined([m.paths for m in group])
+        own = np.concatenate([m.weights for m in group])
+        at = np.arange(len(own)), np.repeat([m.s for m in group], [len(m.weights) for m in group])
+        explicit = oracle.Explicit(paths, capture.coefficients)
+        expected = explicit.weights(heuristic)
+        tied = explicit.tied if heuristic == "maximum" else np.zeros(len(own), dtype=bool)
+        weights, used = recursion(paths, capture.coefficients, heuristic), explicit.used.copy()
+        weights[at], used[at] = own, True
+        tally.add(weights, used, tied)
+        differ = np.abs(own - expected[at])[~tied]
+        tally.differ = max(tally.differ, float(differ.max(initial=0)))
+        tally.unsure += sum(m.unsure for m in group)
+
+
+def of_the_kernel(heuristic: str, count: int, lanes: int, number: int = 1) -> Outcome:
+    """Paths of the kernel in ``count`` random scenes."""
+    tally, failed = Tally(), []
+
+    @seed(number)
+    @settings(
+        max_examples=count,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(renders())
+    def check(render):
+        scene, parameters = render
+        before = tally.off, tally.bad
+        integrator = {"type": "bdpt", "max_depth": LENGTH, "heuristic": heuristic} | parameters
+        capture = Capture(mi.load_dict(scene), mi.load_dict(integrator), lanes, number)
+        weigh(tally, capture, heuristic)
+        if (tally.off, tally.bad) != before:
+            failed.append(render)
+
+    check()
+    more = f"; {count} scenes, the kernel's weights differ from those by explicit densities by {tally.differ:.1e} "
+    more += f"at most; {tally.unsure} paths left out at the rim of a disk of the sky" * (tally.unsure > 0)
+    more += f"; first scene that fails: {failed[0]}" if failed else ""
+    return tally.outcome(more)
+
+
+CASES = ()
