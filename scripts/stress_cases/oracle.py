@@ -167,8 +167,8 @@ def log_densities(paths: Paths) -> np.ndarray:
 
 
 class Explicit:
-    """All strategies of ``paths`` under ``coefficients``: ``size`` log kappa p, (n, k + 2), and ``used``, where
-    that is finite."""
+    """All strategies of ``paths`` under ``coefficients``: ``size`` log kappa p, (n, k + 2), and ``used``,
+    where that is finite."""
 
     def __init__(self, paths: Paths, coefficients: Coefficients):
         kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])

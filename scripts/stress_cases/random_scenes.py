@@ -7,7 +7,10 @@ from hypothesis import strategies as st
 
 import mitsuba as mi  # isort: skip
 
-T = mi.ScalarTransform4f
+
+def T():
+    """The identity; there is no such type before a variant is set."""
+    return mi.ScalarTransform4f()
 
 
 def bitmap(pixels):

@@ -55,14 +55,13 @@ class Tally:
         self.off += int((~(error <= TOLERANCE)).sum())
         self.worst = max(self.worst, float(error.max(initial=0)))
 
-    def outcome(self, more="") -> Outcome:
-        """Whether all sums are 1, and what was seen."""
-        text = (
-            f"{self.paths:,} paths, sums off by {self.worst:.1e} at most, {self.bad} weights outside [0, 1]"
-        )
+    def outcome(self, more="", least=1) -> Outcome:
+        """Whether all sums of at ``least`` so many paths are 1, and what was seen."""
+        text = f"{self.paths:,} paths, sums off by {self.worst:.1e} at most"
+        text += f", {self.bad} with a weight outside [0, 1]"
         text += f", {self.off} sums off by more than {TOLERANCE}" if self.off else ""
         text += f", {self.ties} ties left out" if self.ties else ""
-        return Outcome(self.bad == self.off == 0 and self.paths > 0, text + more)
+        return Outcome(self.bad == self.off == 0 and self.paths >= least, text + more)
 
 
 # -- chains ---------------------------------------------------------------------------------------
@@ -142,8 +141,8 @@ def weigh(tally: Tally, capture: Capture, heuristic: str):
         tally.unsure += sum(m.unsure for m in group)
 
 
-def of_the_kernel(heuristic: str, count: int, lanes: int, number: int = 1) -> Outcome:
-    """Paths of the kernel in ``count`` random scenes."""
+def of_the_kernel(heuristic: str, count: int, lanes: int, number: int, least: int) -> Outcome:
+    """At ``least`` so many paths of the kernel in ``count`` random scenes; ``number`` is the seed."""
     tally, failed = Tally(), []
 
     @seed(number)
@@ -165,10 +164,65 @@ def of_the_kernel(heuristic: str, count: int, lanes: int, number: int = 1) -> Ou
             failed.append(render)
 
     check()
-    more = f"; {count} scenes, the kernel's weights differ from those by explicit densities by {tally.differ:.1e} "
-    more += f"at most; {tally.unsure} paths left out at the rim of a disk of the sky" * (tally.unsure > 0)
+    more = (
+        f"; {count} scenes; the kernel's weight differs by {tally.differ:.1e} at most from that by explicit "
+    )
+    more += "densities"
+    more += f"; {tally.unsure} paths left out at the rim of a disk of the sky" if tally.unsure else ""
     more += f"; first scene that fails: {failed[0]}" if failed else ""
-    return tally.outcome(more)
+    return tally.outcome(more, least)
 
 
-CASES = ()
+# -- cases ----------------------------------------------------------------------------------------
+
+SUMS = (
+    "every sum is 1 within 1e-3 and no weight is negative, above 1 or not finite; float32 alone is off by "
+    "1e-6: some ten roundings of 6e-8 per vertex"
+)
+TIES = {"maximum": "; paths whose two largest densities are within 1e-4 of each other are left out"}
+
+
+def _chains(heuristic: str, batches: int, size: int, quick=False) -> Case:
+    return Case(
+        f"weights-chains-{heuristic}",
+        SECTION,
+        f"`{heuristic}`: weights of all strategies of random chains of 1 to 8 edges by the recursion, "
+        "densities over up to 12 orders of magnitude each, larger from one end all along a path",
+        SUMS + TIES.get(heuristic, ""),
+        partial(chains, heuristic, batches, size),
+        quick,
+    )
+
+
+def _paths(heuristic: str, count: int, lanes: int, number: int, least: int, quick=False) -> Case:
+    return Case(
+        f"weights-paths-{heuristic}",
+        SECTION,
+        f"`{heuristic}`: paths that the kernel makes in random scenes (hypothesis: shapes, BSDFs, emitters, "
+        "sensors, coefficients); its own weight, and those of all other strategies from densities asked of "
+        "the scene anew",
+        SUMS + TIES.get(heuristic, "") + f"; {least:,} paths at least",
+        partial(of_the_kernel, heuristic, count, lanes, number, least),
+        quick,
+    )
+
+
+CASES = (
+    _paths("balance", 20, 1 << 17, 3, 10**7),
+    _paths("power", 8, 1 << 15, 4, 10**6),
+    _paths("maximum", 8, 1 << 15, 5, 10**6),
+    _paths("uniform", 2, 1 << 12, 6, 10**4, quick=True),
+    _chains("balance", 26, 1 << 17),
+    _chains("power", 26, 1 << 17),
+    _chains("maximum", 26, 1 << 17),
+    _chains("uniform", 4, 1 << 14, quick=True),
+    Case(
+        "weights-extremes",
+        SECTION,
+        "each density 1e-30, 1 or 1e30, whatever its neighbours are, all heuristics",
+        "no weight is negative, above 1 or not finite. (Sums are not asked for: products leave the range of "
+        "float32, and what passes 1e37 on the way is cut there)",
+        partial(extremes, 32, 1 << 12),
+        quick=True,
+    ),
+)
