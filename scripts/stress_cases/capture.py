@@ -51,7 +51,8 @@ class Walked:
 @dataclass
 class Made:
     """Paths that the kernel made with ``s`` light vertices: the ``weights`` it gave them; ``unsure`` counts
-    those left out, where rounding decides which disk light from infinity has started on."""
+    those left out, where rounding decides which disk light from infinity has started on, or whether a point
+    lies on a lamp."""
 
     s: int
     weights: np.ndarray
@@ -246,7 +247,9 @@ class Capture:
         camera = lens, lens_pdf, self.camera.density(d[:, -1])
         sure = np.ones(len(d), dtype=bool)
         if self.disks is not None:
-            sure = ~(infinite & self.disks.unsure(x[:, 1], d[:, 0]))
+            sure &= ~(infinite & self.disks.unsure(x[:, 1], d[:, 0]))
+        for number, lamp in enumerate(self.lamps):
+            sure &= ~((index == number) & lamp.unsure(x[:, 1]))
         return Paths(dist2, cos_light, cos_camera, *pdfs, kind, *ends, *camera), sure
 
     def _ends(self, index, x, d, dist2, cos_light):

@@ -37,7 +37,8 @@ def length2(a):
 @dataclass
 class Lamp:
     """An emitter: its ``kind`` and ``probability`` of being chosen, ``area`` of its shape, ``center`` and
-    ``radius`` of a sphere (0 of other shapes), solid angle ``cone`` into which it shines from a point."""
+    ``radius`` of a sphere that shines outwards (0 of other shapes), solid angle ``cone`` into which it shines
+    from a point."""
 
     emitter: object
     kind: int
@@ -81,13 +82,18 @@ class Lamp:
             return self.probability * self.of_direction(-d)
         by_area = dist2 / (cos * self.area)
         if self.radius:
-            # Mitsuba samples the cone of a sphere from outside.
-            sin2 = self.radius**2 / length2(x1 - self.center)
-            outside = sin2 < 1 - 1e-4  # points of the sphere itself see it from inside only
-            sin2 = np.where(outside, sin2, 0.5)
-            cone = 2 * np.pi * sin2 / (1 + np.sqrt(1 - sin2))
-            by_area = np.where(outside, 1 / cone, by_area)
+            # Mitsuba samples the cone of a sphere that is seen from outside.
+            sin2 = np.minimum(self._sin2(x1), 1)
+            return self.probability * (1 + np.sqrt(1 - sin2)) / (2 * np.pi * sin2)
         return self.probability * by_area
+
+    def _sin2(self, x1):
+        """Squared sine of half the angle under which a sphere is seen."""
+        return self.radius**2 / length2(x1 - self.center)
+
+    def unsure(self, x1):
+        """Where rounding decides whether a sphere is seen from outside."""
+        return self._sin2(x1) > 1 - 1e-5 if self.radius else np.zeros(len(x1), dtype=bool)
 
 
 @dataclass
@@ -149,10 +155,11 @@ def _lamp(emitter, probability) -> Lamp:
         lamp.cone = 2 * np.pi * (1 - np.cos(cutoff))
     if shape is not None:
         lamp.area = float(np.array(shape.surface_area()).ravel()[0])
-        if shape.class_name() == "Sphere":
-            box = shape.bbox()
-            lamp.center = (np.array(box.min) + np.array(box.max)) / 2
-            lamp.radius = float(box.max[0] - box.min[0]) / 2
+        box, at = shape.bbox(), shape.sample_position(0, mi.Point2f(0.5))
+        middle = (np.array(box.min, dtype=np.float64) + np.array(box.max)) / 2
+        outwards = np.array(at.n).ravel() @ (np.array(at.p).ravel() - middle) > 0
+        if shape.class_name() == "Sphere" and outwards:
+            lamp.center, lamp.radius = middle, float(box.max[0] - box.min[0]) / 2
     return lamp
 
 

@@ -168,7 +168,11 @@ def of_the_kernel(heuristic: str, count: int, lanes: int, number: int, least: in
         f"; {count} scenes; the kernel's weight differs by {tally.differ:.1e} at most from that by explicit "
     )
     more += "densities"
-    more += f"; {tally.unsure} paths left out at the rim of a disk of the sky" if tally.unsure else ""
+    more += (
+        f"; {tally.unsure} paths left out at the rim of a disk of the sky or on a lamp"
+        if tally.unsure
+        else ""
+    )
     more += f"; first scene that fails: {failed[0]}" if failed else ""
     return tally.outcome(more, least)
 
