@@ -227,8 +227,8 @@ class Capture:
         index = self._index(s, t)
         keep = np.flatnonzero(np.broadcast_to(np.array(c.active), self.lanes))
         weights = np.broadcast_to(np.array(c.weight), self.lanes)[keep]
-        stacked = [np.stack([getattr(v, name) for v in points], axis=1)[keep] for name in POINT]
-        paths, sure = self._paths(index[keep], stacked, np.stack(d, axis=1)[keep])
+        stacked = [np.stack([getattr(v, name)[keep] for v in points], axis=1) for name in POINT]
+        paths, sure = self._paths(index[keep], stacked, np.stack([edge[keep] for edge in d], axis=1))
         return Made(s, weights[sure], paths.of(sure), int((~sure).sum()))
 
     def _paths(self, index, stacked, d):
