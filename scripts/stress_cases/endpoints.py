@@ -93,7 +93,7 @@ class Lamp:
 
     def unsure(self, x1):
         """Where rounding decides whether a sphere is seen from outside."""
-        return self._sin2(x1) > 1 - 1e-5 if self.radius else np.zeros(len(x1), dtype=bool)
+        return self._sin2(x1) > 1 - 1e-4 if self.radius else np.zeros(len(x1), dtype=bool)
 
 
 @dataclass

@@ -183,6 +183,12 @@ class Explicit:
         """Mask (n,) of paths whose two best strategies are within 1e-4 of each other."""
         return np.sort(self._ratio, axis=1)[:, -2] > 1 - 1e-4
 
+    @property
+    def ambiguous(self):
+        """Mask (n,) of paths of which rounding decides under ``maximum``: a strategy lies about 1e-4 below
+        the best. Closer ones are equal to the kernel: that with the fewest light vertices counts."""
+        return ((self._ratio < 1 - 5e-5) & (self._ratio > 1 - 2e-4)).any(1)
+
     def weights(self, heuristic: str):
         """Weights (n, k + 2), zero where a strategy is not in use."""
         ratio = self._ratio
