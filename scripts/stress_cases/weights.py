@@ -32,8 +32,8 @@ class Tally:
     """What the weights of ``paths`` were: sums that are ``off`` by more than the tolerance and the ``worst``
     error of one; paths with a weight that is negative, above 1 or not finite are ``bad``; ``ties``: left out
     because rounding decides which density is the largest; ``span``: most orders of magnitude between two
-    densities of one path, ``wide`` paths with more than 60. Of the kernel: ``differ``: its largest difference from the
-    weight by explicit densities; ``unsure`` see `capture.Made`."""
+    densities of one path, ``wide`` paths with more than 60. Of the kernel: ``differ``: its largest difference
+    from the weight by explicit densities; ``unsure`` see `capture.Made`."""
 
     paths: int = 0
     off: int = 0
