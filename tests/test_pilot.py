@@ -182,8 +182,8 @@ def test_narrow_spot_is_not_noisier_than_path(fov):
 
     Expected: with default parameters the variance, from 16 renders of 32 samples, summed over the image, is
     not above that of `path` with independent numbers (10 % allowed: twice the standard error of the ratio).
-    Of a part of the spot a pixel gets few splats: with light_paths=1/4 given by hand the image is 20,000 times
-    as noisy as `path`'s, seen as a whole less noisy.
+    Of a part of the spot a pixel gets few splats: with light_paths=1/4 given by hand the image is 20,000
+    times as noisy as `path`'s, seen as a whole less noisy.
     """
     lamp = {
         "type": "spot",
