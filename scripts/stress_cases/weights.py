@@ -201,24 +201,25 @@ def _chains(heuristic: str, batches: int, size: int, quick=False) -> Case:
     )
 
 
-def _paths(heuristic: str, count: int, lanes: int, number: int, least: int, quick=False) -> Case:
+def _paths(name: str, heuristic: str, count: int, lanes: int, number: int, least: int) -> Case:
     return Case(
-        f"weights-paths-{heuristic}",
+        f"weights-paths-{name}",
         SECTION,
         f"`{heuristic}`: paths that the kernel makes in random scenes (hypothesis: shapes, BSDFs, emitters, "
         "sensors, coefficients); its own weight, and those of all other strategies from densities asked of "
         "the scene anew",
         SUMS + TIES.get(heuristic, "") + f"; {least:,} paths at least",
         partial(of_the_kernel, heuristic, count, lanes, number, least),
-        quick,
+        quick=name == "few",
     )
 
 
 CASES = (
-    _paths("balance", 20, 1 << 17, 3, 10**7),
-    _paths("power", 8, 1 << 16, 4, 10**6),
-    _paths("maximum", 8, 1 << 16, 5, 5 * 10**5),
-    _paths("uniform", 2, 1 << 12, 6, 10**4, quick=True),
+    _paths("balance", "balance", 20, 1 << 17, 3, 10**7),
+    _paths("power", "power", 8, 1 << 16, 4, 10**6),
+    _paths("maximum", "maximum", 8, 1 << 16, 5, 5 * 10**5),
+    _paths("uniform", "uniform", 4, 1 << 14, 6, 10**5),
+    _paths("few", "balance", 3, 1 << 11, 7, 10**4),
     _chains("balance", 26, 1 << 17),
     _chains("power", 26, 1 << 17),
     _chains("maximum", 26, 1 << 17),
