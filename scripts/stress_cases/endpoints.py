@@ -155,12 +155,16 @@ def _lamp(emitter, probability) -> Lamp:
         lamp.cone = 2 * np.pi * (1 - np.cos(cutoff))
     if shape is not None:
         lamp.area = float(np.array(shape.surface_area()).ravel()[0])
-        box, at = shape.bbox(), shape.sample_position(0, mi.Point2f(0.5))
+        box = shape.bbox()
         middle = (np.array(box.min, dtype=np.float64) + np.array(box.max)) / 2
-        outwards = np.array(at.n).ravel() @ (np.array(at.p).ravel() - middle) > 0
-        if shape.class_name() == "Sphere" and outwards:
+        if shape.class_name() == "Sphere" and _faces_outwards(shape, middle):
             lamp.center, lamp.radius = middle, float(box.max[0] - box.min[0]) / 2
     return lamp
+
+
+def _faces_outwards(sphere, center) -> bool:
+    hit = sphere.ray_intersect(mi.Ray3f(mi.Point3f(center.tolist()), mi.Vector3f(1, 0, 0)))
+    return float(np.array(hit.n).ravel()[0]) > 0
 
 
 @dataclass
