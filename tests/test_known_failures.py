@@ -138,19 +138,19 @@ def inside_of_a_sphere(bsdf):
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap"])
 def test_no_spikes_inside_a_bumpy_sphere(kind):
     """1 (pbrt-v3 73): the adjoint factor of shading normals was in the walk but not at the join, and
-    spikes were blamed on near vertices. Expected: no pixel above three times its neighbourhood's
-    median, and in each light-side strategy's weighted image no pixel above 12
-    times (its noise at 256 spp). Both bounds are far from what noise does here and far below the
-    spikes (orders of magnitude).
+    spikes were blamed on near vertices. They grow with every bounce of the light subpath. Expected: in the
+    image and in each light-side strategy's weighted image, up to paths of 8 edges, no pixel above three times
+    its neighbourhood's median. Tolerance: noise at 256 spp reaches 2.1; the bug reaches 9 to 12 (bump map),
+    5 to 10 (normal map).
     """
     scene = inside_of_a_sphere(rough(kind))
-    bdpt = integrator(max_depth=4, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=8, rr_depth=50, skip="none", strategy_images=True)
     image = render(scene, bdpt, [1], 256)
-    for name, limit in [(None, 3), *((f"weighted.s{s}t{4 - s}", 12) for s in range(2, 4))]:
+    for name in (None, *(f"weighted.s{k + 1 - t}t{t}" for k in range(3, 9) for t in (1, 2))):
         pixels = (image[..., :3] if name is None else layer(image, bdpt, name))[0].mean(-1)
         padded = np.pad(pixels, 2, mode="reflect")
         around = np.median(np.lib.stride_tricks.sliding_window_view(padded, (5, 5)), axis=(2, 3))
-        assert np.max(pixels / around) < limit
+        assert np.max(pixels / around) < 3, name
 
 
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap", "bumpmap unflipped", "normalmap unflipped"])
@@ -460,17 +460,20 @@ def test_crop_window_equals_the_region_of_the_whole(rfilter):
             agree(tiles(layer(part, bdpt, name), 2), tiles(layer(whole, bdpt, name), 2), 0.3)
 
 
-def test_narrow_spot_on_a_matte_floor():
+@pytest.mark.parametrize("fov", [30, 1.5], ids=["the whole spot is seen", "a fiftieth of the spot is seen"])
+def test_narrow_spot_on_a_matte_floor(fov):
     """7 (pbrt-v4 362): on a floor lit directly by a narrow spot, light tracing (s=2, t=1) was trusted
     too much. Expected: the variance with all strategies is below that of t = 1 alone and within the
-    balance bound of next-event estimation's, mu^2 per sample above it. Tolerance: a tenth (variances
+    balance bound of next-event estimation's, mu^2 per sample above it. Seen as a whole, a lit pixel gets
+    some eight splats per sample, and t = 1 itself is within that bound; of a fiftieth of the spot a pixel
+    gets a splat in fifty samples, and t = 1 alone has fifty times the bound. Tolerance: a tenth (variances
     from 64 seeds, summed over the lit pixels: 5 % noise). Statistic: ratio of summed variances.
     """
     spp = 16
     scene = mi.load_dict(
         {
             "type": "scene",
-            "sensor": camera((0, 4, 0), (0, 0, 0), fov=30, up=(0, 0, 1)),
+            "sensor": camera((0, 4, 0), (0, 0, 0), fov=fov, up=(0, 0, 1)),
             "floor": {
                 "type": "rectangle",
                 "bsdf": diffuse(0.5),
@@ -490,9 +493,10 @@ def test_narrow_spot_on_a_matte_floor():
     splats, direct = (
         layer(images, bdpt, f"unweighted.{name}").var(0, ddof=1).sum() for name in ("s2t1", "s1t2")
     )
-    assert splats > 2 * direct  # the scene shows what it is meant to show
+    bound = direct + np.sum(mean**2) / spp
+    assert splats > (2 * direct if fov == 30 else 20 * bound)  # the scene shows what it is meant to show
     assert total < splats
-    assert total < 1.1 * (direct + np.sum(mean**2) / spp)
+    assert total < 1.1 * bound
 
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .emitter_kinds import AREA, POINT, PROJECTOR, SPOT, check_projector
+from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_projector
 from .objects import children, own_parameters
 
 
@@ -17,7 +17,8 @@ class Placement:
     """Where an emitter is: axes ``x``, ``y``, ``z`` and ``position`` of point and spot lights, their
     constant density of emission ``density_w`` (solid angle) within ``cos_cutoff``; ``position`` of
     projectors. Of a sphere that emits inwards, ``position`` and the ``radius`` up to which it samples as
-    from inside; 0 for all others. Scalars for one emitter, Dr.Jit arrays for a table of them."""
+    from inside; 0 for all others. Of a sphere that is rotated, ``position`` and ``outward`` of `Ball`, 0 for
+    all others. Scalars for one emitter, Dr.Jit arrays for a table of them."""
 
     x: object = (1, 0, 0)
     y: object = (0, 1, 0)
@@ -26,6 +27,7 @@ class Placement:
     density_w: object = 1.0
     cos_cutoff: object = -1.0
     radius: object = 0.0
+    outward: object = 0.0
 
     @staticmethod
     def table(rows):
@@ -43,6 +45,43 @@ class Placement:
     def at(self, index, active):
         """The row ``index``."""
         return Placement(**{k: dr.gather(type(v), v, index, active) for k, v in vars(self).items()})
+
+
+@dataclass
+class Ball:
+    """A sphere: ``center``, ``radius``, and ``outward``, 1 or -1, whether its normals point outwards.
+    ``turned``: Mitsuba's ``sample_position`` rotates the point, but not its normal (and
+    ``eval_parameterization``, by which it samples a texture, does not rotate the point)."""
+
+    center: object
+    radius: float
+    outward: float
+    turned: bool
+
+    @staticmethod
+    def of(shape) -> Ball | None:
+        """Of a shape of Mitsuba's; None if it is not a sphere."""
+        if shape.shape_type() != mi.ShapeType.Sphere.value:
+            return None
+        to_world = own_parameters(shape)["to_world"]
+        center = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
+        d = mi.Vector3f(1, 0, 0)
+        si = shape.ray_intersect(mi.Ray3f(center, d))
+        outward = 1.0 if dr.slice(dr.dot(si.n, d)) > 0 else -1.0
+        ps = shape.sample_position(0, mi.Point2f([0.5, 0.1], [0.5, 0.3]))
+        wrong = dr.squared_norm(ps.n - normal_of_ball(ps.p, center, outward)) > 1e-6
+        return Ball(dr.slice(center), float(dr.slice(si.t)), outward, bool(dr.slice(dr.any(wrong))))
+
+
+def normal_of_ball(p, center, outward):
+    """Normal at the point ``p`` of a sphere, see `Ball`."""
+    return mi.Normal3f(dr.normalize(p - center) * outward)
+
+
+def is_turned_ball(shape) -> bool:
+    """Whether ``shape`` is a sphere that Mitsuba samples wrongly, see `Ball`."""
+    ball = Ball.of(shape)
+    return ball is not None and ball.turned
 
 
 def placement(emitter, kind) -> Placement:
@@ -69,14 +108,11 @@ def placement(emitter, kind) -> Placement:
     if kind == PROJECTOR:
         to_world = own_parameters(emitter)["to_world"]
         return Placement(position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))))
-    if kind == AREA and emitter.get_shape().shape_type() == mi.ShapeType.Sphere.value:
-        to_world = own_parameters(emitter.get_shape())["to_world"]
-        p = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
-        ps = emitter.get_shape().sample_position(0, mi.Point2f(0.5))
-        inwards = dr.slice(dr.dot(ps.n, ps.p - p)) < 0
+    ball = Ball.of(emitter.get_shape()) if kind in (AREA, DIRECTIONAL_AREA) else None
+    if ball is not None:
         # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
-        radius = dr.slice(dr.norm(ps.p - p)) * (1 + 1500 * 2.0**-24) if inwards else 0.0
-        return Placement(position=dr.slice(p), radius=radius)
+        radius = ball.radius * (1 + 1500 * 2.0**-24) if ball.outward < 0 else 0.0
+        return Placement(position=ball.center, radius=radius, outward=ball.outward if ball.turned else 0.0)
     return Placement()
 
 

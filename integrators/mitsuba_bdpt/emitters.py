@@ -47,7 +47,15 @@ from .emitter_kinds import (
     needs_evaluation,
     refuse_curves,
 )
-from .emitter_tables import Placement, Projectors, SmoothMeshes, inverse_table, placement
+from .emitter_tables import (
+    Placement,
+    Projectors,
+    SmoothMeshes,
+    inverse_table,
+    is_turned_ball,
+    normal_of_ball,
+    placement,
+)
 from .infinity import Disks
 from .objects import children, living_emitters, number, share_functions
 
@@ -145,6 +153,7 @@ class Emitters:
         placements = [placement(e, k) for e, k in zip(emitters, kinds, strict=True)]
         self._placements = Placement.table(placements)
         self._inward_spheres = any(p.radius > 0 for p in placements)
+        self._turned_spheres = any(p.outward for p in placements)
         self._projectors = Projectors.of(emitters, kinds)
         self._inverse = inverse_table(self._pointers)
         self.disks = Disks(scene) if self.at_infinity else None
@@ -167,7 +176,10 @@ class Emitters:
         self._inv_area = dr.rcp(mi.Float(areas))
         textured = [is_textured(e, k) for e, k in pairs]
         # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
-        by_texture = [not self._ask_shapes and is_sampled_by_texture(e, k) for e, k in pairs]
+        by_texture = [
+            not self._ask_shapes and is_sampled_by_texture(e, k) and not is_turned_ball(e.get_shape())
+            for e, k in pairs
+        ]
         by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
         self._any_by_texture, self._by_texture = any(by_texture), mi.Bool(by_texture)
         self._any_by_shape, self._by_shape = any(by_shape), mi.Bool(by_shape)
@@ -264,12 +276,20 @@ class Emitters:
         """A point on the shape of an emitter, density included."""
         shape = emitter.get_shape()
         if self._ask_shapes:
-            return shape.sample_position(like.time, u_point, active)
+            return self._upright(shape.sample_position(like.time, u_point, active), index, active)
         # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
         ps, _ = emitter.sample_position(like.time, u_point, active)
         if self._any_by_shape:
             mask = self._is_by_shape(index, active)
             ps = dr.select(mask, shape.sample_position(like.time, u_point, mask), ps)
+        return self._upright(ps, index, active)
+
+    def _upright(self, ps, index, active):
+        """A point that a shape has sampled, with its normal as it should be, see `Ball`."""
+        if self._turned_spheres:
+            ball = self._placements.at(index, active)
+            n = normal_of_ball(ps.p, ball.position, ball.outward)
+            ps.n = dr.select(ball.outward != 0, n, ps.n)
         return ps
 
     def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
@@ -487,7 +507,8 @@ class Emitters:
         ds, weight = emitter.sample_direction(si, u, active)
         if self._any_by_shape:
             mask = self._is_by_shape(index, active)
-            by_shape, its_weight = _sample_shape(emitter, si, u, mask)
+            ps = self._upright(emitter.get_shape().sample_position(si.time, u, mask), index, mask)
+            by_shape, its_weight = _sample_shape(emitter, ps, si, mask)
             ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
         area = self._is(index, active, AREA)
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
@@ -597,10 +618,9 @@ def _all_answer(pointers) -> bool:
     return True
 
 
-def _sample_shape(emitter, si, u, active):
-    """Next-event estimation by a uniform point of the emitter's shape, in Mitsuba's conventions: the
+def _sample_shape(emitter, ps, si, active):
+    """Next-event estimation by the uniform point ``ps`` of the emitter's shape, in Mitsuba's conventions: the
     density is over the cosine with the shading normal, the weight is radiance over density."""
-    ps = emitter.get_shape().sample_position(si.time, u, active)
     ds = dr.zeros(mi.DirectionSample3f)
     ds.p, ds.n, ds.uv, ds.time, ds.emitter = ps.p, ps.n, ps.uv, si.time, emitter
     between = ps.p - si.p

@@ -16,7 +16,7 @@ Edge i joins x_i and x_{i+1}. All arrays have one row per path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -57,6 +57,15 @@ class Paths:
     def k(self) -> int:
         """Number of edges."""
         return self.dist2.shape[1]
+
+    def of(self, chosen) -> Paths:
+        """Those that an index or a mask has ``chosen``."""
+        return Paths(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+    @staticmethod
+    def joined(several) -> Paths:
+        """All of ``several``, of the same number of edges."""
+        return Paths(*(np.concatenate([getattr(p, f.name) for p in several]) for f in fields(Paths)))
 
     @property
     def infinite(self):
@@ -157,30 +166,41 @@ def log_densities(paths: Paths) -> np.ndarray:
     return p
 
 
-def weights(paths: Paths, coefficients: Coefficients, heuristic: str):
-    """Weights of all strategies of each path.
+class Explicit:
+    """All strategies of ``paths`` under ``coefficients``: ``size`` log kappa p, (n, k + 2), and ``used``,
+    where that is finite."""
 
-    Returns ``(w, used, tied)``: weights (n, k + 2), zero where a strategy is not in use; the mask
-    of strategies in use (kappa p > 0); and the mask (n,) of paths whose two best strategies are
-    within 1e-4 of each other.
-    """
-    kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
-    with np.errstate(divide="ignore"):
-        size = log_densities(paths) + np.log(kappa)
-    used = np.isfinite(size)
-    best = size.max(1, keepdims=True, initial=-1e300)
-    ratio = np.where(used, np.exp(np.minimum(size - best, 0)), 0)
-    if heuristic == "balance":
-        part = ratio
-    elif heuristic == "power":
-        part = ratio**2
-    elif heuristic == "maximum":
-        part = (ratio >= 1).astype(float)
-    elif heuristic == "uniform":
-        part = used.astype(float)
-    else:
-        raise ValueError(heuristic)
-    total = part.sum(1, keepdims=True)
-    ordered = np.sort(ratio, axis=1)
-    tied = ordered[:, -2] > 1 - 1e-4
-    return part / np.where(total > 0, total, 1), used, tied
+    def __init__(self, paths: Paths, coefficients: Coefficients):
+        kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
+        with np.errstate(divide="ignore"):
+            self.size = log_densities(paths) + np.log(kappa)
+        self.used = np.isfinite(self.size)
+        best = self.size.max(1, keepdims=True, initial=-1e300)
+        self._ratio = np.where(self.used, np.exp(np.minimum(self.size - best, 0)), 0)
+
+    @property
+    def tied(self):
+        """Mask (n,) of paths whose two best strategies are within 1e-4 of each other."""
+        return np.sort(self._ratio, axis=1)[:, -2] > 1 - 1e-4
+
+    @property
+    def ambiguous(self):
+        """Mask (n,) of paths of which rounding decides under ``maximum``: a strategy lies about 1e-4 below
+        the best. Closer ones are equal to the kernel: that with the fewest light vertices counts."""
+        return ((self._ratio < 1 - 5e-5) & (self._ratio > 1 - 2e-4)).any(1)
+
+    def weights(self, heuristic: str):
+        """Weights (n, k + 2), zero where a strategy is not in use."""
+        ratio = self._ratio
+        if heuristic == "balance":
+            part = ratio
+        elif heuristic == "power":
+            part = ratio**2
+        elif heuristic == "maximum":
+            part = (ratio >= 1).astype(float)
+        elif heuristic == "uniform":
+            part = self.used.astype(float)
+        else:
+            raise ValueError(heuristic)
+        total = part.sum(1, keepdims=True)
+        return part / np.where(total > 0, total, 1)

@@ -1,0 +1,326 @@
+"""Paths that the kernel itself makes, vertex by vertex, with the weights that it gives them.
+
+The kernel's own functions run unchanged, but the loop along a walk is one of Python, so that what it passes
+can be kept. The densities of each path from both sides are asked of the scene anew: BSDFs by their ``pdf``,
+endpoints in closed form (`endpoints`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import drjit as dr
+import numpy as np
+from mitsuba_bdpt import bsdf, connect, kernel, rays, rendering, subpath
+from mitsuba_bdpt.points import Points
+
+import mitsuba as mi  # isort: skip
+
+from .endpoints import Camera, disks_of, dot, lamps_of, length2
+from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
+
+
+@dataclass
+class Point:
+    """A vertex of paths: position, geometric normal, densities of the directions to both neighbours, and
+    whether its event is a delta one."""
+
+    p: np.ndarray
+    n: np.ndarray
+    to_camera: np.ndarray
+    to_light: np.ndarray
+    delta: np.ndarray
+
+
+POINT = tuple(f.name for f in fields(Point))
+
+
+@dataclass
+class Walked:
+    """What a walk passed by, from vertex 1 on: ``vertices``, directions ``d`` of the edges to them, `Point`
+    where the walk went on; ``origin`` vertex 0."""
+
+    origin: object = None
+    vertices: list = field(default_factory=list)
+    d: list = field(default_factory=list)
+    points: list = field(default_factory=list)
+
+
+@dataclass
+class Made:
+    """Paths that the kernel made with ``s`` light vertices: the ``weights`` it gave them; ``unsure`` counts
+    those left out, where rounding decides which disk light from infinity has started on, or whether a point
+    lies on a lamp."""
+
+    s: int
+    weights: np.ndarray
+    paths: Paths
+    unsure: int
+
+
+def rows(v) -> np.ndarray:
+    """A Dr.Jit vector as rows, a number as an array, in float64."""
+    return np.asarray(np.array(v), dtype=np.float64).T
+
+
+def densities(si, to_light, to_camera):
+    """Solid-angle densities with which the BSDF at ``si`` samples each of two local directions from the
+    other: ``to_camera``, ``to_light``."""
+    ctx, plugin = mi.BSDFContext(), si.bsdf()
+    forward = plugin.pdf(ctx, bsdf.with_wi(si, to_light), to_camera)
+    return forward, plugin.pdf(ctx, bsdf.with_wi(si, to_camera), to_light)
+
+
+class Capture:
+    """One run of the kernel over ``lanes`` pairs of subpaths; `made` yields all paths."""
+
+    def __init__(self, scene, integrator, lanes: int, seed: int):
+        self.scene, self.lanes = scene, lanes
+        render = rendering.Render(scene, scene.sensors()[0], integrator.settings, seed, 1)
+        self.world, self.plan = render.world, render.plan
+        self.kernel = render.kernel.bound(Points("independent", dr.opaque(mi.UInt32, seed)), 1.0)
+        self.depth = integrator.settings.max_depth
+        self.lamps, self.camera = lamps_of(scene), Camera.of(scene.sensors()[0])
+        self.disks = disks_of(self.world.emitters.disks)
+        self.walked = {"light": Walked(), "camera": Walked()}
+        self.found, self.endpoint = {}, {}
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False):
+            self._run()
+
+    @property
+    def coefficients(self) -> Coefficients:
+        """With which the classes enter the weights."""
+        kappa = self.kernel.kappa
+        names = ("endpoints", "splat", "inner", "arrival")
+        return Coefficients(*(float(np.array(getattr(kappa, name)).ravel()[0]) for name in names))
+
+    # -- the run ----------------------------------------------------------------------------
+
+    def _run(self):
+        k, lane = self.kernel, dr.arange(mi.UInt32, self.lanes)
+        pixels = int(np.prod(k.camera.region.size))
+        place = SimpleNamespace(index=mi.UInt64, pixel=lambda slot: k.camera.region.pixel(slot % pixels))
+        emitters = k.emitters
+        emit, choose = emitters.sample_emission, emitters.sample_direct
+
+        def emission(*arguments):
+            self.emission = emit(*arguments)
+            return self.emission
+
+        def direct(si, u, active):
+            self.choice = u
+            return choose(si, u, active)
+
+        with (
+            patch.object(kernel, "random_walk", self._walk),
+            patch.object(emitters, "sample_emission", emission),
+            patch.object(emitters, "sample_direct", direct),
+            patch.object(connect, "join_endpoints", self._join_endpoints(connect.join_endpoints)),
+        ):
+            stream = k.points.stream("light", mi.UInt64(lane), lane)
+            shared = kernel._shared(k, stream)
+            kernel._light_subpath(k, self, stream, shared, None)
+            common = kernel._Lane(place, shared, None)
+            kernel._camera_subpath(k, self, common, lane, self._counters(), mi.Bool(True))
+
+    def _join_endpoints(self, original):
+        def joined(k, emission, stream, counters, active):
+            u = connect._sensor_points(k, stream)
+            join = k.camera.join(emission.si.p, *u)
+            distant = k.camera.join_direction(emission.d, *u)
+            self.endpoint[1, 1] = dr.select(emission.infinite, distant, join)
+            return original(k, emission, stream, counters, active)
+
+        return joined
+
+    # Where the kernel puts contributions that no walk finds: it is a sink, see `sinks`.
+
+    alpha = False
+
+    def begin(self):
+        """Nothing found yet."""
+        return mi.Float(0)
+
+    def splat(self, kernel_, c, position, shared, counters):
+        """Keep (1,1); walks are seen by `_walk`."""
+        dr.eval(c)
+        self.found[1, 1] = c
+
+    def end(self, *_):
+        """Nothing to add up."""
+
+    def _counters(self):
+        return dict.fromkeys(kernel.COUNTERS, mi.UInt32(0))
+
+    def _walk(self, k, side, walk, stream, visit, state):
+        """In the place of `subpath.random_walk`."""
+        walked = self.walked[side.name]
+        dr.make_opaque(walk, self.emission)
+        walked.origin = mi.Point3f(walk.previous)
+        for edges in range(1, self.depth + 1):
+            vertex = subpath._arrive(k, side, walk)
+            step = subpath._interact(k, side, walk, vertex, stream)
+            visited = self._visit_light if side.adjoint else self._visit_camera
+            found = visited(edges, vertex, stream, walk)
+            after = subpath._leave(k, side, walk, vertex, step, stream)
+            pair = (vertex.si.wi, step.wo) if side.adjoint else (step.wo, vertex.si.wi)
+            asked = densities(vertex.si, *pair)
+            dr.eval(vertex, step, list(found.values()), after, asked, list(self.endpoint.values()))
+            self.found.update(found)
+            walked.vertices.append(vertex)
+            walked.d.append(self._wide(rows(walk.d)))
+            walked.points.append(self._point(vertex.si, *(rows(x) for x in asked), np.array(step.delta)))
+            walk = after
+        return state, walk
+
+    def _point(self, si, to_camera, to_light, delta=False) -> Point:
+        arrays = (np.broadcast_to(x, self.lanes) for x in (to_camera, to_light, delta))
+        return Point(self._wide(rows(si.p)), self._wide(rows(si.n)), *arrays)
+
+    def _visit_light(self, edges, vertex, stream, walk):
+        found, counters = {}, self._counters()
+        if self.plan.arrival:
+            found[edges + 1, 0], _ = connect.arrive(self.kernel, self.emission, vertex, walk)
+            self.endpoint[edges + 1, 0] = self._on_lens(vertex, walk)
+        if self.plan.splat:
+            found[edges + 1, 1], _ = connect.splat(self.kernel, vertex, stream, counters)
+        return found
+
+    def _visit_camera(self, edges, vertex, stream, walk):
+        found, counters = {}, self._counters()
+        if self.plan.hit:
+            found[0, edges + 1] = connect.hit_emitter(self.kernel, vertex)
+        if self.plan.direct:
+            found[1, edges + 1] = connect.next_event(self.kernel, vertex, counters)
+            self.endpoint[1, edges + 1] = mi.Point2f(self.choice)
+        return found
+
+    def _on_lens(self, vertex, walk):
+        distance2 = self.kernel.camera.arrive(walk, vertex, mi.Bool(False)).dist2
+        return walk.previous + walk.d * dr.sqrt(distance2)
+
+    # -- paths ------------------------------------------------------------------------------
+
+    def made(self):
+        """All paths, by s and number of edges."""
+        for (s, t), c in sorted(self.found.items()):
+            if s + t <= self.depth + 1:
+                yield self._made(s, t, c)
+        if self.plan.connections != "all":
+            return
+        for s in range(2, self.depth):
+            for t in range(2, self.depth + 2 - s):
+                yield self._inner(s, t)
+
+    def _inner(self, s, t):
+        y, z = self.walked["light"].vertices[s - 2], self.walked["camera"].vertices[t - 2]
+        c = connect.inner(self.kernel, z, y)
+        c.active &= y.hit & bsdf.connectible(y.bsdf) & bsdf.connectible(z.bsdf)
+        ray = rays.segment(z.anchor, y.anchor, z.si)
+        c.active &= ~rays.occluded(self.scene, ray, c.active)
+        return self._made(s, t, c)
+
+    def _made(self, s, t, c) -> Made:
+        points, d = self._joined(s, t)
+        index = self._index(s, t)
+        keep = np.flatnonzero(np.broadcast_to(np.array(c.active), self.lanes))
+        weights = np.broadcast_to(np.array(c.weight), self.lanes)[keep]
+        stacked = [np.stack([getattr(v, name)[keep] for v in points], axis=1) for name in POINT]
+        paths, sure = self._paths(index[keep], stacked, np.stack([edge[keep] for edge in d], axis=1))
+        return Made(s, weights[sure], paths.of(sure), int((~sure).sum()))
+
+    def _paths(self, index, stacked, d):
+        """The `Paths` through vertices, fields of `Point` side by side, along the directions ``d``; and where
+        their densities are certain."""
+        x, n, *pdfs = stacked
+        kind = np.array([lamp.kind for lamp in self.lamps])[index]
+        infinite = (kind == ENVIRONMENT) | (kind == DIRECTIONAL)
+        dist2 = length2(x[:, 1:] - x[:, :-1])
+        cos_light, cos_camera = np.abs(dot(n[:, :-1], d)), np.abs(dot(n[:, 1:], d))
+        dist2[infinite, 0], cos_light[kind != AREA, 0] = 1, 1
+        cos_camera[:, -1] = np.abs(d[:, -1] @ self.camera.axis)
+        ends = self._ends(index, x, d, dist2, cos_light)
+        lens = np.full(len(d), self.camera.radius > 0)
+        lens_pdf = np.full(len(d), self.camera.lens_density())
+        camera = lens, lens_pdf, self.camera.density(d[:, -1])
+        sure = np.ones(len(d), dtype=bool)
+        if self.disks is not None:
+            sure &= ~(infinite & self.disks.unsure(x[:, 1], d[:, 0]))
+        for number, lamp in enumerate(self.lamps):
+            sure &= ~((index == number) & lamp.unsure(x[:, 1]))
+        return Paths(dist2, cos_light, cos_camera, *pdfs, kind, *ends, *camera), sure
+
+    def _ends(self, index, x, d, dist2, cos_light):
+        """Densities of the emitter's strategies: ``first``, ``second``, ``direct``."""
+        first, second, direct = (np.zeros(len(index)) for _ in range(3))
+        for number, lamp in enumerate(self.lamps):
+            of = index == number
+            if not of.any():
+                continue
+            x1, leaving, cos = x[of, 1], d[of, 0], cos_light[of, 0]
+            first[of] = lamp.first(leaving)
+            second[of] = lamp.second(cos, x1, leaving, self.disks)
+            direct[of] = lamp.direct(cos, dist2[of, 0], x1, leaving)
+            if lamp.kind in (ENVIRONMENT, DIRECTIONAL) and x.shape[1] == 2:
+                second[of] *= self.disks.covers(x1, leaving)
+        return first, second, direct
+
+    def _index(self, s, t):
+        """Of the emitter at x_0."""
+        if s >= 2 or (s, t) == (1, 1):
+            found = np.array(self.emission.index)
+        elif s == 1:
+            found = np.array(self.scene.sample_emitter(self.endpoint[s, t].x)[0])
+        else:
+            pointers = np.array(dr.reinterpret_array(mi.UInt32, self.scene.emitters_dr()))
+            hit = self.walked["camera"].vertices[t - 2].si.emitter(self.scene)
+            ids = np.array(dr.reinterpret_array(mi.UInt32, hit))
+            found = np.argmax(ids[:, None] == pointers, axis=1)
+        return np.broadcast_to(found, self.lanes).astype(int)
+
+    def _joined(self, s, t):
+        """All vertices as `Point` from the light on, and the directions of light along the edges."""
+        light, camera = self.walked["light"], self.walked["camera"]
+        towards, between, first, last = None, [], [], []
+        y = light.vertices[s - 2] if s >= 2 and t else None
+        z = camera.vertices[t - 2] if t >= 2 and s else None
+        if s == 0:
+            first = [self._free(camera.vertices[t - 2].si.p, camera.vertices[t - 2].si.n)]
+        elif s == 1 and t >= 2:
+            first = [self._free(z.endpoint.anchor.p, z.endpoint.anchor.n)]
+            towards = -z.endpoint.d
+        else:
+            first = [self._free(self.emission.si.p, self.emission.anchor.n)]
+        if t >= 2:
+            last = [self._free(camera.origin)]
+        elif t == 1:
+            join = y.endpoint if y is not None else self.endpoint[1, 1]
+            last, towards = [self._free(join.p)], join.d
+        else:
+            last = [self._free(self.endpoint[s, 0])]
+        if y is not None and z is not None:
+            towards = dr.normalize(z.si.p - y.si.p)
+        if towards is not None:
+            between = [self._wide(rows(towards))]
+        middle = [*light.points[: max(s - 2, 0)]]
+        middle += [self._at(y.si, y.si.wi, y.si.to_local(towards))] if y is not None else []
+        middle += [self._at(z.si, z.si.to_local(-towards), z.si.wi)] if z is not None else []
+        middle += camera.points[: max(t - 2, 0)][::-1]
+        back = [-d for d in camera.d[: max(t - 1, 0)]][::-1]
+        return [*first, *middle, *last], [*light.d[: max(s - 1, 0)], *between, *back]
+
+    def _free(self, p, n=(0, 0, 0)) -> Point:
+        """An endpoint."""
+        zeros = np.zeros(self.lanes)
+        return Point(self._wide(rows(p)), self._wide(rows(n)), zeros, zeros, zeros.astype(bool))
+
+    def _at(self, si, to_light, to_camera) -> Point:
+        """A surface's point at an end of the connecting edge."""
+        asked = densities(si, to_light, to_camera)
+        dr.eval(asked)
+        return self._point(si, *(rows(x) for x in asked))
+
+    def _wide(self, array):
+        return np.broadcast_to(array, (self.lanes, 3))

@@ -1,0 +1,165 @@
+"""Random scenes, drawn by hypothesis: shapes, BSDFs, emitters, sensors, and which strategies are in use."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+
+import mitsuba as mi  # isort: skip
+
+
+def T():
+    """The identity; there is no such type before a variant is set."""
+    return mi.ScalarTransform4f()
+
+
+def bitmap(pixels):
+    """A texture that is not a colour."""
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)), "raw": True}
+
+
+def waves():
+    """A height field for bump maps."""
+    y, x = np.mgrid[0:32, 0:32] / 32 * 2 * np.pi
+    return (0.5 + 0.15 * (np.sin(3 * x) + np.sin(2 * y + x)))[..., None]
+
+
+def tilts():
+    """Normals of a wavy surface in tangent space."""
+    y, x = np.mgrid[0:32, 0:32] / 32 * 2 * np.pi
+    n = np.stack([0.3 * np.sin(2 * x), 0.3 * np.sin(3 * y), np.ones_like(x)], axis=-1)
+    return (n / np.linalg.norm(n, axis=-1, keepdims=True) + 1) / 2
+
+
+def diffuse(value=0.6):
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [value, value, value]}}
+
+
+def sides(bsdf):
+    return {"type": "twosided", "bsdf": bsdf}
+
+
+def rough(kind, alpha):
+    return {"type": kind, "alpha": alpha}
+
+
+# By name, of a roughness.
+BSDFS = {
+    "diffuse": lambda a: sides(diffuse()),
+    "conductor": lambda a: sides({"type": "conductor"}),
+    "dielectric": lambda a: {"type": "dielectric"},
+    "thindielectric": lambda a: {"type": "thindielectric"},
+    "plastic": lambda a: sides({"type": "plastic"}),
+    "roughconductor": lambda a: sides(rough("roughconductor", a)),
+    "roughdielectric": lambda a: rough("roughdielectric", a),
+    "roughplastic": lambda a: sides(rough("roughplastic", a)),
+    "principled": lambda a: {"type": "principled", "roughness": a, "metallic": 0.3, "spec_trans": 0.3},
+    "mask": lambda a: {"type": "mask", "opacity": 0.6, "bsdf": sides(diffuse())},
+    "blend": lambda a: sides(
+        {"type": "blendbsdf", "weight": 0.4, "one": diffuse(), "two": rough("roughconductor", a)}
+    ),
+    "bumpmap": lambda a: sides({"type": "bumpmap", "height": bitmap(waves()), "bsdf": diffuse()}),
+    "normalmap": lambda a: sides(
+        {"type": "normalmap", "normalmap": bitmap(tilts()), "bsdf": rough("roughconductor", a)}
+    ),
+}
+
+
+def turned(center, angle, scale=1.0):
+    return T().translate(center).rotate([0.26726124, 0.53452248, 0.80178373], angle).scale(scale)
+
+
+SHAPES = {
+    name: lambda center, angle, size, name=name: {"type": name, "to_world": turned(center, angle, size)}
+    for name in ("sphere", "cube", "disk", "cylinder", "rectangle")
+}
+
+
+def shining(shape):
+    return shape | {"bsdf": diffuse(0.3), "emitter": {"type": "area", "radiance": 4.0}}
+
+
+# By name, of a place, an angle and a size.
+LAMPS = {
+    **{name: lambda c, a, s, make=make: shining(make(c, a, s)) for name, make in SHAPES.items()},
+    "around": lambda c, a, s: shining({"type": "sphere", "radius": 9.0, "flip_normals": True}),
+    "point": lambda c, a, s: {"type": "point", "position": c},
+    "spot": lambda c, a, s: {"type": "spot", "cutoff_angle": 30 + a / 9, "to_world": turned(c, a)},
+    "directional": lambda c, a, s: {"type": "directional", "direction": [c[0], -2, c[2]]},
+    "constant": lambda c, a, s: {"type": "constant"},
+    "envmap": lambda c, a, s: {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.random.default_rng(5).uniform(0.2, 2, (8, 16, 3)).astype(np.float32)),
+        "to_world": turned([0, 0, 0], a),
+    },
+}
+SKIES = ("constant", "envmap")
+
+
+def between(low, high):
+    """One of 65 numbers: floats of hypothesis are often nearly zero."""
+    return st.integers(0, 64).map(lambda i: low + (high - low) * i / 64)
+
+
+PLACES = st.tuples(between(-1.5, 1.5), between(-0.5, 1.5), between(-1.5, 1.5)).map(list)
+LARGE = between(0.25, 0.75)
+
+
+@st.composite
+def objects(draw):
+    """One shape."""
+    shape = SHAPES[draw(st.sampled_from(sorted(SHAPES)))](draw(PLACES), draw(between(0, 360)), draw(LARGE))
+    bsdf = BSDFS[draw(st.sampled_from(sorted(BSDFS)))](draw(between(0.125, 0.5)))
+    return shape | {"bsdf": bsdf}
+
+
+@st.composite
+def lamps(draw):
+    """One or two emitters, with a weight each."""
+    names = draw(st.lists(st.sampled_from(sorted(LAMPS)), min_size=1, max_size=2))
+    if len(set(names) & set(SKIES)) == 2 or names in [[sky] * 2 for sky in SKIES]:
+        names = names[:1]  # a scene has one environment
+    found = []
+    for name in names:
+        lamp = LAMPS[name](draw(PLACES), draw(between(0, 360)), draw(LARGE))
+        holder = lamp.get("emitter", lamp)
+        holder["sampling_weight"] = draw(between(0.125, 8))
+        found.append(lamp)
+    return found
+
+
+@st.composite
+def sensors(draw):
+    """A camera that looks at the middle."""
+    x, y = draw(between(-3, 3)), draw(between(0.5, 3))
+    sensor = {
+        "type": draw(st.sampled_from(["perspective", "thinlens"])),
+        "fov": draw(between(30, 90)),
+        "near_clip": 0.125,
+        "far_clip": 100.0,
+        "to_world": T().look_at([x, y, 4], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}},
+    }
+    lens = {"aperture_radius": draw(between(0.0625, 0.5)), "focus_distance": 4.0}
+    return sensor | (lens if sensor["type"] == "thinlens" else {})
+
+
+@st.composite
+def scenes(draw):
+    """A scene as a dictionary: shapes on a floor, lamps, a sensor."""
+    floor = {
+        "type": "rectangle",
+        "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(4),
+        "bsdf": BSDFS[draw(st.sampled_from(["diffuse", "plastic", "roughconductor", "blend"]))](0.25),
+    }
+    scene = {"type": "scene", "sensor": draw(sensors()), "floor": floor}
+    scene |= {f"object {i}": o for i, o in enumerate(draw(st.lists(objects(), min_size=1, max_size=3)))}
+    return scene | {f"lamp {i}": lamp for i, lamp in enumerate(draw(lamps()))}
+
+
+@st.composite
+def renders(draw):
+    """A scene, and parameters that put strategies in use with different coefficients."""
+    share = draw(st.sampled_from([1.0, 0.25, 0.0625]))
+    skip = draw(st.sampled_from(["none", "impossible"]))
+    return draw(scenes()), {"light_paths": share, "skip": skip, "connections": "all"}
