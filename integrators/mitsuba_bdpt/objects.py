@@ -81,8 +81,9 @@ def own_parameters(owner) -> dict:
 
 
 def share_functions(owners):
-    """Move the numbers of ``owners`` that a kernel would hold as constants into memory: calls of objects of one
-    class then differ in data alone and are compiled once, not once per object. What is differentiated stays."""
+    """Move the numbers of ``owners`` that a kernel would hold as constants into memory: calls of objects of
+    one class then differ in data alone and are compiled once, not once per object. What is differentiated
+    stays."""
     values = (value for owner in owners for value in own_parameters(owner).values())
     dr.make_opaque([value for value in values if not dr.grad_enabled(value)])
 
