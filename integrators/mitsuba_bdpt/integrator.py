@@ -338,7 +338,7 @@ def _warn_of_what_was_lost(statistics: dict, scene):
     parts.append(
         f"NaN or infinity is in {where}"
         if named
-        else "no parameter of the scene holds NaN or infinity: look into plugins of your own"
+        else "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
     )
     mi.Log(mi.LogLevel.Warn, f"bdpt: {'; '.join(parts)}")
 

@@ -44,6 +44,6 @@ def against(ours, theirs, reach: float, what: str = "`path`") -> Outcome:
     return judged(ours, Sample.of(theirs), reach, what)
 
 
-def against_known(ours, expected: float, reach: float) -> Outcome:
-    """`judged` against a value that is known for all tiles."""
-    return judged(ours, Sample.known(np.full(ours.shape[1], expected)), reach, "known")
+def against_known(ours, expected, reach: float) -> Outcome:
+    """`judged` against a value that is known for all tiles, or values as of `tiles`."""
+    return judged(ours, Sample.known(np.broadcast_to(expected, ours.shape[1])), reach, "known")
