@@ -47,3 +47,9 @@ def against(ours, theirs, reach: float, what: str = "`path`") -> Outcome:
 def against_known(ours, expected, reach: float) -> Outcome:
     """`judged` against a value that is known for all tiles, or values as of `tiles`."""
     return judged(ours, Sample.known(np.broadcast_to(expected, ours.shape[1])), reach, "known")
+
+
+def together(outcomes: dict[str, Outcome]) -> Outcome:
+    """Several outcomes, by what was tried, as one: expected if all are."""
+    texts = [f"{'' if o.ok else '**no**: '}{name}: {o.happened}" for name, o in outcomes.items()]
+    return Outcome(all(o.ok for o in outcomes.values()), "; ".join(texts))

@@ -13,7 +13,7 @@ import numpy as np
 
 import mitsuba as mi  # isort: skip
 
-from .agreement import against, tiles
+from .agreement import against, tiles, together
 from .case import Case, Outcome
 
 SECTION = "NaN and infinity"
@@ -26,6 +26,7 @@ NAN, INF = float("nan"), float("inf")
 SAID = {"everything": "all strategies", "default": "default parameters"}
 EVERYTHING = {"skip": "none", "max_depth": 4}
 DEFAULTS = {"max_depth": 4}
+WAYS = {"everything": EVERYTHING, "default": DEFAULTS}
 
 
 class Warned:
@@ -220,10 +221,7 @@ def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
     ok &= len(warnings) == 1 and f"{found} values" in warnings[0]
     ok &= of_twin["non_finite"] == 0 and not quiet and statistics["decisions"] == of_twin["decisions"]
     exactly = f", exactly {count} expected" if count is not None else ""
-    return Outcome(
-        bool(ok),
-        f"{found} counted{exactly}; twin differs by {off:.1g} of its maximum; {len(warnings)} warning",
-    )
+    return Outcome(bool(ok), f"{found} counted{exactly}, off by {off:.1g}, {len(warnings)} warning")
 
 
 TWIN = (
@@ -242,35 +240,40 @@ def bsdf_cases():
     }
     zero = {"weight": ["weight"], "direction": ["weight"], "eval": ["eval"], "pdf": ["weight", "eval"]}
 
-    def case(name, bad, how, parameters, quick):
-        def make(value):
+    def make(name):
+        def made(value):
             register()
             names = [name] if value != 0 else zero[name]
             return room({"type": "poison"} | dict.fromkeys(names, value))
 
-        return Case(
-            f"bsdf-{name}-{bad}-{how}",
-            SECTION,
-            f"BSDF of half a plate: its {said[name]} {'is NaN' if bad != bad else 'infinite'}; " + SAID[how],
-            TWIN,
-            lambda: compared(make, bad, parameters),
-            quick,
+        return made
+
+    def run(name):
+        return together(
+            {
+                f"{bad}, {SAID[how]}": compared(make(name), bad, parameters)
+                for bad in (NAN, INF)
+                for how, parameters in WAYS.items()
+            }
         )
 
-    ways = {"everything": EVERYTHING, "default": DEFAULTS}
     return [
-        case(name, bad, how, parameters, (name, bad, how) in {("pdf", INF, "everything")})
+        Case(
+            f"bsdf-{name}",
+            SECTION,
+            f"a user's BSDF: on half a plate its {said[name]} NaN or infinite; all strategies, and defaults",
+            TWIN,
+            lambda name=name: run(name),
+            name == "pdf",
+        )
         for name in said
-        for bad in (NAN, INF)
-        for how, parameters in ways.items()
-        if how == "everything" or bad != bad
     ]
 
 
 def lamp_cases():
     """Poisoned emitters; the plate of the room keeps a lamp that is sound."""
 
-    def own(name):  # under hide_emitters, for a sky seen directly is asked for no density
+    def user(name):  # under hide_emitters, for a sky seen directly is asked for no density
         zero = {"eval": ["eval"], "pdf": ["eval"]}
 
         def make(value):
@@ -294,9 +297,9 @@ def lamp_cases():
         return room(other=lamp | {"texture": texture(value)})
 
     made = {
-        "own-eval-nan": ("a user's environment: half its radiance NaN", own("eval"), NAN),
-        "own-eval-inf": ("a user's environment: half its radiance infinite", own("eval"), INF),
-        "own-pdf-nan": ("a user's environment: half its densities NaN", own("pdf"), NAN),
+        "own-eval-nan": ("a user's environment: half its radiance NaN", user("eval"), NAN),
+        "own-eval-inf": ("a user's environment: half its radiance infinite", user("eval"), INF),
+        "own-pdf-nan": ("a user's environment: half its densities NaN", user("pdf"), NAN),
         "point-nan": ("point light of intensity NaN", point, NAN),
         "point-inf": ("point light of infinite intensity", point, INF),
         "area-nan": ("area light of radiance NaN", lambda v: room(**glowing(v)), NAN),
@@ -312,20 +315,30 @@ def lamp_cases():
         ),
         "spot-texture-nan": ("spot light through a texture with NaN", spot, NAN),
     }
-    hidden = {"hide_emitters": True}
-    ways = {"everything": EVERYTHING | hidden, "default": DEFAULTS | hidden}
-    return [
-        Case(
-            f"lamp-{name}-{how}", SECTION, f"{tried}; {SAID[how]}", TWIN, _lamp(make, bad, parameters), quick
+
+    def run(names):
+        hidden = {"hide_emitters": True}
+        return together(
+            {
+                f"{made[name][0]}, {SAID[how]}": compared(*made[name][1:], parameters | hidden)
+                for name in names
+                for how, parameters in WAYS.items()
+            }
         )
-        for name, (tried, make, bad) in made.items()
-        for how, parameters in ways.items()
-        for quick in [name == "own-pdf-nan" and how == "default"]
+
+    own = [name for name in made if name.startswith("own-")]
+    mitsubas = [name for name in made if name not in own]
+    tried = "radiance or density NaN or infinite in half of all directions; all strategies, and defaults"
+    return [
+        Case("lamp-own", SECTION, f"a user's environment: {tried}", TWIN, lambda: run(own), True),
+        Case(
+            "lamp-mitsuba",
+            SECTION,
+            "Mitsuba's lamps with radiances that are NaN or infinite; all strategies, and defaults",
+            TWIN,
+            lambda: run(mitsubas),
+        ),
     ]
-
-
-def _lamp(make, bad, parameters):
-    return lambda: compared(make, bad, parameters)
 
 
 # -- textures, layers, passes, with exact counts -------------------------------------------------
@@ -395,26 +408,40 @@ def counted_cases():
         ),
     }
 
-    def case(name, tried, count, arguments):
-        make, parameters, number = arguments
-        run = compared if name != "emission" else finite_and_counted
-        return Case(
-            f"exact-{name}",
-            SECTION,
-            tried,
-            f"{count}; " + (TWIN if run is compared else "a black image; one warning"),
-            lambda: run(make, NAN, parameters, number, spp),
-            name in ("reflectance-red", "feature"),
-        )
+    def run(names):
+        outcomes = {}
+        for name in names:
+            tried, count, (make, parameters, number) = made[name]
+            check = compared if name != "emission" else finite_and_counted
+            outcomes[f"{tried}, {count}"] = check(make, NAN, parameters, number, spp)
+        return together(outcomes)
 
-    strategies = Case(
-        "strategy-images-nan",
-        SECTION,
-        "half a plate's BSDF has the value NaN: all layers of `strategy_images`",
-        TWIN,
-        lambda: compared(_poisoned("eval"), NAN, EVERYTHING | {"strategy_images": True}),
-    )
-    return [*(case(name, *row) for name, row in made.items()), strategies]
+    def case(name, tried, names, quick):
+        expected = "the number that follows from the scene, exactly; " + TWIN
+        return Case(f"exact-{name}", SECTION, tried, expected, lambda: run(names), quick)
+
+    return [
+        case(
+            "reflectance",
+            "texels of a reflectance NaN in all colours, or in one of black; in passes; with `variance`",
+            ("reflectance", "reflectance-red", "passes", "variance"),
+            True,
+        ),
+        case(
+            "lamps",
+            "texels of a lamp seen directly, or a point light's intensity, NaN",
+            ("radiance", "emission"),
+            False,
+        ),
+        case("feature", "texels of an albedo NaN, shown by `aovs`", ("feature",), False),
+        Case(
+            "strategy-images-nan",
+            SECTION,
+            "half a plate's BSDF has the value NaN: all layers of `strategy_images`",
+            TWIN,
+            lambda: compared(_poisoned("eval"), NAN, EVERYTHING | {"strategy_images": True}),
+        ),
+    ]
 
 
 def _poisoned(name):
@@ -522,32 +549,29 @@ def distribution_cases():
         ours = tiles(lamp(NAN), {"type": "bdpt", **parameters}, seeds, spp)
         return against(ours, tiles(lamp(0.0), {"type": "bdpt", **parameters}, seeds, spp), 0.02, "twin")
 
-    whole = "all light that takes the distribution is lost, and said so: finite, counted, the parameter named"
+    def lost():
+        return together(
+            {
+                "`envmap`": _lost_whole(sky(), "other.data"),
+                "`projector`": _lost_whole(projector(), "irradiance.data"),
+            }
+        )
+
     return [
         Case(
-            "envmap-texel-nan",
+            "distribution-nan",
             SECTION,
-            "one texel of an `envmap` NaN",
-            whole,
-            lambda: _lost_whole(sky(), "other.data"),
+            "texels of an `envmap`, or of a `projector`, NaN",
+            "all light that takes Mitsuba's distribution is lost, and said so: finite, counted, named",
+            lost,
         ),
         Case(
-            "projector-texel-nan",
+            "area-texels-nan",
             SECTION,
-            "texels of a `projector` NaN",
-            whole,
-            lambda: _lost_whole(projector(), "irradiance.data"),
-        ),
-        *(
-            Case(
-                f"area-texels-nan-{how}",
-                SECTION,
-                f"texels of an area light NaN; {SAID[how]}",
-                "only these texels are lost: the image of its twin, in which they are 0; Welch's test over "
-                "tiles (level 1e-3, 8 seeds each), which sees errors of 2 %",
-                lambda p=parameters: of_area(p),
-            )
-            for how, parameters in (("everything", EVERYTHING), ("default", DEFAULTS))
+            "texels of an area light NaN; all strategies, and defaults",
+            "only these texels are lost: the image of its twin, in which they are 0; Welch's test over tiles "
+            "(level 1e-3, 8 seeds each), which sees errors of 2 %",
+            lambda: together({SAID[how]: of_area(parameters) for how, parameters in WAYS.items()}),
         ),
     ]
 
@@ -599,15 +623,14 @@ def mesh_cases():
     }
     return [
         Case(
-            f"mesh-{data.replace('_', '-')}-{bad}",
+            f"mesh-{data.replace('_', '-')}",
             SECTION,
-            f"`{data}` of one of four vertices {'NaN' if bad != bad else 'infinite'}, set after loading",
+            f"`{data}` of one of four vertices NaN or infinite, set after loading",
             f"{expected}; Welch's test over tiles against `path` (level 1e-3, 8 seeds each), which sees "
             "errors of 2 %",
-            lambda data=data, bad=bad: _mesh(data, bad),
+            lambda data=data: together({str(bad): _mesh(data, bad) for bad in (NAN, INF)}),
         )
         for data, expected in what.items()
-        for bad in (NAN, INF)
     ]
 
 

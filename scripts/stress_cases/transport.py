@@ -6,7 +6,7 @@ import numpy as np
 
 import mitsuba as mi  # isort: skip
 
-from .agreement import against, against_known, tiles
+from .agreement import against, against_known, tiles, together
 from .case import Case, Outcome
 from .non_finite import Warned, camera
 
@@ -76,30 +76,33 @@ def closed_rooms():
         "point": ("point light in a closed sphere", point_in_sphere),
         "cube": ("closed cube that glows everywhere", glowing_cube),
     }
-    found = []
-    for name, (room, make) in rooms.items():
-        for albedo, depth, spp in ((1.0, 4, 64), (1.0, 40, 32), (0.99, -1, 8)):
+
+    def run(make, limits):
+        outcomes = {}
+        for albedo, depth, spp in limits:
+            target, known = make(albedo, depth)
+            late = {} if depth >= 0 else {"rr_depth": LATE}
             for way, parameters in WAYS.items():
+                means = tiles(target, bdpt(max_depth=depth, **late, **parameters), SEEDS, spp)
+                outcomes[f"max_depth={depth}, {SAID[way]}"] = against_known(means, known, 0.03)
+        return together(outcomes)
 
-                def run(make=make, albedo=albedo, depth=depth, spp=spp, parameters=parameters):
-                    target, known = make(albedo, depth)
-                    late = {} if depth >= 0 else {"rr_depth": LATE}
-                    means = tiles(target, bdpt(max_depth=depth, **late, **parameters), SEEDS, spp)
-                    return against_known(means, known, 0.03)
-
-                limit = f"max_depth={depth}" if depth >= 0 else f"no limit of the depth, rr_depth={LATE}"
-                found.append(
-                    Case(
-                        f"closed-{name}-{albedo:g}-{depth if depth >= 0 else 'unlimited'}-{way}",
-                        SECTION,
-                        f"{room}, albedo {albedo:g}, {limit}; {SAID[way]}",
-                        f"the sum of albedo^m over all reflections; {STUDENT}, which sees errors of 3 % of "
-                        "the image's mean (roulette makes long paths noisy)",
-                        run,
-                        (name, depth, way) == ("point", 4, "default"),
-                    )
-                )
-    return found
+    families = {
+        "white": ("albedo 1, max_depth 4 and 40", ((1.0, 4, 64), (1.0, 40, 32))),
+        "grey": (f"albedo 0.99, no limit of the depth, rr_depth={LATE}", ((0.99, -1, 8),)),
+    }
+    return [
+        Case(
+            f"closed-{name}-{family}",
+            SECTION,
+            f"{room}, {said}; all strategies, and defaults",
+            f"the sum of albedo^m over all reflections; {STUDENT}, which sees errors of 3 % of the image's "
+            "mean (roulette makes long paths noisy)",
+            lambda make=make, limits=limits: run(make, limits),
+        )
+        for name, (room, make) in rooms.items()
+        for family, (said, limits) in families.items()
+    ]
 
 
 def _roulette() -> Outcome:
@@ -330,33 +333,43 @@ def surfaces() -> dict:
 
 
 def surface_cases():
-    """Every surface by default; a sharp one of each kind with all strategies."""
-    tried = [(name, "default") for name in surfaces()]
-    tried += [(name, "everything") for name in surfaces() if name.endswith("-0.0001") or "sharp" in name]
+    """Every surface by default, sharp ones with all strategies too."""
+    families = {}
+    for name in surfaces():
+        kind, _, alpha = name.partition("-")
+        families.setdefault(kind if alpha[:1].isdigit() else name, []).append(name)
 
-    def case(name, way):
-        text, bsdf = surfaces()[name]
-        spoilt = name == "sharp-beside-glass"
+    def run(names, spoilt):
+        outcomes = {}
+        for name in names:
+            text, bsdf = surfaces()[name]
+            sharp = "sharp" in name or name.endswith("-0.0001")
+            for way in ("default", "everything") if sharp else ("default",):
+                outcomes[f"{text}, {SAID[way]}"] = like_path(bsdf, WAYS[way], spoilt)
+        return together(outcomes)
+
+    def case(family, names):
+        spoilt = family == "sharp-beside-glass"
         finite = "every value finite"
         if spoilt:
             finite = (
                 "and what Mitsuba's `sample` makes NaN is counted: of a `roughconductor` seen from behind in "
                 "a `blendbsdf`, which reflects nothing (`path` drops it in silence)"
             )
+        tried = surfaces()[names[0]][0] if len(names) == 1 else f"`{family}` of roughness 1e-4 to 1"
         return Case(
-            f"{name}-{way}",
+            f"surface-{family}",
             SECTION,
-            f"{text}; {SAID[way]}",
+            tried,
             f"as `path`, {finite}: {WELCH}, which sees errors of 2 % of the image's mean",
-            lambda: like_path(bsdf, WAYS[way], spoilt),
+            lambda: run(names, spoilt),
         )
 
-    return [case(name, way) for name, way in tried]
+    return [case(family, names) for family, names in families.items()]
 
 
 def glass_cases():
     """Mirrors, glass in glass, total reflection."""
-    furnace = f"radiance 1, as nothing is absorbed: {STUDENT}, which sees errors of 2 %"
     inside = {"water": 1.33, "air": 1.0, "diamond": 2.4}
     return [
         *(
@@ -373,34 +386,28 @@ def glass_cases():
                 (0.98, f"{STUDENT}, which sees errors of 0.2 %"),
             )
         ),
-        *(
-            Case(
-                f"nested-{name}-{way}",
-                SECTION,
-                f"a ball of {name} (index {ior:g}) in a ball of glass in a white world; {SAID[way]}",
-                furnace,
-                lambda ior=ior, way=way: _nested(ior, WAYS[way]),
-                (name, way) == ("air", "default"),
-            )
-            for name, ior in inside.items()
-            for way in WAYS
+        Case(
+            "nested-dielectrics",
+            SECTION,
+            "balls of water, air and diamond in a ball of glass in a white world; all strategies, and "
+            "defaults; the white world from the centre of glass",
+            f"radiance 1, as nothing is absorbed, and 1.5^2 from within: {STUDENT}, which sees errors of 2 %",
+            lambda: together(
+                {
+                    f"{name}, {SAID[way]}": _nested(ior, parameters)
+                    for name, ior in inside.items()
+                    for way, parameters in WAYS.items()
+                }
+                | {"from within": _from_within()}
+            ),
+            True,
         ),
         Case(
-            "from-within-glass",
+            "total-reflection",
             SECTION,
-            "the white world seen from the centre of a ball of glass",
-            f"radiance 1.5^2; {STUDENT}, which sees errors of 2 %",
-            _from_within,
-        ),
-        *(
-            Case(
-                f"total-reflection-{way}",
-                SECTION,
-                f"a lamp in a glass cube of index 1.8: most of its light is reflected totally; {SAID[way]}",
-                f"as `path`: {WELCH}, which sees errors of 3 % (few paths leave the cube)",
-                lambda way=way: _total_reflection(WAYS[way]),
-            )
-            for way in WAYS
+            "a lamp in a glass cube of index 1.8: most of its light is reflected totally",
+            f"as `path`: {WELCH}, which sees errors of 3 % (few paths leave the cube)",
+            lambda: together({SAID[way]: _total_reflection(parameters) for way, parameters in WAYS.items()}),
         ),
     ]
 
