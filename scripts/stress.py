@@ -47,9 +47,10 @@ def apart(name: str, limit: float = LIMIT) -> Outcome:
         done = subprocess.run(command, capture_output=True, text=True, timeout=limit, check=False)
     except subprocess.TimeoutExpired:
         return Outcome(False, f"does not end within {limit} s")
-    try:
-        return Outcome(**json.loads(done.stdout.splitlines()[-1]))
-    except (IndexError, ValueError, TypeError):
+    try:  # what Mitsuba logged may come before or after it, on the same line too
+        found, _ = json.JSONDecoder().raw_decode(done.stdout[done.stdout.rindex('{"ok":') :])
+        return Outcome(**found)
+    except (ValueError, TypeError):
         tail = done.stderr.strip().splitlines()[-1:] or ["nothing on stderr"]
         return Outcome(False, f"ends with status {done.returncode}: {tail[0]}")
 

@@ -563,16 +563,16 @@ class Poison(mi.BSDF):
 def test_walks_without_a_finite_throughput_are_counted(light_paths):
     """Rationale: what is not finite counts as zero, and the user is told how often. Expected: a BSDF
     that spoils a quarter of the sampled directions leaves a finite image, and `non_finite` counts
-    every such walk of the camera (a quarter of the samples lost at the first vertex, of the rest a
-    quarter at the second, no third: 7/16 of 64 per pixel); light subpaths take the direction only
-    and are not spoiled. Tolerance: 5 %, five standard errors of the count.
+    every such walk: of the camera's a quarter lost at the first vertex, of the rest a quarter at the second,
+    no third (7/16 of 64 per pixel); of light subpaths, which end an edge earlier, a quarter. Tolerance: 5 %,
+    five standard errors of the count.
     """
     mi.register_bsdf("poison", Poison)
     scene = lamp_in_a_sphere(bsdf={"type": "poison"})
     bdpt = integrator(max_depth=3, skip="none", light_paths=light_paths, points="independent")
     result = image(bdpt, scene, spp=64)
     assert np.isfinite(result).all() and result.max() > 0
-    expected = 7 / 16 * 64 * 16 * 16
+    expected = (7 / 16 + light_paths / 4) * 64 * 16 * 16
     assert abs(bdpt.statistics["non_finite"] - expected) < 0.05 * expected
 
 

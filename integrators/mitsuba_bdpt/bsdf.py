@@ -112,7 +112,14 @@ def connectible(bsdf):
 
 def evaluate(bsdf, si, wo, active) -> Evaluation:
     """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
-    return Evaluation(*_ask(bsdf, _evaluated, si, wo, active))
+    return _evaluation(*_ask(bsdf, _evaluated, si, wo, active))
+
+
+def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
+    """The value is NaN, so that whoever uses it counts it, also where a density is not finite: no weight
+    follows from that. (Where the value is 0 it does not matter.)"""
+    finite = dr.isfinite(pdf_fwd_w + pdf_rev_w)
+    return Evaluation(dr.select(finite | is_zero(value), value, dr.nan), pdf_fwd_w, pdf_rev_w)
 
 
 def _evaluated(self, si, wo, active):
@@ -133,7 +140,7 @@ def evaluate_adjoint(bsdf, si, wo, active, cos_ratio=None) -> Evaluation:
 
 
 def _adjoint(cos_ratio, value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
-    return Evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
+    return _evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
 
 
 def _evaluated_adjoint(self, si, wo, active):
@@ -171,10 +178,10 @@ def sample(
 
     sampled, evaluated = _ask_both(bsdf, ask, (si, u1, u2, active), _evaluated, target)
     bs, weight, pdf_fwd_w, pdf_rev_w, reversible = sampled
-    step = _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
+    step = _step(si, bs, weight, weight, pdf_fwd_w, pdf_rev_w)
     if traits.round_trip:  # no alternative that would have to make this event from the other side
         step.cos_out = dr.select(reversible, step.cos_out, 0)
-    return step, Evaluation(*evaluated) if target else None
+    return step, _evaluation(*evaluated) if target else None
 
 
 def sample_adjoint(
@@ -197,24 +204,29 @@ def sample_adjoint(
         # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
         rejected = (bs.pdf == 0) | (~delta & (pdf_fwd_w == 0)) | is_zero(mitsuba_weight)
         weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), value / pdf_fwd_w)
-        return bs, dr.select(rejected, 0, weight), pdf_fwd_w, pdf_rev_w
+        return bs, mitsuba_weight, dr.select(rejected, 0, weight), pdf_fwd_w, pdf_rev_w
 
     sampled, evaluated = _ask_both(bsdf, ask, (si, u1, u2, active), _evaluated_adjoint, target)
-    bs, weight, pdf_fwd_w, pdf_rev_w = sampled
+    bs, mitsuba_weight, weight, pdf_fwd_w, pdf_rev_w = sampled
     cos_ratio = geometric_cos(si, bs.wo) / geometric_cos(si, si.wi)
     weight = dr.select(is_zero(weight), 0, weight * cos_ratio)
-    step = _step(si, bs, weight, pdf_fwd_w, pdf_rev_w)
+    step = _step(si, bs, mitsuba_weight, weight, pdf_fwd_w, pdf_rev_w)
     return step, _adjoint(target.cos_ratio, *evaluated) if target else None
 
 
 def brightest(value):
-    """The largest entry of a spectrum, in size."""
+    """The largest entry of a spectrum, in size; one that is NaN counts only where all others do."""
     return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
 
 
 def is_zero(value):
     """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
-    return brightest(value) == 0
+    return dr.all(mi.unpolarized_spectrum(value) == 0)
+
+
+def is_finite(value):
+    """Mask: no entry of a spectrum is NaN or infinite."""
+    return dr.all(dr.isfinite(mi.unpolarized_spectrum(value)))
 
 
 def _back(bsdf, si, bs, u1, u2, active, mode):
@@ -235,14 +247,19 @@ def _event_cos_ratio(si, bs):
     return dr.select(refracted, ratio, 1)
 
 
-def _step(si, bs, weight, pdf_fwd_w, pdf_rev_w) -> Step:
+def _step(si, bs, mitsuba_weight, weight, pdf_fwd_w, pdf_rev_w) -> Step:
+    """The step that Mitsuba's sample ``bs`` of ``mitsuba_weight`` stands for."""
+    delta, cos_out = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), geometric_cos(si, bs.wo)
+    # A direction that is NaN hits nothing, and nobody would know.
+    finite = dr.isfinite(dr.select(delta, cos_out, cos_out + pdf_fwd_w + pdf_rev_w))
+    finite &= is_finite(mitsuba_weight)
     return Step(
         wo=bs.wo,
-        weight=weight,
+        weight=dr.select(finite | is_zero(mitsuba_weight), weight, dr.nan),
         pdf_fwd_w=pdf_fwd_w,
         pdf_rev_w=pdf_rev_w,
-        cos_out=geometric_cos(si, bs.wo),
-        delta=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta),
+        cos_out=cos_out,
+        delta=delta,
         null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
         eta=bs.eta,
     )

@@ -43,6 +43,14 @@ class Contribution:
         return dr.select(self.active, self.value * self.weight, 0)
 
 
+def finite(c: Contribution, counters) -> Contribution:
+    """``c``, inactive where it adds no finite value, which is counted: such a contribution counts as zero."""
+    lost = c.active & ~bsdf.is_finite(c.value * c.weight)
+    counters["non_finite"] += _one(lost)
+    c.active &= ~lost
+    return c
+
+
 @dataclass
 class LightPath:
     """Connectible vertices of a lane's light subpath in local memory, ``count`` of them.
@@ -147,7 +155,7 @@ def choose_emitter(kernel, z: Vertex, stream):
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & bsdf.connectible(z.bsdf)
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
     e = kernel.emitters.sample_direct(z.si, u, active)
-    return e, bsdf.Target(z.si.to_local(e.d), active & (e.pdf_w > 0))
+    return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
 
 
 def next_event(kernel, z: Vertex, counters) -> Contribution:
@@ -191,7 +199,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
         active &= ~emission.infinite  # measure zero
     else:
         join = dr.select(emission.infinite, kernel.camera.join_direction(emission.d, *u), join)
-    active &= join.valid & (emission.pdf_first > 0) & ~emission.beam
+    active &= join.valid & ~(emission.pdf_first == 0) & ~emission.beam
     if kernel.camera.delta:
         active &= ~emission.delta  # measure zero: `path` sees nothing either
     radiance = kernel.emitters.radiance_towards(emission, join.d, active)
@@ -342,21 +350,23 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
     ``visible``: it is active and nothing is in between.
     """
 
-    def body(slot, total, nonzero):
+    def body(slot, total, nonzero, lost):
         y = read_light_vertex(kernel, path, slot)
-        c = inner(kernel, z, y)
+        counted = {"non_finite": lost}
+        c = finite(inner(kernel, z, y), counted)
         nonzero = nonzero + _one(c.active)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active)
-        return slot + 1, add(c, visible, total), nonzero
+        return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
 
     candidates = candidate_count(kernel, z, path)
-    _, total, nonzero = dr.while_loop(
-        (mi.UInt32(0), total, mi.UInt32(0)),
-        lambda slot, total, nonzero: slot < candidates,
+    _, total, nonzero, lost = dr.while_loop(
+        (mi.UInt32(0), total, mi.UInt32(0), mi.UInt32(0)),
+        lambda slot, *_: slot < candidates,
         body,
         label="inner connections",
     )
+    counters["non_finite"] += lost
     counters["evaluated"] += candidates
     counters["zero"] += candidates - nonzero
     counters["shadow_inner"] += nonzero
@@ -370,13 +380,12 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     number serves the whole draw: what is left of it after each decision is uniform again.
     """
 
-    def body(slot, chosen, total, end, u, nonzero, broken):
+    def body(slot, chosen, total, end, u, nonzero, lost):
         y = read_light_vertex(kernel, path, slot)
-        c = inner(kernel, z, y)
+        counted = {"non_finite": lost}
+        c = finite(inner(kernel, z, y), counted)
         value = c.weighted()
         size = _size(value)
-        broken |= ~dr.isfinite(size)
-        size = dr.select(dr.isfinite(size), size, 0)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
         u_total = u * total
@@ -386,20 +395,20 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         chosen = dr.select(take, value, chosen)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
         end = dr.select(take, rays.end_point(z.anchor, y.anchor), end)
-        return slot + 1, chosen, total, end, u, nonzero + _one(c.active), broken
+        return slot + 1, chosen, total, end, u, nonzero + _one(c.active), counted["non_finite"]
 
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
     none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.Point3f(z.si.p)
-    _, chosen, total, end, u, nonzero, broken = dr.while_loop(
-        (*none, u, mi.UInt32(0), mi.Bool(False)),
+    _, chosen, total, end, u, nonzero, lost = dr.while_loop(
+        (*none, u, mi.UInt32(0), mi.UInt32(0)),
         lambda slot, *_: slot < candidates,
         body,
         label="draw an inner connection",
     )
     counters["evaluated"] += candidates
     counters["zero"] += candidates - nonzero
-    counters["non_finite"] += _one(broken)
+    counters["non_finite"] += lost
     value = chosen * (total / _size(chosen))
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -143,8 +145,14 @@ def is_textured(emitter, kind: int) -> bool:
 
 
 def is_sampled_by_texture(emitter, kind: int) -> bool:
-    """Whether Mitsuba chooses a point of the emitter by its texture, and rightly."""
-    return is_textured(emitter, kind) and emitter.get_shape().shape_type() in _TEXTURE_SAMPLED
+    """Whether Mitsuba chooses a point of the emitter by its texture, and rightly. (With a texel that is not
+    finite all densities are NaN.)"""
+    if not is_textured(emitter, kind) or emitter.get_shape().shape_type() not in _TEXTURE_SAMPLED:
+        return False
+    try:
+        return math.isfinite(number(children(emitter)["radiance"].mean()))
+    except RuntimeError:  # a texture that knows no mean
+        return True
 
 
 def check_coordinates(emitter):

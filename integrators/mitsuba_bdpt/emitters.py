@@ -307,7 +307,8 @@ class Emitters:
         cos = dr.abs(dr.dot(n, d))
         radiance = emitter.eval(si, active)
         return Emission(
-            weight=dr.select(pdf_first * pdf_second > 0, radiance * (cos / (pdf_first * pdf_second)), 0),
+            # Here and below a density that is NaN leaves the weight NaN, to be counted.
+            weight=dr.select(pdf_first * pdf_second == 0, 0, radiance * (cos / (pdf_first * pdf_second))),
             d=d,
             anchor=rays.sampled_anchor(ps.p, n, ps.p, self.quadrics.ends(shape, active)),
             cos=cos,
@@ -332,7 +333,7 @@ class Emitters:
             radiance = dr.select(mask, mi.Spectrum(texture.eval(si, mask)), radiance)
         curvature = self.quadrics.ends(emitter.get_shape(), active)
         return Emission(
-            weight=dr.select(ps.pdf > 0, radiance / ps.pdf, 0),  # without cosine, as in Mitsuba
+            weight=dr.select(ps.pdf == 0, 0, radiance / ps.pdf),  # without cosine, as in Mitsuba
             d=d,
             anchor=rays.sampled_anchor(ps.p, n, ps.p, curvature),
             cos=dr.abs(dr.dot(n, d)),
@@ -393,7 +394,7 @@ class Emitters:
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.t, si.p, si.time, si.wavelengths = mi.Float(0), p, like.time, like.wavelengths
         return Emission(
-            weight=dr.select(pdf_second > 0, intensity / pdf_second, 0),
+            weight=dr.select(pdf_second == 0, 0, intensity / pdf_second),
             d=d,
             anchor=rays.free_anchor(p),
             cos=mi.Float(1),
@@ -424,7 +425,7 @@ class Emitters:
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.p, si.time, si.wavelengths = d, p, like.time, like.wavelengths
         return Emission(
-            weight=dr.select(ds.pdf > 0, weight / pdf_second, 0),
+            weight=dr.select(ds.pdf == 0, 0, weight / pdf_second),
             d=d,
             anchor=rays.free_anchor(p),
             cos=mi.Float(1),
@@ -525,7 +526,8 @@ class Emitters:
         # Mitsuba divides by the shading normal's cosine; the measure is the geometric one.
         to_geometric = dr.select(area & (cos != dr.abs(cos_shading)), dr.abs(cos_shading) / cos, 1)
         pdf = dr.select(delta, 1, ds.pdf * to_geometric) * pmf
-        weight = dr.select(ds.pdf > 0, weight / (to_geometric * pmf), 0)
+        weight = dr.select(ds.pdf == 0, 0, weight / (to_geometric * pmf))
+        weight = dr.select(dr.isnan(ds.pdf), dr.nan, weight)  # no weight of strategies follows from it
         if UNSAMPLED in self.kinds:  # what Mitsuba samples of it has no radiance or the wrong one
             weight = dr.select(self._is(index, active, UNSAMPLED), 0, weight)
         ratio = mi.Float(0)
@@ -631,4 +633,4 @@ def _sample_shape(emitter, ps, si, active):
     there = mi.SurfaceInteraction3f(ps, si.wavelengths)
     there.wi = there.to_local(-ds.d)
     radiance = emitter.eval(there, active)
-    return ds, dr.select(ds.pdf > 0, radiance / ds.pdf, 0)
+    return ds, dr.select(ds.pdf == 0, 0, radiance / ds.pdf)

@@ -6,10 +6,11 @@ from .choice import STRATIFIED_SPLATS
 from .plan import Plan, Settings, lost_paths
 
 
-def explain(world, p: Plan, settings: Settings, table) -> str:
+def explain(world, p: Plan, settings: Settings, table, lost_by_pilot: int = 0) -> str:
     """Text about the strategies in use and those that are skipped.
 
-    ``table`` is a pilot's, see `choice.choose`; empty without one.
+    ``table`` is a pilot's, see `choice.choose`; empty without one. ``lost_by_pilot``: how many of its values
+    were not finite.
     """
     used = [
         name
@@ -38,6 +39,8 @@ def explain(world, p: Plan, settings: Settings, table) -> str:
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
             "one kernel"
         )
+    if lost_by_pilot:
+        lines.append(f"not finite: {lost_by_pilot} values of the pilot, which decided from the rest")
     return "\n".join(lines + _pilot(settings, table))
 
 

@@ -5,8 +5,9 @@ position. Features are thus filtered and normalised exactly as the image is, aft
 passes, and mean what they mean in ``aov``: they show emitters under ``hide_emitters``, and uv
 derivatives shrink with the square root of the samples per pixel. Two things differ. Albedo is RGB on
 every film: its wavelengths are drawn for that, where ``aov`` takes the sensor's and is wrong if these
-follow a response. And uv derivatives are 0 where a ray meets nothing; those of ``aov`` are NaN, which its
-sums keep or lose as the number of channels is even or odd.
+follow a response. And uv derivatives are 0 where there are none, as where a ray meets nothing; those of
+``aov`` are NaN, which its sums keep or lose as the number of channels is even or odd. Other features that are
+not finite count as 0 too, and are counted.
 """
 
 from __future__ import annotations
@@ -60,6 +61,12 @@ def feature_names(aovs: str) -> list[str]:
     return _plugin(aovs).aov_names() if _pairs(aovs) else []
 
 
+def _may_be_undefined(aovs: str) -> list[bool]:
+    """Whether each layer is one of uv derivatives, which are NaN where there are none."""
+    kinds = (pair.partition(":")[2] for pair in _pairs(aovs))
+    return [kind.startswith("duv_") for kind in kinds for _ in feature_names(f"x:{kind}")]
+
+
 def _pairs(aovs: str) -> list[str]:
     return [pair for pair in re.split("[, ]+", aovs) if pair]
 
@@ -75,12 +82,13 @@ class FeatureLayers:
     def __init__(self, scene, sensor, aovs: str, spp: int):
         self._scene, self._sensor, self._plugin = scene, sensor, _plugin(aovs)
         self.names = self._plugin.aov_names()
+        self._may_be_undefined = _may_be_undefined(aovs)
         self._region = Region(sensor.film())
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
 
-    def sample(self, points, stream, position, u_lens, time, active) -> list:
+    def sample(self, points, stream, position, u_lens, time, active) -> tuple[list, object]:
         """One number per layer for the camera sample at the film ``position`` (pixels), seen through
-        the point of the lens that ``u_lens`` chooses."""
+        the point of the lens that ``u_lens`` chooses; and a mask, false where one was not finite and is 0."""
         uv = self._region.to_uv(position)
         ray, _ = self._sensor.sample_ray_differential(time, 0.5, uv, u_lens, active)
         ray.scale_differential(self._spread)
@@ -88,4 +96,7 @@ class FeatureLayers:
             u = points.draw_1d("camera", stream, Purpose.WAVELENGTH)
             ray.wavelengths, _ = mi.sample_rgb_spectrum(mi.sample_shifted(u))
         _, _, values = self._plugin.sample(self._scene, self._sensor.sampler(), ray, active=active)
-        return [dr.select(dr.isfinite(value), value, 0) for value in values]
+        finite = mi.Bool(True)
+        for value, undefined in zip(values, self._may_be_undefined, strict=True):
+            finite &= undefined | dr.isfinite(value)
+        return [dr.select(dr.isfinite(value), value, 0) for value in values], finite

@@ -17,6 +17,8 @@ from .plan import UNLIMITED
 from .rendering import Render
 from .snapshot import Snapshot
 from .strategies import layer_names
+from .suspects import brighteners, not_finite
+from .world import bsdfs
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
 
@@ -92,6 +94,13 @@ All of them are combined by multiple importance sampling.
    - |float|
    - Stop after the pass in which so many seconds were exceeded; -1 (default): never.
 
+Values that are not finite, of textures or of plugins of yours, do not enter the image: a contribution that
+is NaN or infinite, or whose weight does not follow from densities that are, counts as zero in a sample that
+counts like any other, so that the rest of the image is as if it were zero in truth.
+``statistics["non_finite"]`` counts them, ``statistics["non_finite_in_pilot"]`` those of the pilots, which
+decide from the rest, and one message of Mitsuba's log (``Warn``) after the render names the parameters that
+hold such numbers. One before the render names BSDFs that reflect more light than they receive.
+
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
@@ -145,11 +154,13 @@ def _make_class():
             if start is not None:
                 _check_resumable(start, self.settings)
                 render.resume(start)
+            _warn_of_brighteners(scene)
             try:
                 self._cancelled = False
                 render.run(self.on_pass, lambda: self._cancelled)
             finally:
                 self.statistics = render.statistics()
+                _warn_of_what_was_lost(self.statistics, scene)
             _log(self.statistics)
             return _result(sensor.film(), develop, evaluate)
 
@@ -160,6 +171,7 @@ def _make_class():
             sensor = _resolve(scene, sensor)
             render = Render(scene, sensor, self.settings, seed, _samples(sensor, spp, self.settings))
             render.decide()
+            _warn_of_what_was_lost(render.statistics(), scene)
             return [decision.record() for decision in render.decisions]
 
         def assemble(self, snapshot, scene, sensor=0, develop=True, evaluate=True):
@@ -171,6 +183,7 @@ def _make_class():
             render.resume(snapshot, apart_from=("seed", "spp", "decisions"))
             render.accumulator.finish()
             self.statistics = render.statistics()
+            _warn_of_what_was_lost(self.statistics, scene)
             return _result(sensor.film(), develop, evaluate)
 
         def sample(self, *args, **kwargs):
@@ -196,7 +209,7 @@ def _make_class():
             table = render.decide() if spp else []
             if self.settings.decisions:
                 render.replay(0)
-            text = explain(render.world, render.plan, self.settings, table)
+            text = explain(render.world, render.plan, self.settings, table, render.lost_by_pilot())
             return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"
 
         def to_string(self):
@@ -218,6 +231,9 @@ def _check_resumable(start, settings):
             "of its samples; use points=sobol"
         )
 
+
+# Culprits that a message names, at most.
+NAMED = 5
 
 NO_DERIVATIVES = (
     "bdpt: derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
@@ -296,12 +312,35 @@ def _log(statistics: dict):
             "bdpt: the render ended before four of the parts that the error follows from were whole; ask "
             "for no more samples per pixel than timeout allows",
         )
-    if statistics["non_finite"]:
+
+
+def _warn_of_brighteners(scene):
+    found = brighteners(bsdfs(scene))
+    if found:
+        more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
         mi.Log(
             mi.LogLevel.Warn,
-            f"bdpt: {statistics['non_finite']} samples had no finite value and count as zero; look for "
-            "infinities or NaN in textures, radiances and custom plugins",
+            f"bdpt: {'; '.join(found[:NAMED])}{more}: more light returns than arrives, and where it cannot "
+            "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
         )
+
+
+def _warn_of_what_was_lost(statistics: dict, scene):
+    """Say how many values were not finite, and in what parameters of the scene to look for the cause."""
+    count, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
+    if not (count or in_pilot):
+        return
+    parts = [f"{count} values were not finite and count as zero"]
+    if in_pilot:
+        parts.append(f"so did {in_pilot} of the pilot, which decided from the rest")
+    named = not_finite(scene)
+    where = ", ".join(named[:NAMED]) + (f" and {len(named) - NAMED} more" if len(named) > NAMED else "")
+    parts.append(
+        f"NaN or infinity is in {where}"
+        if named
+        else "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
+    )
+    mi.Log(mi.LogLevel.Warn, f"bdpt: {'; '.join(parts)}")
 
 
 _classes = {}

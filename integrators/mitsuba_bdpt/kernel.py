@@ -24,7 +24,8 @@ STORE_SIZES = (64, MAX_STORED)
 
 
 # What lanes count (``UInt32``): rays by kind, inner connections by what became of them (``rouletted``: splats
-# too), samples that count as zero for want of a finite value.
+# too), values that count as zero because they are not finite: contributions, subpaths that end for want of a
+# finite throughput, features.
 COUNTERS = (
     "camera",
     "light",
@@ -232,7 +233,7 @@ def _counted_by_light(plan):
 
 def _counted_by_camera(plan):
     one = plan.connections == "one"
-    names = ["shadow_s1"] * plan.direct + ["non_finite"] * one + ["rouletted"] * (one and plan.roulette)
+    names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
     return names + ["shadow_inner", "evaluated", "zero"] * (plan.connections != "none")
 
 
@@ -247,8 +248,11 @@ def _light_subpath(kernel, sink, stream, shared, path):
     counters = _zeros("shadow_t1", "light", "non_finite")
     if kernel.plan.endpoints:
         c, position = connect.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
-        sink.splat(kernel, c, position, shared, counters)
+        sink.splat(kernel, connect.finite(c, counters), position, shared, counters)
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
+    broken = active & ~bsdf.is_finite(e.weight)
+    counters["non_finite"] += dr.select(broken, mi.UInt32(1), mi.UInt32(0))
+    active &= ~broken
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
@@ -270,10 +274,10 @@ def _light_subpath(kernel, sink, stream, shared, path):
         path, counters = state
         if kernel.plan.arrival:
             c, position = connect.arrive(kernel, e, vertex, walk)
-            sink.splat(kernel, c, position, shared, counters)
+            sink.splat(kernel, connect.finite(c, counters), position, shared, counters)
         if kernel.plan.splat:
             c, position = connect.splat(kernel, vertex, stream, counters)
-            sink.splat(kernel, c, position, shared, counters)
+            sink.splat(kernel, connect.finite(c, counters), position, shared, counters)
         if kernel.plan.connections != "none":
             connect.store_light_vertex(kernel, vertex, path)
         return path, counters
@@ -308,19 +312,24 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
     active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
     walk = _camera_walk(kernel, start, active)
 
+    def add_hit(z, total, lost):
+        counted = {"non_finite": lost}
+        c = connect.finite(connect.hit_emitter(kernel, z), counted)
+        return sink.add(kernel, c, total, start, shared), counted["non_finite"]
+
     def visit(z, state, _):
         total, counters = state
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
-            total = dr.if_stmt(
-                (z, total),
+            total, counters["non_finite"] = dr.if_stmt(
+                (z, total, counters["non_finite"]),
                 connect.sees_emitter(kernel, z),
-                lambda z, total: sink.add(kernel, connect.hit_emitter(kernel, z), total, start, shared),
-                lambda z, total: total,
+                add_hit,
+                lambda z, total, lost: (total, lost),
                 label="s = 0",
             )
         if plan.direct:
-            c = connect.next_event(kernel, z, counters)
+            c = connect.finite(connect.next_event(kernel, z, counters), counters)
             total = sink.add(kernel, c, total, start, shared)
         if plan.connections != "none":
             total = sink.connect(kernel, z, lane, stream, counters, total, start)

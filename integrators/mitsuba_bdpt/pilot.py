@@ -181,9 +181,6 @@ class Pilot:
         row = self._group(dr.arange(mi.UInt32, self._lanes)) * TILES**2 + self._tile(position)
         _, moments = self._parts(size, c)
         _add(self._splats, _SPLAT_COLUMNS, [size, *moments["moment"], *moments["light"]], row, size > 0)
-        # As `sinks.Image` does: loops hold the counters that they change.
-        broken = c.active & ~dr.isfinite(_mean_colour(c))
-        counters["non_finite"] += dr.select(broken, mi.UInt32(1), mi.UInt32(0))
 
     def end(self, kernel, lane, sample, total, seen, counters):
         """Add a camera sample."""
@@ -270,8 +267,7 @@ class Pilot:
         else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
         (1,1) finds and path tracing alone hardly.
         """
-        size = _mean_colour(c)
-        return dr.select(c.active & (c.s + c.t > 2) & dr.isfinite(size), size, 0)
+        return dr.select(c.active & (c.s + c.t > 2), _mean_colour(c), 0)
 
     def _group(self, lane):
         return lane // PER_PIXEL % GROUPS

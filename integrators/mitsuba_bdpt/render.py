@@ -326,7 +326,7 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: fl
         missed = 0 < until_error < error
         parts.append(f"relMSE about {error:.2g}" + (f", not the {until_error:g} asked for" if missed else ""))
     if outcome.statistics.get("non_finite"):
-        parts.append(f"{outcome.statistics['non_finite']} samples without a finite value count as zero")
+        parts.append(f"{outcome.statistics['non_finite']} values were not finite and count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
     if outcome.interrupted:
         parts.append("interrupted")

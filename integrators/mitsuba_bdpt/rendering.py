@@ -127,6 +127,10 @@ class Render:
         self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
         return table
 
+    def lost_by_pilot(self) -> int:
+        """Values of the pilots that were not finite, and counted as zero."""
+        return 0 if self._moments is None else round(self._moments.rays["non_finite"] * self._moments.lanes)
+
     def why_no_pilot(self) -> str:
         """Why there is no table of a pilot's, as a sentence."""
         return f"no pilot: {self._settled()[0] or 'it saw nothing, or no finite value'}"
@@ -420,6 +424,7 @@ class Render:
             "decisions": [d.record() for d in self.decisions],
             "passes": list(self.accumulator.passes),
             "non_finite": self._counts["non_finite"],
+            "non_finite_in_pilot": self.lost_by_pilot(),
             "kernels": {"compiled": self.compiled, "cached": self.cached},
             **({"error": self.accumulator.error()} if self.settings.variance else {}),
             "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),

@@ -46,7 +46,8 @@ class Image:
         return total + connect.connect_one(kernel, z, lane.path, stream, counters)
 
     def splat(self, kernel, c, position, shared, counters):
-        """Add a contribution with t <= 1; without finite value it counts as zero."""
+        """Add a contribution with t <= 1; colours that are not finite (`connect.finite` has seen the
+        contribution, not what the film makes of it) count as zero."""
         value = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
         finite = dr.all(dr.isfinite(value))
         counters["non_finite"] += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
@@ -55,18 +56,19 @@ class Image:
             self._put_strategy(c, position, shared)
 
     def end(self, kernel, lane, sample, total, seen, counters):
-        """Add a camera sample; without finite value it counts as zero."""
+        """Add a camera sample; colours that are not finite, sums of finite ones, count as zero."""
         film, shared, start = self._film, lane.shared, sample.start
-        features = []
+        features, finite = [], mi.Bool(True)
         if film.features is not None:
-            features = film.features.sample(
+            features, finite = film.features.sample(
                 kernel.points, sample.stream, start.position, sample.u_lens, shared.time, sample.covered
             )
         colours = film.colour(total * shared.weight, shared.wavelengths)
-        finite = dr.all(dr.isfinite(colours))
+        shown = dr.all(dr.isfinite(colours))
         alpha = _alpha(kernel, seen)
-        film.put_camera(start.counted, dr.select(finite, colours, 0), alpha, features, sample.covered)
-        counters["non_finite"] += dr.select(sample.covered & ~finite, mi.UInt32(1), mi.UInt32(0))
+        film.put_camera(start.counted, dr.select(shown, colours, 0), alpha, features, sample.covered)
+        for mask in (finite, shown):
+            counters["non_finite"] += dr.select(sample.covered & ~mask, mi.UInt32(1), mi.UInt32(0))
 
     def _put_strategy(self, c, position, shared):
         weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)

@@ -25,7 +25,7 @@ class Walk:
     ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
     measure before that edge; ``eta`` product of relative indices of refraction (1 where nothing
     refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
-    happened; ``broken``: it ended for want of a finite throughput.
+    happened; ``broken``: it ended for want of a finite throughput or shading frame.
 
     What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
     """
@@ -215,7 +215,9 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk
     throughput = walk.throughput * step.weight
     eta = walk.eta * step.eta if kernel.refracts else 1
     brightest = bsdf.brightest(throughput)
-    broken = walk.broken | (active & ~dr.isfinite(brightest))
+    # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
+    finite = bsdf.is_finite(throughput) & dr.isfinite(dr.sum(si.wi))
+    broken = walk.broken | (active & ~finite)
     active &= (brightest > 0) & ~broken
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)

@@ -22,14 +22,14 @@ class World:
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene)
         self.camera = prepare(sensor, self.emitters.quadrics, self.surfaces)
-        found = _bsdfs(scene)
+        found = bsdfs(scene)
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
         self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         self.traits = bsdf.Traits.of(found)
 
 
-def _bsdfs(scene):
+def bsdfs(scene):
     """The BSDFs of all shapes, those of shape groups included."""
     found = [s.bsdf() for s in scene.shapes()]
     waiting = list(scene.shapes())

@@ -1,0 +1,56 @@
+"""Values of users' plugins, textures and meshes that are not finite, and reflectances above 1.
+
+Families of such values are in scripts/stress_cases/non_finite.py, with what is expected of each and the
+reason of each tolerance; the quick ones are run by tests/test_stress.py.
+"""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import suspects
+from stress_cases import cases
+from stress_cases.non_finite import NAN, Warned, filled, painted, room
+
+CASES = {case.name: case for case in cases()}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("bsdf-weight", "bsdf-direction", "bsdf-eval", "lamp-mitsuba", "exact-lamps", "strategy-images-nan"),
+        *("pilot-nan", "interrupted-nan", "distribution-nan", "mesh-vertex-normals", "exact-feature"),
+    ],
+)
+def test_what_is_not_finite_counts_as_zero(name):
+    """Rationale, expectation and tolerance: see the case of that name."""
+    outcome = CASES[name].run()
+    assert outcome.ok, outcome.happened
+
+
+def test_culprits_are_named():
+    """Expected: the texture that holds NaN is named, and no parameter of a sound scene."""
+    assert suspects.not_finite(filled(painted(NAN))) == ["plate.bsdf.reflectance.data"]
+    assert suspects.not_finite(room()) == []
+
+
+@pytest.mark.parametrize(
+    "bsdf, said",
+    [
+        ({"type": "diffuse", "reflectance": 1.5}, "has reflectance up to 1.5"),
+        (
+            {"type": "twosided", "a": {"type": "plastic", "diffuse_reflectance": 2.0}},
+            "diffuse_reflectance up to 2",
+        ),
+        ({"type": "diffuse", "reflectance": 1.0}, ""),
+        ({"type": "conductor", "eta": 3.0, "k": 5.0}, ""),
+    ],
+)
+def test_what_reflects_more_than_it_receives_is_named(bsdf, said):
+    """Expected: one warning per render that names BSDF and parameter; none where all is 1 or less, or where a
+    parameter above 1 is no reflectance."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
+    with Warned() as warnings:
+        image = np.array(integrator.render(room(bsdf), spp=4))
+    assert np.isfinite(image).all()
+    assert len(warnings) == bool(said)
+    assert all(said in text for text in warnings)
