@@ -400,7 +400,9 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     counters["evaluated"] += candidates
     counters["zero"] += candidates - nonzero
     counters["non_finite"] += _one(broken)
-    value = chosen * (total / _size(chosen))
+    value = (
+        chosen / _size(chosen)
+    ) * total  # in this order: the draw may hit a tiny one, and total / size is inf
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)
     counters["shadow_inner"] += _one(active)
