@@ -217,8 +217,8 @@ def test_decisions_do_not_depend_on_the_unit_of_radiance(name):
     or chose at random, at 1e12 by outliers; and connections between points of one plane (cosines of 1e-20,
     by rounding), which are 0 in faint light, ruled out path tracing alone in strong light, or overflowed when
     they were drawn. Expected: in light times 2^-66, 2^40, 2^66 the same decision, variance within 1e-6, and
-    the image times that factor: within 1e-5 of its mean (sums of atomics) but for a percent of the pixels, where
-    what is too faint for single precision took part in a draw. No sample without finite value.
+    the image times that factor: within 1e-5 of its mean (sums of atomics) but for a percent of the pixels,
+    where what is too faint for single precision took part in a draw. No sample without finite value.
     """
     scenes, images, records = Path(__file__).parents[1] / "scenes", [], []
     for factor in (1.0, 2.0**-66, 2.0**40, 2.0**66):

@@ -43,10 +43,10 @@ GROUPS = 16
 # best; so it is 1.1 to 2.3. 64 would say 1.1, as renders show, but the same of rooms with a small caustic.)
 RAREST = 1024
 
-# The square of what a weighting cannot make counts so many times in its moments, and one whose relative variance
-# comes out beyond the other number is ruled out: it misses a millionth of a pixel or more. (Missing it must
-# not be judged by itself: between points of one plane rounding leaves cosines of 1e-20, contributions of
-# 1e-40, and densities that single precision takes for 0.)
+# The square of what a weighting cannot make counts so many times in its moments, and one whose relative
+# variance comes out beyond the other number is ruled out: it misses a millionth of a pixel or more. (Any
+# miss must not do so: between points of one plane rounding leaves cosines of 1e-20, contributions of 1e-40,
+# and densities that single precision takes for 0.)
 LOST, RULED_OUT = 1e30, 1e15
 
 # Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
