@@ -166,12 +166,7 @@ def _slab(axis, place, thickness):
 def _walls(inside: bool) -> Outcome:
     """A closed box of walls 1e-4 thick; lamps on one side of it, the camera on the other."""
     walls = {f"w{a}{s}": _slab(a, s * 1.0, 1e-4) for a in range(3) for s in (-1, 1)}
-    room = {
-        "type": "cube",
-        "to_world": _transform().scale(4),
-        "flip_normals": True,
-        "bsdf": _grey(0.7),
-    }
+    room = {"type": "cube", "to_world": _transform().scale(4), "bsdf": _grey(0.7)}
     at = 0.4 if inside else 1.9
     point = {"type": "point", "position": [at, 0.2, at], "intensity": 10.0}
     sphere = {"type": "sphere", "center": [-at, 0.3, 0.4], "radius": 0.2, "emitter": _area(20)}
