@@ -1,6 +1,6 @@
 """Try to break the renderer, and write what happened into a table.
 
-    python scripts/stress.py             # all, under twenty minutes; writes docs/stress.json and docs/stress.md
+    python scripts/stress.py             # all, within twenty minutes; writes docs/stress.json and .md
     python scripts/stress.py NAME ...    # some of them, printed
     python scripts/stress.py --list      # names of all
 
