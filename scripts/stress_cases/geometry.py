@@ -176,7 +176,7 @@ def _walls(inside: bool) -> Outcome:
     for name, parts in (("closed", walls), ("open", {k: v for k, v in walls.items() if k != "w1-1"})):
         scene = _scene(sensor=camera, point=point, sphere=sphere, room=room, **parts)
         for side, parameters in (*SIDES.items(), ("path", PATH)):
-            values, _ = _tiles(scene, parameters | {"max_depth": 6}, 512, range(3))
+            values, _ = _tiles(scene, parameters | {"max_depth": 6}, 256, range(2))
             (leaks if name == "closed" else seen)[side] = float(values.mean())
     theirs = leaks.pop("path") / seen["path"]
     share = max(leaks[side] / seen[side] for side in leaks)
@@ -298,10 +298,10 @@ def _million(emits: bool) -> Outcome:
     common = {"sensor": _camera((3, -5, 3), (0, 0, -0.2)), "floor": _floor(0.5, 5)}
     common["floor"]["to_world"] = _transform().translate([0, 0, -1.2]).scale(5)
     common |= {} if emits else {"lamp": _lamp(4, 0.5, 20)}
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with tempfile.TemporaryDirectory() as folder:
         mesh = _ball_mesh(707, folder, **parts)
         fine, exact = _scene(**common, ball=mesh), _scene(**common, ball={"type": "sphere"} | parts)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     started = time.perf_counter()
     mi.load_dict({"type": "bdpt", "max_depth": 5}).render(fine, spp=16)
     seconds = time.perf_counter() - started
@@ -310,7 +310,9 @@ def _million(emits: bool) -> Outcome:
     mi.load_dict({"type": "path", "max_depth": 5}).render(fine, spp=16)
     theirs = time.perf_counter() - started
     outcome = _against([(fine, exact, {})], {"max_depth": 5})
-    text = f"{outcome.happened}; first render {seconds:.1f} s (`path` {theirs:.1f} s), {more:.0f} MiB more"
+    text = (
+        f"{outcome.happened}; first render {seconds:.1f} s (`path` {theirs:.1f} s), {more:.0f} MiB for it all"
+    )
     return Outcome(outcome.ok and seconds < 20 and more < 1024, text)
 
 
@@ -375,7 +377,7 @@ def _odd_cameras(where) -> Outcome:
     if where == "surface":
         cameras = [
             _camera((-1.5, -1, 0), (0, 0, 0.2)),  # in the plane of the floor
-            _camera((0, 0, 0.8), (1, 1, 0.6), 80),  # on top of the ball
+            _camera((0, 0, 0.8), (0.4, 0.3, 3), 80, (0, 1, 0)),  # on top of the ball
             _camera((2, 2, 0), (0, 0, 0.3)),  # at the corner of the floor
         ]
     else:
@@ -454,7 +456,7 @@ CASES = (
         _case(
             f"million-triangles{'-emit' if emits else ''}",
             f"a ball of a million triangles{' that emits' if emits else ''}",
-            f"the image of a sphere: {_WELCH}; first render below 20 s and with less than 1 GiB more",
+            f"the image of a sphere: {_WELCH}; first render below 20 s, mesh and renders below 1 GiB",
             partial(_million, emits),
         )
         for emits in (False, True)
