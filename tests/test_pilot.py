@@ -245,6 +245,37 @@ def test_a_pilot_that_sees_nothing():
         assert integrator.statistics["decisions"] == []
 
 
+@pytest.mark.parametrize("name", ["glass_caustics", "window_room"])
+def test_decisions_do_not_depend_on_the_unit_of_radiance(name):
+    """Rationale: squares of single precision end at 1e38, so that a pilot of light times 1e20 said nothing
+    or chose at random, at 1e12 by outliers; and connections between points of one plane (cosines of 1e-20,
+    by rounding), which are 0 in faint light, ruled out path tracing alone in strong light, or overflowed when
+    they were drawn. Expected: in light times 2^-66, 2^40, 2^66 the same decision, variance within 1e-6, and
+    the image times that factor: within 1e-5 of its mean (sums of atomics) but for a percent of the pixels,
+    where what is too faint for single precision took part in a draw. No sample without finite value.
+    """
+    scenes, images, records = Path(__file__).parents[1] / "scenes", [], []
+    for factor in (1.0, 2.0**-66, 2.0**40, 2.0**66):
+        scene = mi.load_file(str(scenes / f"{name}.xml"), resolution=32)
+        params = mi.traverse(scene)
+        for key in params.keys():
+            if key.endswith((".radiance.value", ".scale")):  # a lamp's, an environment's
+                params[key] = params[key] * factor
+        params.update()
+        integrator = bdpt(max_depth=6)
+        image = integrator.render(scene, seed=1, spp=128)
+        images.append(np.array(image, dtype=np.float64) / factor)
+        assert integrator.statistics["non_finite"] == 0
+        (record,) = integrator.statistics["decisions"]
+        records.append(record)
+    assert images[0].mean() > 0.1
+    for image, record in zip(images[1:], records[1:], strict=True):
+        for key in ("light_paths", "connections", "coefficients"):
+            assert record[key] == records[0][key]
+        np.testing.assert_allclose(record["variance"], records[0]["variance"], rtol=1e-6)
+        assert (np.abs(image - images[0]) > 1e-5 * images[0].mean()).mean() < 0.01
+
+
 @pytest.mark.parametrize("chosen", [1024, 3000, 9000, 16384])
 def test_pixels_of_a_pilot(chosen):
     """Rationale: every 16th pixel of a wide film is in the same columns, and a number that does not divide

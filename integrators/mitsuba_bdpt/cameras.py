@@ -120,27 +120,29 @@ class Camera(Sensor):
         )
 
     def join(self, p, u_lens, u_film) -> CameraJoin:
-        index, view, z0 = self._lens_point(u_lens, u_film)
+        which = self._lens_point(u_lens, u_film)
+        _, view, z0, _ = which
         to_z0 = z0 - p
         dist2 = dr.squared_norm(to_z0)
         d = to_z0 * dr.rsqrt(dist2)
-        return self._join((index, view), p - z0, d, dist2, z0, (view.near, view.far))
+        return self._join(which, p - z0, d, dist2, (view.near, view.far))
 
     def join_direction(self, d, u_lens, u_film) -> CameraJoin:
-        index, view, z0 = self._lens_point(u_lens, u_film)
-        return self._join((index, view), -d, mi.Vector3f(d), mi.Float(1), z0, (0, dr.inf))
+        which = self._lens_point(u_lens, u_film)
+        return self._join(which, -d, mi.Vector3f(d), mi.Float(1), (0, dr.inf))
 
     def _lens_point(self, u_lens, u_film):
+        """Index of a view, the view, a point of its lens in the world and in camera coordinates."""
         index = mi.UInt32(0)
         if self._count > 1:
             index, _ = view_at(u_film.x, self._count)
         view = self._view(index)
         local = view.lens_point(u_lens) if self.lens else mi.Point3f(0)
-        return index, view, _transform(view.to_world, local, 1)
+        return index, view, _transform(view.to_world, local, 1), local
 
-    def _join(self, which, outward, d, dist2, z0, clip) -> CameraJoin:
-        index, view = which
-        position, depth, inside = self._project(index, view, outward, z0)
+    def _join(self, which, outward, d, dist2, clip) -> CameraJoin:
+        index, view, z0, lens = which
+        position, depth, inside = self._project(index, view, outward, lens)
         within = (depth > 0) & (depth >= clip[0]) & (depth <= clip[1])
         cos = view.axis_cos(-d)
         on_near_plane = z0 - d * (view.near / cos)
@@ -158,15 +160,15 @@ class Camera(Sensor):
             valid=inside & within,
         )
 
-    def _project(self, index, view, outward, z0):
-        """Film position of the direction ``outward`` from ``z0`` (world), its depth along the axis, and
-        whether it lies in the region."""
+    def _project(self, index, view, outward, lens):
+        """Film position of the direction ``outward`` (world) from the point ``lens`` of the lens (camera
+        coordinates: in the world's, far from the origin, rounding would move it), its depth along the axis,
+        and whether it lies in the region."""
         local = _transform(view.to_camera, outward, 0)
         depth = local.z
-        # The film position is where the line crosses the plane in focus, seen from the lens centre.
-        lens = _transform(view.to_camera, z0, 1)
-        x = local.x / depth + lens.x / view.focus
-        y = local.y / depth + lens.y / view.focus
+        x, y = local.x / depth, local.y / depth
+        if self.lens:  # where the line crosses the plane in focus, seen from the lens centre
+            x, y = x + lens.x / view.focus, y + lens.y / view.focus
         a = view.to_film
         uv = mi.Point2f(a[0] * x + a[1] * y, a[2] * x + a[3] * y) + view.origin
         if self._count > 1:
@@ -180,7 +182,8 @@ class Camera(Sensor):
         """Where the walk's ray crosses the lens, which is no shape of the scene. What lies between the lens
         and the near plane does not hide it: camera rays start there too."""
         view = self._view(mi.UInt32(0))
-        o, d = _transform(view.to_camera, walk.previous, 1), _transform(view.to_camera, walk.d, 0)
+        centre = _transform(view.to_world, mi.Point3f(0), 1)
+        o, d = (_transform(view.to_camera, v, 0) for v in (walk.previous - centre, walk.d))
         towards = walk.active & (d.z < 0) & (o.z > 0)
         slope = dr.select(towards, -d.z, 1)
         distance = o.z / slope
@@ -189,7 +192,7 @@ class Camera(Sensor):
         unhidden = distant | ~walk.pi.is_valid() | (walk.pi.t >= (o.z - view.near) / slope)
         within = distant | ((o.z >= view.near) & (o.z <= view.far))
         z0 = _transform(view.to_world, local, 1)
-        position, _, inside = self._project(mi.UInt32(0), view, -walk.d, z0)
+        position, _, inside = self._project(mi.UInt32(0), view, -walk.d, local)
         pdf_area, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
         return Arrival(
             dist2=dr.square(distance),

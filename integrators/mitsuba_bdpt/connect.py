@@ -409,7 +409,8 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     counters["evaluated"] += candidates
     counters["zero"] += candidates - nonzero
     counters["non_finite"] += lost
-    value = chosen * (total / _size(chosen))
+    # In this order: the draw may hit a tiny one, for which total / size is infinite.
+    value = (chosen / _size(chosen)) * total
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)
     counters["shadow_inner"] += _one(active)

@@ -43,6 +43,12 @@ GROUPS = 16
 # best; so it is 1.1 to 2.3. 64 would say 1.1, as renders show, but the same of rooms with a small caustic.)
 RAREST = 1024
 
+# The square of what a weighting cannot make counts so many times in its moments, and one whose relative
+# variance comes out beyond the other number is ruled out: it misses a millionth of a pixel or more. (Any
+# miss must not do so: between points of one plane rounding leaves cosines of 1e-20, contributions of 1e-40,
+# and densities that single precision takes for 0.)
+LOST, RULED_OUT = 1e30, 1e15
+
 # Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
 PER_PIXEL = 2
 
@@ -139,9 +145,9 @@ class Pilot:
 
     def __init__(self, region, lanes: int, rarest: float):
         self._region, self._lanes = region, lanes
-        self._least = dr.opaque(mi.Float, 1 / rarest)
-        self._samples = dr.zeros(mi.Float, lanes * _COLUMNS)
-        self._splats = dr.zeros(mi.Float, GROUPS * TILES**2 * _SPLAT_COLUMNS)
+        self._least = dr.opaque(mi.Float64, 1 / rarest)
+        self._samples = dr.zeros(mi.Float64, lanes * _COLUMNS)
+        self._splats = dr.zeros(mi.Float64, GROUPS * TILES**2 * _SPLAT_COLUMNS)
         dr.make_opaque(self._samples, self._splats)
 
     def begin(self):
@@ -186,7 +192,7 @@ class Pilot:
         """Add a camera sample."""
         columns = [x for name in _PARTS for x in total[name]]
         slot = dr.arange(mi.UInt32, self._lanes)
-        columns += [mi.Float(total["joined"]), mi.Float(self._tile(sample.start.position))]
+        columns += [mi.Float64(total["joined"]), mi.Float64(self._tile(sample.start.position))]
         _add(self._samples, _COLUMNS, columns, slot, sample.covered)
 
     def evaluate(self, counts):
@@ -196,8 +202,8 @@ class Pilot:
     def moments(self, counts: dict) -> Moments:
         """What was found; ``counts`` what the lanes counted."""
         lanes = self._lanes
-        samples = np.array(self._samples, dtype=np.float64).reshape(lanes, _COLUMNS)
-        splats = np.array(self._splats, dtype=np.float64).reshape(GROUPS, TILES**2, _SPLAT_COLUMNS)
+        samples = np.array(self._samples).reshape(lanes, _COLUMNS)
+        splats = np.array(self._splats).reshape(GROUPS, TILES**2, _SPLAT_COLUMNS)
         ends = np.cumsum([*_PARTS.values(), 2]).tolist()
         estimate, moment, light, draw, rest = np.split(samples[:, : ends[-1]], ends[:-1], axis=1)
         joined, tiles = rest[:, 0], rest[:, 1].astype(int)
@@ -223,10 +229,9 @@ class Pilot:
             return np.pad(total, ((0, 0), (len(WEIGHTINGS) - total.shape[1], 0))) * (GROUPS / lanes)
 
         end = 1 + _PARTS["moment"]
-        with np.errstate(invalid="ignore"):  # inf - inf, of weightings that are ruled out
-            base = estimate**2 + moment - estimate * other
+        base = summed(estimate**2 + moment - estimate * other, splats[:, :, 1:end])
         return Moments(
-            base=summed(base, splats[:, :, 1:end]),
+            base=np.where(base < RULED_OUT, base, np.inf),
             light=summed(light, splats[:, :, end : end + _PARTS["light"]]),
             draw=summed(draw),
             mean=float(np.median(by_group) * GROUPS / lanes),
@@ -239,7 +244,7 @@ class Pilot:
         class, and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
         # Where there is nothing, shares may be 0 / 0.
         shares = dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
-        lost = dr.select(size > 0, mi.Float(dr.inf), 0)
+        lost = LOST * dr.square(size)
         own, moments, lights = [], [], []
         for w in WEIGHTINGS:
             total = _dot(w, shares, 1)
@@ -261,13 +266,14 @@ class Pilot:
         return own, {"moment": moments, "light": lights}
 
     def _size(self, c):
-        """Weighted size of a contribution that counts.
+        """Weighted size of a contribution that counts, in double precision: its square, in any unit of
+        radiance, is too large or too small for single (at 1e12 outliers are, at 1e20 all).
 
         Emitters seen directly do not count: relative to what is around them their edges would outweigh all
         else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
         (1,1) finds and path tracing alone hardly.
         """
-        return dr.select(c.active & (c.s + c.t > 2), _mean_colour(c), 0)
+        return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
 
     def _group(self, lane):
         return lane // PER_PIXEL % GROUPS
@@ -305,7 +311,7 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
 def _add(target, columns: int, values, row, active):
     """Add ``values`` to a row of ``target``; as a packet, which takes an even number of them. (`dr.scatter`
     would evaluate what was recorded so far.)"""
-    packet = mi.ArrayXf(values + [mi.Float(0)] * (columns - len(values)))
+    packet = mi.ArrayXd(values + [mi.Float64(0)] * (columns - len(values)))
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
 
 
@@ -315,7 +321,7 @@ def _mean_colour(c):
 
 
 def _none(n: int) -> list:
-    return [mi.Float(0) for _ in range(n)]
+    return [mi.Float64(0) for _ in range(n)]
 
 
 def _sums(total: list, more: list) -> list:

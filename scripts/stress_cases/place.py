@@ -2,21 +2,337 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
 import reference
+from metrics import Sample, sidak, tile_means, welch
 
 import mitsuba as mi  # isort: skip
 
 from .case import Case, Outcome
 
+SECTION = "Scale and place"
+DEPTH, SIZE, TILES = 6, 32, 4
 
-def _plain() -> Outcome:
-    scene = reference.load_scene("cornell_box", resolution=16)
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6})
-    bdpt.render(scene, spp=16)
-    count = bdpt.statistics["non_finite"]
-    return Outcome(count == 0, f"{count} values that are not finite")
+# What every comparison is made with: the defaults (with so many samples that a pilot decides) and everything.
+SIDES = {"default": ({}, 128), "skip=none": ({"skip": "none"}, 16)}
+
+# Level of all t-tests of a case together, after Sidak's correction. Seeds are fixed.
+LEVEL = 1e-3
 
 
-CASES = (
-    Case("plain-cornell-box", "Scale and place", "`cornell_box` as it is", "all values finite", _plain, True),
+# -- placing a scene of scenes/ ---------------------------------------------------------------
+
+
+def rotation(axis, degrees):
+    """Matrix of a turn about an axis."""
+    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.deg2rad(degrees)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a scene is put: all lengths times ``scale`` (and intensities times its square, so that radiances
+    stay), turned, moved by ``shift``; ``light``: times what all emitters shine."""
+
+    scale: float = 1.0
+    turn: object = None
+    shift: tuple = (0.0, 0.0, 0.0)
+    light: float = 1.0
+
+    @property
+    def rotation(self):
+        return np.eye(3) if self.turn is None else self.turn
+
+    def point(self, p):
+        """Where a point comes to lie."""
+        return self.rotation @ (self.scale * np.asarray(p)) + self.shift
+
+
+def _numbers(text):
+    return np.array([float(x) for x in text.replace(",", " ").split()])
+
+
+def _text(values) -> str:
+    return " ".join(repr(float(x)) for x in np.ravel(values))  # all digits: powers of two stay exact
+
+
+def _vector(element):
+    if element.get("value"):
+        return _numbers(element.get("value"))
+    return np.array([float(element.get(axis, 0)) for axis in "xyz"])
+
+
+def _set_vector(element, values):
+    element.attrib.pop("value", None)
+    for axis, value in zip("xyz", values, strict=True):
+        element.set(axis, repr(float(value)))
+
+
+def _times(element, factor, *names):
+    for name in names:
+        for found in element.findall(f"*[@name='{name}']"):
+            if found.get("value"):
+                found.set("value", _text(_numbers(found.get("value")) * factor))
+
+
+def _to_world(element):
+    found = element.find("transform[@name='to_world']")
+    if found is None:
+        found = ElementTree.SubElement(element, "transform", name="to_world")
+    return found
+
+
+def _append(element, linear, shift=(0, 0, 0)):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    ElementTree.SubElement(_to_world(element), "matrix", value=_text(matrix))
+
+
+def _look_from(element, place: Place):
+    """Sensors and spots must not be scaled themselves."""
+    for lookat in element.iter("lookat"):
+        for key in ("origin", "target"):
+            lookat.set(key, _text(_numbers(lookat.get(key)) * place.scale))
+    _append(element, place.rotation, place.shift)
+
+
+def _full_path(element):
+    for file in element.findall("string[@name='filename']"):
+        file.set("value", str(reference.ROOT / "scenes" / file.get("value")))
+
+
+def _place_sensor(sensor, place: Place):
+    for name, default in (("near_clip", 0.01), ("far_clip", 1e4)):
+        if sensor.find(f"*[@name='{name}']") is None:
+            ElementTree.SubElement(sensor, "float", name=name, value=str(default))
+    _times(sensor, place.scale, "near_clip", "far_clip", "aperture_radius", "focus_distance")
+    _look_from(sensor, place)
+
+
+def _place_emitter(emitter, place: Place):
+    kind = emitter.get("type")
+    _times(emitter, place.light, "radiance", "irradiance", "intensity")
+    if kind in ("point", "spot"):
+        _times(emitter, place.scale**2, "intensity")
+    if kind == "point":
+        position = emitter.find("point[@name='position']")
+        _set_vector(position, place.point(_vector(position)))
+    elif kind == "spot":
+        _look_from(emitter, place)
+    elif kind == "directional":
+        direction = emitter.find("vector[@name='direction']")
+        _set_vector(direction, place.rotation @ _vector(direction))
+    elif kind == "envmap":
+        _full_path(emitter)
+        _append(emitter, place.rotation)
+        ElementTree.SubElement(emitter, "float", name="scale", value=repr(place.light))
+
+
+def _spot_for_point(root):
+    """The point light of a scene becomes a spot that shines down."""
+    emitter = root.find("emitter[@type='point']")
+    emitter.set("type", "spot")
+    position = emitter.find("point[@name='position']")
+    origin = _vector(position)
+    emitter.remove(position)
+    lookat = {"origin": _text(origin), "target": _text(origin - [0.1, -0.2, 1]), "up": "0 1 0"}
+    ElementTree.SubElement(_to_world(emitter), "lookat", lookat)
+    ElementTree.SubElement(emitter, "float", name="cutoff_angle", value="60")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A scene of scenes/: what of it matters here, and what is changed in its file."""
+
+    scene: str
+    words: str
+    edit: object = None
+    by_path: bool = True
+
+    def load(self, place: Place = Place(), size: int = SIZE):  # noqa: B008 (frozen)
+        """The scene in its place."""
+        root = ElementTree.parse(reference.scene_file(self.scene)).getroot()
+        if self.edit is not None:
+            self.edit(root)
+        for sensor in root.findall("sensor"):
+            _place_sensor(sensor, place)
+        for shape in root.findall("shape"):
+            _full_path(shape)
+            _append(shape, place.rotation * place.scale, place.shift)
+        for emitter in root.iter("emitter"):
+            _place_emitter(emitter, place)
+        text = ElementTree.tostring(root, encoding="unicode")
+        return mi.load_string(text, parallel=False, resolution=size)
+
+
+SUBJECTS = {
+    "area": Subject("cornell_box", "`cornell_box` (area light)"),
+    "point": Subject("lamp_behind_glass", "`lamp_behind_glass` (point light, glass, a mesh)", by_path=False),
+    "spot": Subject(
+        "smallvcm_cornell_point",
+        "`smallvcm_cornell_point` with a spot for its lamp (glass, mirror)",
+        _spot_for_point,
+    ),
+    "envmap": Subject("window_room", "`window_room` (environment with a sun)"),
+    "sun": Subject("smallvcm_cornell_sun", "`smallvcm_cornell_sun` (directional light, glass, mirror)"),
+    "lens": Subject("thin_lens", "`thin_lens` (thin lens, lamps on spheres and a disk, glass)"),
+}
+
+
+# -- what is compared -------------------------------------------------------------------------
+
+
+def _render(scene, parameters, spp, seed):
+    """Image, and the statistics of bdpt."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": DEPTH} | parameters)
+    image = np.array(integrator.render(scene, seed=seed, spp=spp), dtype=np.float64)
+    return image, integrator.statistics
+
+
+def _ways(statistics):
+    """What was decided, without figures."""
+    keys = ("light_paths", "connections", "coefficients")
+    return [[record[key] for key in keys] for record in statistics["decisions"]]
+
+
+# How far two images that should be equal in every digit may be apart, over their mean: the order in which
+# pixels' sums are taken, and an intensity that Mitsuba's point lights round differently at each distance.
+EXACT = 1e-5
+
+# Share of the pixels that may differ all the same: those in whose draws something took part that is 0 in
+# single precision in one unit and not in the other.
+DRAWN = 0.01
+
+
+def _exact(subject: Subject, places: dict) -> Outcome:
+    """One seed; images in all ``places`` equal the plain one (times the light) in every digit, so do the
+    decisions."""
+    worst, differing, ok, words = 0.0, 0.0, True, []
+    for side, (parameters, spp) in SIDES.items():
+        plain, statistics = _render(subject.load(), parameters, spp, 3)
+        ways = _ways(statistics)
+        ok &= plain.mean() > 0.01 and (side != "default" or bool(ways))
+        for name, place in places.items():
+            image, statistics = _render(subject.load(place), parameters, spp, 3)
+            apart = np.abs(image / place.light - plain) / plain.mean()
+            differing = max(differing, float((apart > EXACT).mean()))
+            worst = max(worst, abs(float(image.mean() / place.light / plain.mean()) - 1))
+            if _ways(statistics) != ways or statistics["non_finite"]:
+                ok = False
+                words.append(f"{side}, {name}: {_ways(statistics)}, {statistics['non_finite']} not finite")
+    ok &= differing <= DRAWN and worst < 1e-3
+    text = f"{100 * differing:.2g} % of the pixels differ at most, means by {worst:.1g}"
+    return Outcome(bool(ok), "; ".join([text, *words] if words else [text, "decisions the same"]))
+
+
+def _tiles(scene, parameters, spp, seeds):
+    """Tile means of the second colour, (seeds, tiles)."""
+    integrator = mi.load_dict({"max_depth": DEPTH} | parameters)
+    images = [mi.render(scene, integrator=integrator, spp=spp, seed=seed) for seed in seeds]
+    return np.stack([tile_means(np.array(image), TILES)[:, 1] for image in images])
+
+
+def _alike(subject: Subject, places: dict) -> Outcome:
+    """Tile means of renders with other seeds agree."""
+    p, gap, error = [], 0.0, 0.0
+    for parameters, spp in SIDES.values():
+        parameters = {"type": "bdpt"} | parameters
+        plain = _tiles(subject.load(), parameters, spp, range(5))
+        for number, place in enumerate(places.values(), 1):
+            other = _tiles(subject.load(place), parameters, spp, range(10 * number, 10 * number + 5))
+            found = welch(Sample.of(plain), Sample.of(other))
+            p += found.p.tolist()
+            gap = max(gap, abs(float(other.mean() / plain.mean()) - 1))
+            error = max(error, float(found.error.mean() / plain.mean()))
+    family = sidak(p)
+    text = f"p = {family:.2g} over {len(p)} comparisons, means {100 * gap:.2g} % apart at most, "
+    text += f"standard error of a tile {100 * error:.2g} %"
+    return Outcome(family >= LEVEL and error < 0.1, text)
+
+
+AWAY = Place(shift=(7000.0, -5000.0, 5000.0))  # 1e4 units
+
+
+def _deviation(subject: Subject, parameters, spp) -> float:
+    """Root mean square of what the tiles of the moved scene are off, over the image's mean, less noise."""
+    plain, moved = (
+        Sample.of(_tiles(subject.load(place), parameters, spp, seeds))
+        for place, seeds in ((Place(), range(5)), (AWAY, range(10, 15)))
+    )
+    difference = welch(plain, moved)
+    square = (difference.value**2).mean() - (difference.error**2).mean()
+    return float(np.sqrt(max(square, 0)) / plain.mean.mean())
+
+
+def _moved(subject: Subject) -> Outcome:
+    """Our own error far from the origin is small, and that of `path` larger."""
+    ours = [_deviation(subject, {"type": "bdpt"} | p, spp) for p, spp in SIDES.values()]
+    text = f"tiles off by {100 * max(ours):.2g} %"
+    if not subject.by_path:
+        return Outcome(max(ours) < MOVED, text)
+    theirs = _deviation(subject, {"type": "path"}, 128)
+    return Outcome(max(ours) < min(MOVED, theirs), f"{text}, under `path` by {100 * theirs:.2g} %")
+
+
+# Coordinates of 1e4 have steps of 1e-3, and rays have to start 32 steps of 2^-24 off a surface, 0.01 to 0.02
+# units, of scenes that are 2 to 5 units wide.
+MOVED = 0.03
+
+TURN = rotation([1, 2, 3], 35.7)
+SCALES = {f"2^{k}": Place(2.0**k) for k in (-13, -10, 10, 13)}
+LIGHTS = {f"2^{k}": Place(light=2.0**k) for k in (-40, -20, 20, 40)}
+TURNED = {f"{scale:g}": Place(scale, TURN) for scale in (1e-4, 1e4)}
+
+_EXACTLY = (
+    "the same image, seed for seed, with defaults and with skip=none, and the same decision of the pilot. "
+    f"Powers of two are exact in floating point: {100 * DRAWN:g} % of the pixels may differ by more than "
+    f"{EXACT:g} of the mean, where something takes part in a draw that is 0 in one of the units"
 )
+
+
+def _cases():
+    for name, subject in SUBJECTS.items():
+        words = subject.words
+        quick = name == "sun"
+        yield Case(
+            f"scale-{name}",
+            SECTION,
+            f"{words}, lengths times 2^-13 (1.2e-4), 2^-10, 2^10, 2^13",
+            _EXACTLY,
+            partial(_exact, subject, SCALES),
+            quick,
+        )
+        yield Case(
+            f"light-{name}",
+            SECTION,
+            f"{words}, lights times 2^-40 (0.9e-12), 2^-20, 2^20, 2^40",
+            _EXACTLY,
+            partial(_exact, subject, LIGHTS),
+            name == "envmap",
+        )
+        yield Case(
+            f"turned-{name}",
+            SECTION,
+            f"{words}, turned by 35.7° about (1, 2, 3), lengths times 1e-4 and 1e4",
+            "tile means as of the plain scene (other seeds, 5 a side): Welch's t-test with Šidák at 1e-3, "
+            "defaults and skip=none",
+            partial(_alike, subject, TURNED),
+        )
+        yield Case(
+            f"moved-{name}",
+            SECTION,
+            f"{words}, moved by 1e4",
+            f"tiles off by less than {100 * MOVED:g} % of the mean: coordinates of 1e4 have steps of 1e-3, "
+            "rays start 0.01 to 0.02 off a surface, scenes are 2 to 5 wide; `path`, where it sees the light, "
+            "is off by more",
+            partial(_moved, subject),
+        )
+
+
+CASES = tuple(_cases())

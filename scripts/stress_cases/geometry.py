@@ -1,0 +1,501 @@
+"""Surfaces that are very near, very thin, very small, very many, or where they should not be."""
+
+from __future__ import annotations
+
+import resource
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from metrics import Sample, sidak, tile_means, welch
+
+import mitsuba as mi  # isort: skip
+
+from .case import Case, Outcome
+
+SECTION = "Geometry"
+SIZE, TILES = 16, 4
+
+# Level of all t-tests of a case together, after Sidak's correction. Seeds are fixed.
+LEVEL = 1e-3
+
+SIDES = {"default": {}, "skip=none": {"skip": "none"}}
+
+
+# -- parts of scenes --------------------------------------------------------------------------
+
+
+def _transform():
+    return mi.ScalarTransform4f()
+
+
+def _grey(value):
+    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [float(value)] * 3}}
+    return {"type": "twosided", "bsdf": grey}
+
+
+def _camera(origin, target, fov=45.0, up=(0, 0, 1), near=1e-3):
+    film = {
+        "type": "hdrfilm",
+        "width": SIZE,
+        "height": SIZE,
+        "pixel_format": "rgb",
+        "rfilter": {"type": "box"},
+    }
+    return {
+        "type": "perspective",
+        "fov": float(fov),
+        "near_clip": near,
+        "to_world": _transform().look_at(list(origin), list(target), list(up)),
+        "film": film | {"component_format": "float32"},
+    }
+
+
+def _area(radiance):
+    return {"type": "area", "radiance": float(radiance)}
+
+
+def _floor(reflectance=0.5, half=2.0):
+    """In the plane z = 0, facing up."""
+    return {"type": "rectangle", "to_world": _transform().scale(half), "bsdf": _grey(reflectance)}
+
+
+def _lamp(height=3.0, half=0.3, radiance=10.0):
+    """A square that faces down."""
+    to_world = _transform().translate([0.4, 0.3, height]).rotate([1, 0, 0], 180).scale(half)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": _grey(0), "emitter": _area(radiance)}
+
+
+def _scene(**parts):
+    return mi.load_dict({"type": "scene", **parts})
+
+
+# -- how images are judged --------------------------------------------------------------------
+
+
+def _tiles(scene, parameters, spp, seeds):
+    """Tile means, (seeds, tiles), and samples without finite value."""
+    integrator = mi.load_dict({"type": "bdpt"} | parameters)
+    found, broken = [], 0
+    for seed in seeds:
+        image = np.array(integrator.render(scene, spp=spp, seed=seed))
+        found.append(tile_means(image, TILES)[:, 1])
+        broken += integrator.statistics["non_finite"] if hasattr(integrator, "statistics") else 0
+    return np.stack(found), broken
+
+
+def _judge(pairs, most_error) -> Outcome:
+    """t-tests of ``pairs`` of `Sample`s, and whether the means' errors are below ``most_error``."""
+    p, gap, error = [], 0.0, 0.0
+    for a, b in pairs:
+        found = welch(a, b)
+        p += found.p.tolist()
+        scale = max(float(np.abs(b.mean).mean()), 1e-300)
+        gap = max(gap, abs(float((a.mean - b.mean).mean())) / scale)
+        error = max(error, float(found.error.mean()) / scale)
+    family = sidak(p)
+    text = f"p = {family:.2g} over {len(p)} comparisons, means {100 * gap:.2g} % apart, "
+    text += f"standard error {100 * error:.2g} %"
+    return Outcome(family >= LEVEL and error <= most_error, text)
+
+
+def _whole(values):
+    return Sample.of(np.mean(values, axis=1, keepdims=True))
+
+
+def _against(makes, parameters, spp=256, most_error=0.02) -> Outcome:
+    """Scene pairs ``makes`` that should look alike: (scene, other scene, the other's integrator)."""
+    pairs, broken = [], 0
+    for scene, other, theirs in makes:
+        seen = theirs and Sample.of(_tiles(other, parameters | theirs, 2 * spp, range(10, 16))[0])
+        for side in SIDES.values():
+            a, bad = _tiles(scene, side | parameters, spp, range(6))
+            b = seen or Sample.of(_tiles(other, side | parameters, spp, range(10, 16))[0])
+            pairs.append((Sample.of(a), b))
+            broken += bad
+    outcome = _judge(pairs, most_error)
+    return Outcome(outcome.ok and not broken, f"{outcome.happened}, {broken} samples not finite")
+
+
+def _known(makes, parameters, spp=256, most_error=0.01) -> Outcome:
+    """(scene, mean that is known) pairs."""
+    pairs, broken = [], 0
+    for scene, expected in makes:
+        for side in SIDES.values():
+            a, bad = _tiles(scene, side | parameters, spp, range(8))
+            pairs.append((_whole(a), Sample.known([expected])))
+            broken += bad
+    outcome = _judge(pairs, most_error)
+    return Outcome(outcome.ok and not broken, f"{outcome.happened}, {broken} samples not finite")
+
+
+PATH = {"type": "path"}
+
+
+# -- plates, walls, contacts ------------------------------------------------------------------
+
+
+def _form_factor(h):
+    """Between two unit squares, parallel and coaxial, at the distance ``h``."""
+    x = 1 / h
+    root = np.sqrt(1 + x * x)
+    terms = np.log((1 + x * x) / np.sqrt(1 + 2 * x * x))
+    terms += 2 * x * root * np.arctan(x / root) - 2 * x * np.arctan(x)
+    return 2 / (np.pi * x * x) * terms
+
+
+def _plates() -> Outcome:
+    makes = []
+    for h in (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0):
+        to_world = _transform().translate([0, 0, h]).rotate([1, 0, 0], 180).scale(0.5)
+        lamp = {"type": "rectangle", "emitter": _area(1), "bsdf": _grey(0), "to_world": to_world}
+        plate = {"type": "rectangle", "to_world": _transform().scale(0.5), "bsdf": _grey(1)}
+        camera = _camera((0, 0, 2), (0, 0, 0), np.rad2deg(2 * np.arctan(0.25)), (0, 1, 0))
+        makes.append((_scene(sensor=camera, plate=plate, lamp=lamp), _form_factor(h)))
+    return _known(makes, {"max_depth": 2, "hide_emitters": True}, spp=64)
+
+
+def _slab(axis, place, thickness):
+    """A wall across an axis, wide enough that walls overlap at the edges of a room of 2 units."""
+    half, centre = [1.0 + 2 * thickness] * 3, [0.0] * 3
+    half[axis], centre[axis] = thickness / 2, place
+    return {"type": "cube", "to_world": _transform().translate(centre).scale(half), "bsdf": _grey(0.7)}
+
+
+def _walls(inside: bool) -> Outcome:
+    """A closed box of walls 1e-4 thick; lamps on one side of it, the camera on the other."""
+    walls = {f"w{a}{s}": _slab(a, s * 1.0, 1e-4) for a in range(3) for s in (-1, 1)}
+    room = {"type": "cube", "to_world": _transform().scale(4), "bsdf": _grey(0.7)}
+    at = 0.4 if inside else 1.9
+    point = {"type": "point", "position": [at, 0.2, at], "intensity": 10.0}
+    sphere = {"type": "sphere", "center": [-at, 0.3, 0.4], "radius": 0.2, "emitter": _area(20)}
+    camera = _camera((0.1, -2.9, 0.3) if inside else (0.1, -0.8, 0.2), (0, 0, 0), 70)
+    leaks, seen = {}, {}
+    for name, parts in (("closed", walls), ("open", {k: v for k, v in walls.items() if k != "w1-1"})):
+        scene = _scene(sensor=camera, point=point, sphere=sphere, room=room, **parts)
+        for side, parameters in (*SIDES.items(), ("path", PATH)):
+            values, _ = _tiles(scene, parameters | {"max_depth": 6}, 256, range(2))
+            (leaks if name == "closed" else seen)[side] = float(values.mean())
+    theirs = leaks.pop("path") / seen["path"]
+    share = max(leaks[side] / seen[side] for side in leaks)
+    text = f"{share:.2g} of the light of the room with one wall missing; `path`: {theirs:.2g}"
+    return Outcome(share == 0 and min(seen.values()) > 0, text)
+
+
+def _touching() -> Outcome:
+    """A box that stands on the floor looks like one that is let into it; so does a stack of two."""
+
+    def box(low, high):
+        to_world = _transform().translate([0, 0, (low + high) / 2]).scale([0.5, 0.5, (high - low) / 2])
+        return {"type": "cube", "to_world": to_world, "bsdf": _grey(0.6)}
+
+    common = {"sensor": _camera((2, -3, 2), (0, 0, 0.3)), "floor": _floor(), "lamp": _lamp()}
+    sunk = _scene(**common, box=box(-0.7, 0.8))
+    standing = _scene(**common, box=box(0, 0.8))
+    stacked = _scene(**common, box=box(0, 0.5), upper=box(0.5, 0.8))
+    return _against([(standing, sunk, {}), (stacked, sunk, {})], {"max_depth": 5})
+
+
+def _coincident() -> Outcome:
+    """The same floor twice and thrice is one floor."""
+    common = {"sensor": _camera((2, -3, 2), (0, 0, 0.3)), "lamp": _lamp()}
+    ball = {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.4, "bsdf": _grey(0.6)}
+    one = _scene(**common, ball=ball, floor=_floor())
+    three = _scene(**common, ball=ball, twin=ball, floor=_floor(), second=_floor(), third=_floor())
+    return _against([(three, one, {})], {"max_depth": 5})
+
+
+def _lamp_in_the_ceiling() -> Outcome:
+    """A lamp in the plane of a ceiling: which of the two a ray meets is undefined."""
+    common = {"sensor": _camera((2, -3, 2), (0, 0, 0.3)), "floor": _floor()}
+    to_world = _transform().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(1.5)
+    ceiling = {"type": "rectangle", "to_world": to_world, "bsdf": _grey(0)}
+    means = {}
+    for name, more in (("lamp", {}), ("both", {"ceiling": ceiling})):
+        scene = _scene(**common, lamp=_lamp(), **more)
+        for side, parameters in (*SIDES.items(), ("path", PATH)):
+            values, broken = _tiles(scene, parameters | {"max_depth": 4}, 256, range(4))
+            means[name, side] = float(values.mean()) if not broken else np.nan
+    shares = {side: means["both", side] / means["lamp", side] for side in (*SIDES, "path")}
+    text = ", ".join(f"{side} {100 * share:.4g} %" for side, share in shares.items())
+    ok = all(0 <= shares[side] <= 1.01 for side in SIDES)
+    return Outcome(ok, f"of the light without the ceiling: {text}")
+
+
+# -- triangles --------------------------------------------------------------------------------
+
+
+def _mesh(positions, faces, folder, name, **parts):
+    """A PLY mesh without vertex normals."""
+    mesh = mi.Mesh(name, len(positions), len(faces))
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = mi.Float(np.asarray(positions, dtype=np.float32).ravel())
+    values["faces"] = mi.UInt32(np.asarray(faces, dtype=np.uint32).ravel())
+    values.update()
+    path = Path(folder) / f"{name}.ply"
+    mesh.write_ply(str(path))
+    return {"type": "ply", "filename": str(path), "face_normals": True} | parts
+
+
+# A square of two triangles; and more points on it, for triangles without area: points, edges, needles.
+SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0, 0], [0.5, 0.5, 0]], dtype=float)
+WHOLE = [[0, 1, 2], [0, 2, 3]]
+EMPTY = [[4, 4, 4], [0, 0, 2], [0, 4, 2], [4, 5, 2], [1, 1, 1]]
+
+
+def _no_area() -> Outcome:
+    """Triangles without area, in the floor and in the lamp, change nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        scenes = []
+        for name, faces in (("plain", WHOLE), ("empty", EMPTY[:3] + WHOLE + EMPTY[3:])):
+            lamp = SQUARE * [0.3, -0.3, 1] + [0.4, 0.3, 3]
+            scenes.append(
+                _scene(
+                    sensor=_camera((2, -3, 2), (0, 0, 0.3)),
+                    floor=_mesh(SQUARE * 2, faces, folder, f"{name}_floor", bsdf=_grey(0.5)),
+                    lamp=_mesh(lamp, faces, folder, f"{name}_lamp", bsdf=_grey(0), emitter=_area(10)),
+                    ball={"type": "sphere", "center": [0, 0, 0.4], "radius": 0.4, "bsdf": _grey(0.6)},
+                )
+            )
+        return _against([(scenes[1], scenes[0], {})], {"max_depth": 5})
+
+
+def _lamp_without_area() -> Outcome:
+    """A lamp of nothing but empty triangles beside a real one."""
+    with tempfile.TemporaryDirectory() as folder:
+        nothing = _mesh(SQUARE + [0, 0, 1], EMPTY, folder, "nothing", bsdf=_grey(0), emitter=_area(10))
+        common = {"sensor": _camera((2, -3, 2), (0, 0, 0.3)), "floor": _floor(), "lamp": _lamp()}
+        happened = {}
+        for name, parameters in (("bdpt", {}), ("path", PATH)):
+            try:
+                values, broken = _tiles(_scene(**common, nothing=nothing), parameters, 64, range(2))
+                happened[name] = f"renders, {broken} samples not finite, mean {values.mean():.4g}"
+                ok = broken == 0 and np.isfinite(values).all()
+            except (RuntimeError, ValueError) as error:
+                happened[name] = "refused: " + str(error).strip().splitlines()[-1][:100]
+                ok = True
+            if name == "bdpt":
+                good = ok
+        return Outcome(good, f"`bdpt` {happened['bdpt']}; `path` {happened['path']}")
+
+
+def _ball_mesh(n, folder, **parts):
+    """A unit ball of about 2 n^2 triangles."""
+    phi, theta = np.meshgrid(np.arange(n) * 2 * np.pi / n, np.linspace(0, np.pi, n + 1))
+    phi, theta = phi.ravel(), theta.ravel()
+    points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1)
+    j, i = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    a, b = (j * n + i).ravel(), (j * n + (i + 1) % n).ravel()
+    faces = np.concatenate([np.stack([a, a + n, b], 1), np.stack([b, a + n, b + n], 1)])
+    return _mesh(points, faces, folder, "ball", **parts)
+
+
+def _million(emits: bool) -> Outcome:
+    """A ball of a million triangles beside the sphere that it stands for."""
+    parts = {"bsdf": _grey(0.5)} | ({"emitter": _area(3)} if emits else {})
+    common = {"sensor": _camera((3, -5, 3), (0, 0, -0.2)), "floor": _floor(0.5, 5)}
+    common["floor"]["to_world"] = _transform().translate([0, 0, -1.2]).scale(5)
+    common |= {} if emits else {"lamp": _lamp(4, 0.5, 20)}
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with tempfile.TemporaryDirectory() as folder:
+        mesh = _ball_mesh(707, folder, **parts)
+        fine, exact = _scene(**common, ball=mesh), _scene(**common, ball={"type": "sphere"} | parts)
+    started = time.perf_counter()
+    mi.load_dict({"type": "bdpt", "max_depth": 5}).render(fine, spp=16)
+    seconds = time.perf_counter() - started
+    more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    started = time.perf_counter()
+    mi.load_dict({"type": "path", "max_depth": 5}).render(fine, spp=16)
+    theirs = time.perf_counter() - started
+    outcome = _against([(fine, exact, {})], {"max_depth": 5})
+    text = (
+        f"{outcome.happened}; first render {seconds:.1f} s (`path` {theirs:.1f} s), {more:.0f} MiB for it all"
+    )
+    return Outcome(outcome.ok and seconds < 20 and more < 1024, text)
+
+
+# -- light at its limits ----------------------------------------------------------------------
+
+
+def _grazing() -> Outcome:
+    """The sun at cosines from 0.1 to 1e-6 over a floor: rho E cos / pi."""
+    makes = []
+    for cos in (0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        sun = {
+            "type": "directional",
+            "direction": [float(np.sqrt(1 - cos**2)), 0.0, -cos],
+            "irradiance": 1.0 / cos,
+        }
+        makes.append(
+            (_scene(sensor=_camera((0.5, -2, 2), (0, 0, 0)), floor=_floor(0.5, 4), sun=sun), 0.5 / np.pi)
+        )
+    return _known(makes, {"max_depth": 4}, spp=256, most_error=0.03)
+
+
+def _tiny(kind) -> Outcome:
+    """A lamp of 1e-6 is a point lamp of the same intensity."""
+    half, away = 1e-6, 2.0
+    down = _transform().translate([0, 0, away]).rotate([1, 0, 0], 180)
+    if kind == "sphere":
+        shape = {"type": "sphere", "center": [0, 0, away], "radius": half}
+    else:
+        shape = {"type": kind, "to_world": down.scale(half)}
+    area = {"sphere": np.pi, "disk": np.pi, "rectangle": 4}[kind] * half**2
+    # Seen at an angle, so that the lamp does not stand in the way: a spot of 0.003 about the point below it.
+    camera = _camera((0.5, -1, 1.5), (0, 0, 0), 0.1)
+    scene = _scene(
+        sensor=camera, floor=_floor(0.5, 4), lamp=shape | {"bsdf": _grey(0), "emitter": _area(1 / area)}
+    )
+    expected = 0.5 / np.pi / away**2
+    outcome = _known([(scene, expected)], {"max_depth": 2}, spp=64, most_error=0.01)
+    theirs, _ = _tiles(scene, PATH | {"max_depth": 2}, 64, range(4))
+    text = f"{outcome.happened}; `path` has {theirs.mean() / expected:.3g} of the light"
+    if kind == "sphere" and not outcome.ok and theirs.mean() == 0:
+        text += ", either: Mitsuba's density of the cone towards the sphere is infinite in single precision"
+    return Outcome(outcome.ok, text)
+
+
+# -- the camera in odd places -----------------------------------------------------------------
+
+
+def _in_glass() -> Outcome:
+    """Inside a glass ball under a sky of radiance 1, off its centre: n^2, since nothing is lost."""
+    glass = {"type": "sphere", "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}}
+    sky = {"type": "constant", "radiance": 1.0}
+    scene = _scene(sensor=_camera((0.3, 0.1, 0.2), (1, 1, 0.5), 70), glass=glass, sky=sky)
+    floor = {"sensor": _camera((0.3, 0.1, 0.2), (0.4, 0.5, -1), 60), "lamp": _lamp()}
+    floor["floor"] = {"type": "rectangle", "to_world": _transform().translate([0, 0, -1.5]).scale(3)}
+    room = _scene(**floor, glass=glass)
+    known = _known([(scene, 2.25)], {"max_depth": 40}, spp=64)
+    same = _against([(room, room, PATH)], {"max_depth": 5}, spp=1024, most_error=0.1)
+    return Outcome(known.ok and same.ok, f"sky: {known.happened}; lamp and floor: {same.happened}")
+
+
+def _odd_cameras(where) -> Outcome:
+    """A pinhole on a surface or at a light sees what `path` sees."""
+    ball = {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.4, "bsdf": _grey(0.6)}
+    parts = {"floor": _floor(), "ball": ball, "lamp": _lamp()}
+    if where == "surface":
+        cameras = [
+            _camera((-1.5, -1, 0), (0, 0, 0.2)),  # in the plane of the floor
+            _camera((0, 0, 0.8), (0.4, 0.3, 3), 80, (0, 1, 0)),  # on top of the ball
+            _camera((2, 2, 0), (0, 0, 0.3)),  # at the corner of the floor
+        ]
+    else:
+        cameras = [
+            _camera((0.4, 0.3, 3), (0, 0, 0), 60),  # in the square of the lamp
+            _camera((1.0, -1.2, 1.5), (0, 0, 0.3)),  # at the point light
+            _camera(
+                (-1, 0.5, 1.2), (0, 0, 0.3)
+            ),  # in the middle of a lamp on a sphere, whose inside is black
+        ]
+        parts["point"] = {"type": "point", "position": [1.0, -1.2, 1.5], "intensity": 5.0}
+        parts["bulb"] = {"type": "sphere", "center": [-1, 0.5, 1.2], "radius": 0.1, "emitter": _area(30)}
+    scenes = [_scene(sensor=camera, **parts) for camera in cameras]
+    return _against([(s, s, PATH) for s in scenes], {"max_depth": 4}, spp=512, most_error=0.05)
+
+
+_T_TEST = "t-test with Šidák at 1e-3"
+_WELCH = f"Welch's {_T_TEST} of tile means over 6 seeds a side, defaults and skip=none"
+
+
+def _case(name, tried, expected, run, quick=False):
+    return Case(name, SECTION, tried, expected, run, quick)
+
+
+CASES = (
+    _case(
+        "plates",
+        "two parallel plates 1e-4, 1e-3, … 100 of their width apart",
+        f"the analytic form factor: {_T_TEST} over 8 seeds, standard error below 1 %",
+        _plates,
+    ),
+    *(
+        _case(
+            f"thin-walls-{'out' if inside else 'in'}",
+            f"a closed room of 2 with walls 1e-4 thick, lamps {'in' if inside else 'out'}side, camera "
+            f"{'out' if inside else 'in'}side",
+            "exactly black: no ray may leak",
+            partial(_walls, inside),
+            not inside,
+        )
+        for inside in (False, True)
+    ),
+    _case(
+        "touching",
+        "a box that stands on the floor, two stacked ones",
+        f"the image of a box that is let into the floor: {_WELCH}",
+        _touching,
+    ),
+    _case(
+        "coincident",
+        "a floor three times in one plane, a ball twice",
+        f"the image of one of each: {_WELCH}",
+        _coincident,
+    ),
+    _case(
+        "lamp-in-the-ceiling",
+        "a lamp in the plane of a black ceiling",
+        "which of them a ray meets is undefined: values finite, no more light than without the ceiling "
+        "(1 % for noise)",
+        _lamp_in_the_ceiling,
+    ),
+    _case(
+        "triangles-without-area",
+        "triangles without area (points, edges, needles) in a floor and in a lamp",
+        f"they change nothing: {_WELCH}",
+        _no_area,
+        True,
+    ),
+    _case(
+        "lamp-without-area",
+        "a lamp of triangles without area alone",
+        "refused in words, or an image of finite values",
+        _lamp_without_area,
+    ),
+    *(
+        _case(
+            f"million-triangles{'-emit' if emits else ''}",
+            f"a ball of a million triangles{' that emits' if emits else ''}",
+            f"the image of a sphere: {_WELCH}; first render below 20 s, mesh and renders below 1 GiB",
+            partial(_million, emits),
+        )
+        for emits in (False, True)
+    ),
+    _case(
+        "grazing-sun",
+        "a sun over a floor, cosines 0.1, 1e-2, … 1e-6",
+        f"reflectance times irradiance over pi: {_T_TEST} over 8 seeds, standard error below 3 %",
+        _grazing,
+        True,
+    ),
+    *(
+        _case(
+            f"tiny-{kind}",
+            f"a lamp on a {kind} of 1e-6",
+            f"the light of a point of the same intensity: {_T_TEST} over 8 seeds, standard error below 1 %",
+            partial(_tiny, kind),
+        )
+        for kind in ("rectangle", "disk", "sphere")
+    ),
+    _case(
+        "camera-in-glass",
+        "the camera in a glass ball, under a sky and in a lit room",
+        f"n^2 = 2.25 times the sky's radiance; in the room what `path` sees: {_WELCH}",
+        _in_glass,
+    ),
+    *(
+        _case(
+            f"camera-{name}",
+            f"the pinhole {words}",
+            f"what `path` sees: {_WELCH}",
+            partial(_odd_cameras, where),
+        )
+        for name, where, words in (
+            ("on-a-surface", "surface", "in the plane of a floor, on a ball, at a corner"),
+            ("at-a-light", "light", "in a lamp's surface, at a point light, in a lamp on a sphere"),
+        )
+    ),
+)
