@@ -56,7 +56,8 @@ class Biased(Refused):
     """An efficiency over integrators that fail the bias check; ``lacks``: what each of them does, by name."""
 
     def __init__(self, lacks: dict[str, str]):
-        super().__init__("; ".join(f"{name}: {what}" for name, what in lacks.items()))
+        several = "; ".join(f"{name}: {what}" for name, what in lacks.items())
+        super().__init__(several if len(lacks) > 1 else next(iter(lacks.values())))
         self.lacks = lacks
 
 
@@ -224,21 +225,27 @@ class Results:
         return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
 
     def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Spread:
-        """As `efficiency`; raises `Biased` where the other fails the bias check (with too few seeds for one,
-        there is none to fail)."""
+        """As `efficiency`; raises `Biased` where the other fails the bias check. (With too few seeds for one
+        there is none to fail, but an image that is black where the reference is not.)"""
         try:
             check = self.bias(scene, rival)
         except Refused:
             check = None
+            rows = self.of(scene, rival)
+            if rows and not np.any([row["tile_means"] for row in rows]):
+                raise Biased({rival: NOTHING}) from None
         if check is not None and not check.passed:
             raise Biased({rival: missing(check)})
         return self.efficiency(scene, rival, error, budget)
 
     def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Spread:
         """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
-        that pass the bias check; raises `Biased` if neither does."""
+        that were rendered and pass the bias check; raises `Biased` if none does."""
         found, biased = [], {}
-        for rival in RIVALS:
+        rivals = [rival for rival in RIVALS if self.of(scene, rival)]
+        if not rivals:
+            raise Refused(f"{RIVALS[0]} was not rendered")
+        for rival in rivals:
             try:
                 found.append(self.fair_efficiency(scene, rival, error, budget))
             except Biased as why:

@@ -22,6 +22,7 @@ import numpy as np
 import reference
 import report
 from analysis import NOTHING, RIVALS, Biased, Refused, Results
+from mitsuba_bdpt.explain import subpaths
 from mitsuba_bdpt.files import replacing
 
 FRAME = Path(__file__).with_suffix(".html")
@@ -84,7 +85,7 @@ def why(results: Results, scene: str) -> str:
             "all": "all inner connections",
         }[decided["connections"]]
         served = round(1 / decided["light_paths"])
-        said = f"A pilot chose one light subpath per {served} camera subpaths, {joined}."
+        said = f"A pilot chose one light subpath per {subpaths(served)}, {joined}."
     left_out = [
         f"Left out: {entry['class']} ({entry['why']})."
         for entry in statistics.get("skipped", [])

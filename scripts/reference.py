@@ -23,7 +23,6 @@ import hashlib
 import json
 import math
 import platform
-import re
 import time
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -46,7 +45,9 @@ from metrics import (
 
 import mitsuba as mi  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
+from mitsuba_bdpt.checkpoints import named_files  # isort: skip
 from mitsuba_bdpt.files import replacing  # isort: skip
+from mitsuba_bdpt.loading import in_proportion  # isort: skip
 from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -132,14 +133,7 @@ def load_scene(name: str, **definitions):
 
 def load_file(path: Path, **definitions):
     """A scene with its ``<default>``s replaced; ``resolution`` keeps the image's proportions."""
-    text = path.read_text()
-    width, height = (
-        re.search(rf'<default name="{key}" value="(\d+)"', text) for key in ("resolution", "resolution_y")
-    )
-    if height and "resolution" in definitions:
-        proportion = int(height[1]) / int(width[1])
-        definitions["resolution_y"] = max(round(definitions["resolution"] * proportion), 1)
-    return mi.load_file(str(path), parallel=False, **definitions)
+    return mi.load_file(str(path), parallel=False, **in_proportion(path, definitions))
 
 
 def default_depth(name: str) -> int:
@@ -205,8 +199,7 @@ def digest(*paths: Path) -> str:
 def scene_digest(name: str) -> str:
     """SHA-256 of a scene's file and of the meshes and textures that it names."""
     file = scene_file(name)
-    named = re.findall(r'name="filename" value="([^"$]+)"', file.read_text())
-    return digest(file, *(file.parent / path for path in named))
+    return digest(file, *named_files(file))
 
 
 def source_digest() -> str:

@@ -125,7 +125,7 @@ def main(arguments=None) -> int:
         raise ValueError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     mi.set_variant("llvm_ad_rgb")
     path = scene_file(options.scene)
-    output = options.output or ROOT / "renders" / f"pyramid_{path.stem}"
+    output = options.output and options.output.with_suffix("") or ROOT / "renders" / f"pyramid_{path.stem}"
     film, images = render(path, options)
     output.parent.mkdir(parents=True, exist_ok=True)
     write_images(

@@ -161,8 +161,8 @@ def results(outcome, statistics):
     [
         (Spread(24.0, 23, 25, 20.0, 30.0, 5), 24, "path takes 24x the time for the same error (20 to 30x)"),
         (Spread(0.8, 0.7, 0.9, 0.5, 1.0, 5), 0.8, "path is ahead: its efficiency is 1.25x ours (1 to 2x)"),
-        (Biased({"path": "all energy is missing"}), np.inf, "fails the bias check here: path: all energy"),
-        (Biased({"path": "2 % too much energy"}), np.nan, "path fails the bias check here: path: 2 % too"),
+        (Biased({"path": "all energy is missing"}), np.inf, "fails the bias check here: all energy"),
+        (Biased({"path": "2 % too much energy"}), np.nan, "path fails the bias check here: 2 % too"),
         (NotJudged("too noisy", 0.02), np.nan, "No figure: too noisy"),
     ],
 )

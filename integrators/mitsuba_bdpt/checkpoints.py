@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import sys
 import time
 from argparse import Namespace
@@ -20,10 +21,19 @@ def path_of(output: Path) -> Path:
     return output.with_suffix(".checkpoint.npz")
 
 
+def named_files(scene: Path) -> list[Path]:
+    """Meshes and textures that a scene file names by constants, as far as they exist."""
+    names = re.findall(r'name="filename" value="([^"$]+)"', scene.read_text())
+    return [path for path in (scene.parent / name for name in names) if path.is_file()]
+
+
 def digest(options: Namespace) -> str:
-    """Of a scene file and the definitions on the command line, not of the files that it names."""
-    text = options.scene.read_bytes() + json.dumps(sorted(options.defines)).encode()
-    return hashlib.sha256(text + str(options.sensor).encode()).hexdigest()
+    """Of a scene file, the meshes and textures that it names, the definitions on the command line and the
+    sensor."""
+    found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor]).encode())
+    for path in (options.scene, *named_files(options.scene)):
+        found.update(hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
 
 
 def check(options: Namespace, output: Path) -> None:
@@ -46,8 +56,9 @@ def start(options: Namespace, output: Path) -> Snapshot:
     kept = read(path)
     if kept.progress.get("scene") != digest(options):
         raise ValueError(
-            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r} or its definitions (-D) have "
-            "changed; go on with those it was begun with, or delete it."
+            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a mesh or "
+            "texture, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
+            "or delete it."
         )
     return kept
 

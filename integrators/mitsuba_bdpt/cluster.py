@@ -76,24 +76,30 @@ class Merged:
         return self._next + len(self._waiting)
 
 
-def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]) -> dict:
+def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]):
     """Render as the command line ``options`` say on the cluster ``options.scheduler``, into the sensor's
-    film; returns the statistics, whose seconds are those of all parts together. ``on_part`` is called after
-    each part. Raises what `connected` does."""
-    started, merged = time.perf_counter(), Merged()
+    film; returns the statistics, whose seconds are those of all parts together, and whether Ctrl-C came:
+    then they are of the parts before the first one that had not come. ``on_part`` is called after each part.
+    Raises what `connected` does."""
+    started, merged, interrupted = time.perf_counter(), Merged(), False
     with connected(options.scheduler) as client:
         job = _job(scene, integrator, options, spp)
         count = options.parts or PARTS_PER_WORKER * worker_count(client)
         parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
-        for index, data in results(client, render_part, parts):
-            merged.add(index, Snapshot.from_bytes(data))
-            done = merged.snapshot
-            if done is not None:
-                rays = sum(done.progress["counts"][name] for name in RAYS)
-                seconds = time.perf_counter() - started
-                on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
+        try:
+            for index, data in results(client, render_part, parts):
+                merged.add(index, Snapshot.from_bytes(data))
+                done = merged.snapshot
+                if done is not None:
+                    rays = sum(done.progress["counts"][name] for name in RAYS)
+                    seconds = time.perf_counter() - started
+                    on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
+        except KeyboardInterrupt:
+            interrupted = True
+    if merged.snapshot is None:
+        return {"passes": []}, interrupted
     integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
-    return integrator.statistics
+    return integrator.statistics, interrupted
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:
@@ -132,15 +138,17 @@ def results(client, function, arguments):
             if len(running) < workers and list(running.values()).count(index) == 1:
                 submit(index)
 
-    fill()
-    while len(done) < len(arguments):
-        future = next(pending)
-        index = running.pop(future)
-        if index not in done:
-            done.add(index)
-            yield index, _result(future, index)
+    try:
         fill()
-    client.cancel(list(running), force=True)
+        while len(done) < len(arguments):
+            future = next(pending)
+            index = running.pop(future)
+            if index not in done:
+                done.add(index)
+                yield index, _result(future, index)
+            fill()
+    finally:
+        client.cancel(list(running), force=True)
 
 
 def _result(future, index: int):

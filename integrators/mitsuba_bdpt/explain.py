@@ -6,6 +6,11 @@ from .choice import STRATIFIED_SPLATS
 from .plan import Plan, Settings, lost_paths
 
 
+def subpaths(count: int) -> str:
+    """So many camera subpaths, in words."""
+    return f"{count} camera subpaths" if count > 1 else "camera subpath"
+
+
 def explain(world, p: Plan, settings: Settings, table, lost_by_pilot: int = 0) -> str:
     """Text about the strategies in use and those that are skipped.
 
@@ -25,7 +30,7 @@ def explain(world, p: Plan, settings: Settings, table, lost_by_pilot: int = 0) -
         if on
     ]
     lines = [
-        f"heuristic {settings.heuristic}, one light subpath per {p.served} camera subpaths"
+        f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.served)}"
         if p.light
         else f"heuristic {settings.heuristic}, no light subpaths"
     ]

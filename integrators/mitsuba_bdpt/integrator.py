@@ -9,6 +9,7 @@ from dataclasses import asdict
 import drjit as dr
 import mitsuba as mi
 
+from . import choice
 from .explain import explain
 from .features import feature_names
 from .parameters import check_made_for, check_variant, integer, is_index, read_settings
@@ -210,6 +211,8 @@ def _make_class():
             if self.settings.decisions:
                 render.replay(0)
             text = explain(render.world, render.plan, self.settings, table, render.lost_by_pilot())
+            if spp is None and choice.is_open(render.plan, self.settings):
+                return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
             return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"
 
         def to_string(self):

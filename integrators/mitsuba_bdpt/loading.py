@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import re
 from argparse import Namespace
 from collections.abc import Mapping
+from pathlib import Path
 
 import mitsuba as mi
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """What an integrator that replaces the scene's takes over: the same paths are to be found."""
+
+
+def in_proportion(scene: Path, definitions: dict) -> dict:
+    """``definitions`` with the height ``resolution_y`` that belongs to the ``resolution`` among them, if the
+    scene file has such defaults and it is not given: the image keeps its proportions."""
+    text = scene.read_text()
+    width, height = (
+        re.search(rf'<default name="{key}" value="(\d+)"', text) for key in ("resolution", "resolution_y")
+    )
+    if not (width and height and "resolution" in definitions) or "resolution_y" in definitions:
+        return definitions
+    scaled = int(definitions["resolution"]) * int(height[1]) / int(width[1])
+    return definitions | {"resolution_y": max(round(scaled), 1)}
 
 
 def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
@@ -30,7 +45,8 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if options.time is not None:
         overrides["timeout"] = options.time
     config = mi.parser.ParserConfig(options.variant)
-    state = mi.parser.parse_file(config, str(options.scene), **dict(options.defines))
+    defines = in_proportion(options.scene, dict(options.defines))
+    state = mi.parser.parse_file(config, str(options.scene), **defines)
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     kind = mi.ObjectType.Integrator
     node = next((node for node in state.nodes if node.type == kind), None)

@@ -136,8 +136,8 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
     if options.scheduler is not None:
         started = time.perf_counter()
         with progress_bar() as bar:
-            statistics = cluster.render(scene, integrator, options, spp, show_pass(bar, None))
-        return Outcome(time.perf_counter() - started, sum(statistics["passes"]), False, statistics)
+            statistics, interrupted = cluster.render(scene, integrator, options, spp, show_pass(bar, None))
+        return Outcome(time.perf_counter() - started, sum(statistics["passes"]), interrupted, statistics)
     if options.time is not None and not hasattr(integrator, "on_pass"):
         return render_repeatedly(scene, integrator, options, spp)
     return render_here(scene, integrator, options, spp, output)

@@ -21,7 +21,7 @@ from .kernel import COUNTERS, Kernel, trace
 from .objects import nothing_freed, step_by_step
 from .parameters import check_film, check_scene, check_variant, integer
 from .passes import REPLICATES, Step, batches, schedule
-from .plan import Settings, plan
+from .plan import Settings, lost_paths, plan
 from .sinks import Image
 from .snapshot import Snapshot
 from .strategies import strategy_count
@@ -139,7 +139,8 @@ class Render:
         """Why no pilot is asked about the rest of the render, empty if one is; and the decision, if there is
         one."""
         if not choice.is_open(self._full, self.settings):
-            return "there is nothing to choose, by the scene or by hand", None
+            why = "chosen by hand" if self._full.light else "light subpaths cannot add anything"
+            return f"there is nothing to choose: {why}", None
         if self._pixels < choice.FEW_PIXELS:
             return f"it says nothing about films of fewer than {choice.FEW_PIXELS} pixels", None
         if decision := choice.by_scene(self.world, self._full, self.settings, self._samples()):
@@ -182,6 +183,11 @@ class Render:
         for decision in self.settings.decisions:
             if decision.first_pass == number:
                 self._adopt(decision, choice.replayed(decision))
+                for text in sorted({*self._lost(self.plan)} - {*self._lost(self._full)}):
+                    mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {text}")
+
+    def _lost(self, p):
+        return lost_paths(self.world, p, self.settings)
 
     def _decide_before(self, step: Step):
         """Replay the decision for this pass; or, early in a long render, ask another pilot."""
