@@ -21,6 +21,10 @@ import mitsuba as mi  # isort: skip
 from .endpoints import Camera, disks_of, dot, lamps_of, length2
 from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 
+# Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
+# edge's vertices. Both serve as its direction.
+MOST_TURNED = 1e-3
+
 
 @dataclass
 class Point:
@@ -51,8 +55,8 @@ class Walked:
 @dataclass
 class Made:
     """Paths that the kernel made with ``s`` light vertices: the ``weights`` it gave them; ``unsure`` counts
-    those left out, where rounding decides which disk light from infinity has started on, or whether a point
-    lies on a lamp."""
+    those left out, where rounding decides which disk light from infinity has started on, whether a point
+    lies on a lamp, or what the cosines of a short edge are (`MOST_TURNED`)."""
 
     s: int
     weights: np.ndarray
@@ -237,7 +241,10 @@ class Capture:
         x, n, *pdfs = stacked
         kind = np.array([lamp.kind for lamp in self.lamps])[index]
         infinite = (kind == ENVIRONMENT) | (kind == DIRECTIONAL)
-        dist2 = length2(x[:, 1:] - x[:, :-1])
+        between = x[:, 1:] - x[:, :-1]
+        dist2 = length2(between)
+        turned = np.sqrt(length2(between / np.sqrt(dist2)[..., None] - d))
+        turned[infinite, 0] = 0
         cos_light, cos_camera = np.abs(dot(n[:, :-1], d)), np.abs(dot(n[:, 1:], d))
         dist2[infinite, 0], cos_light[kind != AREA, 0] = 1, 1
         cos_camera[:, -1] = np.abs(d[:, -1] @ self.camera.axis)
@@ -245,7 +252,7 @@ class Capture:
         lens = np.full(len(d), self.camera.radius > 0)
         lens_pdf = np.full(len(d), self.camera.lens_density())
         camera = lens, lens_pdf, self.camera.density(d[:, -1])
-        sure = np.ones(len(d), dtype=bool)
+        sure = (turned < MOST_TURNED * np.minimum(cos_light, cos_camera)).all(1)
         if self.disks is not None:
             sure &= ~(infinite & self.disks.unsure(x[:, 1], d[:, 0]))
         for number, lamp in enumerate(self.lamps):

@@ -168,11 +168,7 @@ def of_the_kernel(heuristic: str, count: int, lanes: int, number: int, least: in
         f"; {count} scenes; the kernel's weight differs by {tally.differ:.1e} at most from that by explicit "
     )
     more += "densities"
-    more += (
-        f"; {tally.unsure} paths left out at the rim of a disk of the sky or on a lamp"
-        if tally.unsure
-        else ""
-    )
+    more += f"; {tally.unsure} paths left out where rounding decides" if tally.unsure else ""
     more += f"; first scene that fails: {failed[0]}" if failed else ""
     return tally.outcome(more, least)
 
@@ -202,13 +198,17 @@ def _chains(heuristic: str, batches: int, size: int, quick=False) -> Case:
 
 
 def _paths(name: str, heuristic: str, count: int, lanes: int, number: int, least: int) -> Case:
+    left_out = (
+        "paths left out: at the rim of a disk on which light from the sky starts, on the surface of a lamp, "
+    )
+    left_out += "along edges so short that the offset of rays turns them by more than 1e-3 of a cosine"
     return Case(
         f"weights-paths-{name}",
         SECTION,
         f"`{heuristic}`: paths that the kernel makes in random scenes (hypothesis: shapes, BSDFs, emitters, "
         "sensors, coefficients); its own weight, and those of all other strategies from densities asked of "
         "the scene anew",
-        SUMS + TIES.get(heuristic, "") + f"; {least:,} paths at least",
+        SUMS + TIES.get(heuristic, "") + f"; {least:,} paths at least; {left_out}",
         partial(of_the_kernel, heuristic, count, lanes, number, least),
         quick=name == "few",
     )
