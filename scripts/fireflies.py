@@ -44,8 +44,8 @@ AGREE = 1e-2
 @dataclass(frozen=True)
 class Firefly:
     """A sample that stands out, with the path that adds most to it: ``off`` by so many values of its pixel,
-    ``error`` its sum of squared relative errors; ``rebuilt`` None if the path could not be found anew, ``same``
-    whether it then had the estimate and the weight that the render gave it."""
+    ``error`` its sum of squared relative errors; ``rebuilt`` None if the path could not be found anew, ``doubt``
+    why, or in what it then differed from what the render says, empty if in nothing."""
 
     path: recording.Path
     letters: str
@@ -53,7 +53,7 @@ class Firefly:
     off: float
     error: float
     rebuilt: reconstruct.Rebuilt | None
-    same: bool
+    doubt: str
 
     @property
     def kind(self) -> tuple:
@@ -94,34 +94,28 @@ def fireflies(scene, integrator, target, spp: int, seed: int, level: float, top:
     for outlier, paths in zip(outliers, recording.replay(outliers), strict=True):
         off = outlier.value / spp / scale[outlier.y, outlier.x]
         path = paths[0]
-        rebuilt, same = _found_anew(scene, outlier.launch.kernel, path)
-        found.append(
-            Firefly(
-                path, names.letters(path), names.vertices(path), off.max(), float(off @ off), rebuilt, same
-            )
-        )
+        said = names.letters(path), names.vertices(path), off.max(), float(off @ off)
+        found.append(Firefly(path, *said, *_found_anew(scene, outlier.launch.kernel, path)))
     return image, found
 
 
 def _found_anew(scene, kernel, path):
-    """The path found anew, and whether it is the same."""
+    """The path found anew, and what speaks against it."""
     try:
         rebuilt = reconstruct.rebuild(scene, kernel.emitters, path)
-    except reconstruct.Lost:
-        return None, False
-    return rebuilt, _same(rebuilt, path, kernel)
-
-
-def _same(rebuilt, path, kernel) -> bool:
-    """Whether a path found anew has the estimate and the weight of the render."""
+    except reconstruct.Lost as why:
+        return None, str(why)
     # The estimate is divided by the class's count, and, from `rr_depth` on, by the probability of survival.
-    count = float(kernel.bound(None, 1 / kernel.plan.served).count_light[0]) if path.t <= 1 else 1.0
+    count = 1 / kernel.plan.served if path.t <= 1 else 1.0
     ratio = path.estimate.max() * count / rebuilt.estimate(path.s).max()
     played = max(path.s, path.t) > int(kernel.rr_depth[0])
-    fits = ratio > 1 - AGREE and (played or ratio < 1 + AGREE)
+    if ratio < 1 - AGREE or (ratio > 1 + AGREE and not played):
+        return rebuilt, f"the estimate is {ratio:.3g} times that of the path"
     kappa = coefficients(kernel.plan, path.s + path.t - 1)
     weight = kappa[path.s] / (kappa @ rebuilt.relative(path.s))
-    return fits and abs(weight - path.weight) < AGREE * path.weight
+    if abs(weight - path.weight) > AGREE * path.weight:
+        return rebuilt, f"the weight is {path.weight:.3g}, that of the path {weight:.3g}"
+    return rebuilt, ""
 
 
 def coefficients(plan, k: int) -> np.ndarray:
@@ -138,7 +132,8 @@ def coefficients(plan, k: int) -> np.ndarray:
 
 def line(name: str, found: list[Firefly], total: float, examined: int) -> list[str]:
     """The row of one kind of path; ``total`` squared error of all renders."""
-    worst = max(found, key=lambda firefly: firefly.off)
+    by_size = sorted(found, key=lambda firefly: -firefly.off)
+    worst = by_size[0]
     path = worst.path
     return [
         f"`{name}`",
@@ -147,9 +142,16 @@ def line(name: str, found: list[Firefly], total: float, examined: int) -> list[s
         f"{len(found)} of {examined}",
         f"s = {path.s}, t = {path.t}",
         f"`{worst.letters}`: {worst.names}",
-        *_elsewhere(worst),
-        f"{sum(f.same for f in found)} of {len(found)}",
+        *_elsewhere(next((f for f in by_size if not f.doubt), worst)),
+        _doubts(found),
     ]
+
+
+def _doubts(found: list[Firefly]) -> str:
+    """How many paths were found anew, and what speaks against the others."""
+    doubts = {f.doubt for f in found} - {""}
+    text = f"{sum(not f.doubt for f in found)} of {len(found)}"
+    return text + (f" ({'; '.join(sorted(doubts))})" if doubts else "")
 
 
 def _elsewhere(firefly: Firefly) -> tuple[str, str]:

@@ -20,6 +20,9 @@ import mitsuba as mi  # isort: skip
 # is the same up to this part of the edge to it.
 LOBES, SAME_DIRECTION, SAME_PLACE = (1e-4, 1 - 1e-4, 0.5, 0.2, 0.8), 1 - 1e-5, 1e-2
 
+# Rays start so far on the way to the next vertex: Mitsuba's own offset is too large for short edges.
+STEP = 1e-3
+
 
 class Lost(ValueError):
     """The path cannot be found anew; the text says where it differs."""
@@ -76,10 +79,11 @@ def _follow(scene, path):
     for i in range(1, k):
         si = scene.ray_intersect(ray)
         _check_place(si, path, i)
-        si.p = _point(path.p[i])  # so that a chain of reflections does not enlarge the rounding
         event, d = _scatter(si, _direction(path, i), path.delta[i], i)
         events.append(event)
-        ray = si.spawn_ray(d)
+        # From the vertex that was written down, so that a chain of reflections does not enlarge the rounding.
+        length = 1.0 if path.infinite and i == k - 1 else np.linalg.norm(path.p[i + 1] - path.p[i])
+        ray = mi.Ray3f(_point(path.p[i]) + d * (STEP * length), d)
     end = scene.ray_intersect(ray)
     if not path.infinite:
         _check_place(end, path, k)

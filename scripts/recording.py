@@ -55,8 +55,9 @@ class Collector(sinks.Image):
     def __init__(self, film, least, lanes: int):
         super().__init__(film)
         self._least, self._lanes, self._width = mi.Float(least.ravel()), lanes, film.size[0]
-        self._count, self._rows = dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, CAPACITY * COLUMNS)
-        dr.make_opaque(self._least, self._count, self._rows)
+        dr.make_opaque(self._least)
+        # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
+        self.kept = []
 
     def splat(self, kernel, c, position, shared, counters):
         """Add a contribution with t <= 1."""
@@ -74,18 +75,24 @@ class Collector(sinks.Image):
         active = active & dr.all((pixel >= 0) & (pixel < mi.Point2i(self._film.size)))
         index = mi.UInt32(pixel.y * self._width + pixel.x)
         active &= dr.any(colours > dr.gather(mi.Color3f, self._least, index, active))
-        row = dr.scatter_inc(self._count, mi.UInt32(0), active)
+        count, rows = dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, CAPACITY * COLUMNS)
+        dr.make_opaque(count, rows)
+        self.kept.append((count, rows))
+        row = dr.scatter_inc(count, mi.UInt32(0), active)
         values = [dr.arange(mi.UInt32, self._lanes), pixel.x, pixel.y, *colours, *strategy]
         packet = mi.ArrayXf([mi.Float(x) for x in values])
-        dr.scatter_reduce(dr.ReduceOp.Add, self._rows, packet, row, active & (row < CAPACITY))
+        dr.scatter_reduce(dr.ReduceOp.Add, rows, packet, row, active & (row < CAPACITY))
 
     def found(self, launch: Launch) -> list[Outlier]:
         """What was kept, the launch being over; raises ``ValueError`` if that was too much."""
-        count = int(self._count[0])
-        if count > CAPACITY:
-            raise ValueError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
-        rows = np.array(self._rows, dtype=float).reshape(-1, COLUMNS)[:count]
-        return [_outlier(launch, row, self._lanes) for row in rows]
+        found = []
+        for number, rows in self.kept:
+            count = int(number[0])
+            if count > CAPACITY:
+                raise ValueError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
+            numbers = np.array(rows, dtype=float).reshape(-1, COLUMNS)[:count]
+            found += [_outlier(launch, row, self._lanes) for row in numbers]
+        return found
 
 
 def _outlier(launch: Launch, row, lanes: int) -> Outlier:
@@ -110,7 +117,7 @@ def render(scene, integrator, least, spp: int, seed: int):
         lanes = -(-batch.pixels * batch.samples // traced.plan.served)
         collector = Collector(image._film, least, lanes)
         counts = kernel.trace(traced, collector, batch, points, of)
-        image._film.evaluate(counts, collector._rows, collector._count)
+        image._film.evaluate(counts, collector.kept)
         outliers.extend(collector.found(launch))
         return counts
 
@@ -317,14 +324,16 @@ class Recorder:
 
     def _path(self, i: int, c) -> Path:
         s, t = int(c["s"]), int(c["t"])
-        towards = self._vertices(self.camera, t, i, joined=s > 0)
-        back = self._vertices(self.light, s, i, joined=True)[::-1]
-        pdf_w = self.pdf_w[i]
-        infinite = bool(self.light.infinite[i]) if s else not self.camera.visits[t - 2].hit[i]
-        if s == 1 and t > 1:  # next-event estimation has a point of its own
+        towards, pdf_w = self._vertices(self.camera, t, i, joined=s > 0), self.pdf_w[i]
+        if s == 0:
+            back, infinite = [], not self.camera.visits[t - 2].hit[i]
+        elif s == 1 and t > 1:  # next-event estimation has a point of its own
             last = self.camera.visits[t - 2]
             back, infinite = [(last.joined[:, i], 0, False)], bool(last.infinite[i])
-        elif t == 1 and s > 1:  # and so has light tracing
+        else:
+            back = self._vertices(self.light, s, i, joined=True)[::-1]
+            infinite = bool(self.light.infinite[i])
+        if t == 1 and s > 1:  # and so has light tracing
             last = self.light.visits[s - 2]
             towards, pdf_w = [(last.joined[:, i], 0, False)], last.pdf_w[i]
         p, shapes, delta = zip(*towards, *back, strict=True)

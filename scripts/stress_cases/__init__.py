@@ -5,7 +5,7 @@ from importlib import import_module
 from .case import Case
 
 # Modules of this package, in the order of the table; each has a tuple ``CASES``.
-SECTIONS = ("place",)
+SECTIONS = ("place", "fireflies")
 
 
 def cases() -> list[Case]:
