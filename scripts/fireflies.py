@@ -44,7 +44,7 @@ AGREE = 1e-2
 @dataclass(frozen=True)
 class Firefly:
     """A sample that stands out, with the path that adds most to it: ``off`` by so many values of its pixel,
-    ``error`` its sum of squared relative errors; ``rebuilt`` None if the path could not be found anew, ``doubt``
+    ``error`` its sum of squared relative errors; ``kappa`` of the k + 2 strategies; ``rebuilt`` None if the path could not be found anew, ``doubt``
     why, or in what it then differed from what the render says, empty if in nothing."""
 
     path: recording.Path
@@ -52,6 +52,7 @@ class Firefly:
     names: str
     off: float
     error: float
+    kappa: np.ndarray
     rebuilt: reconstruct.Rebuilt | None
     doubt: str
 
@@ -94,12 +95,14 @@ def fireflies(scene, integrator, target, spp: int, seed: int, level: float, top:
     for outlier, paths in zip(outliers, recording.replay(outliers), strict=True):
         off = outlier.value / spp / scale[outlier.y, outlier.x]
         path = paths[0]
-        said = names.letters(path), names.vertices(path), off.max(), float(off @ off)
-        found.append(Firefly(path, *said, *_found_anew(scene, outlier.launch.kernel, path)))
+        kernel = outlier.launch.kernel
+        kappa = coefficients(kernel.plan, path.s + path.t - 1)
+        said = names.letters(path), names.vertices(path), off.max(), float(off @ off), kappa
+        found.append(Firefly(path, *said, *_found_anew(scene, kernel, kappa, path)))
     return image, found
 
 
-def _found_anew(scene, kernel, path):
+def _found_anew(scene, kernel, kappa, path):
     """The path found anew, and what speaks against it."""
     try:
         rebuilt = reconstruct.rebuild(scene, kernel.emitters, path)
@@ -111,7 +114,6 @@ def _found_anew(scene, kernel, path):
     played = max(path.s, path.t) > int(kernel.rr_depth[0])
     if ratio < 1 - AGREE or (ratio > 1 + AGREE and not played):
         return rebuilt, f"the estimate is {ratio:.3g} times that of the path"
-    kappa = coefficients(kernel.plan, path.s + path.t - 1)
     weight = kappa[path.s] / (kappa @ rebuilt.relative(path.s))
     if abs(weight - path.weight) > AGREE * path.weight:
         return rebuilt, f"the weight is {path.weight:.3g}, that of the path {weight:.3g}"
@@ -128,6 +130,12 @@ def coefficients(plan, k: int) -> np.ndarray:
     if plan.direct and k > 1:
         kappa[1] = plan.direct_coefficient
     return kappa
+
+
+def in_use(firefly: Firefly) -> np.ndarray:
+    """Densities of the strategies in use, in which each has its coefficient, over that of the one that made
+    the path."""
+    return firefly.kappa * firefly.rebuilt.relative(firefly.path.s)
 
 
 def line(name: str, found: list[Firefly], total: float, examined: int) -> list[str]:

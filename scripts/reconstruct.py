@@ -78,13 +78,15 @@ def _follow(scene, path):
     events = []
     for i in range(1, k):
         si = scene.ray_intersect(ray)
+        dr.eval(si)
         _check_place(si, path, i)
         event, d = _scatter(si, _direction(path, i), path.delta[i], i)
         events.append(event)
         # From the vertex that was written down, so that a chain of reflections does not enlarge the rounding.
         length = 1.0 if path.infinite and i == k - 1 else np.linalg.norm(path.p[i + 1] - path.p[i])
-        ray = mi.Ray3f(_point(path.p[i]) + d * (STEP * length), d)
+        ray = mi.Ray3f(_point(path.p[i]) + d * dr.opaque(mi.Float, STEP * length), d)
     end = scene.ray_intersect(ray)
+    dr.eval(end)
     if not path.infinite:
         _check_place(end, path, k)
     elif bool(end.is_valid()[0]):
@@ -112,29 +114,33 @@ def _check_place(si, path, i: int):
 
 def _scatter(si, d, delta: bool, i: int):
     """The `_Event` at a vertex that goes on along ``d``, and the direction in which it really goes on."""
-    ctx, bsdf = mi.BSDFContext(), si.bsdf()
-    wo = si.to_local(_vector(d))
+    ctx, bsdf, wo = mi.BSDFContext(), si.bsdf(), si.to_local(_vector(d))
+    to_light = to_camera = 1.0
     if delta:
         wo, value = _lobe(ctx, bsdf, si, wo, i)
-        to_light = to_camera = 1.0
     else:
         back = mi.SurfaceInteraction3f(si)
         back.wi = wo
-        value = np.array(bsdf.eval(ctx, si, wo), dtype=float).ravel()
-        to_light, to_camera = (float(x[0]) for x in (bsdf.pdf(ctx, si, wo), bsdf.pdf(ctx, back, si.wi)))
+        value, *pdfs = bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo), bsdf.pdf(ctx, back, si.wi)
+        dr.eval(value, pdfs)
+        value, to_light, to_camera = np.array(value, dtype=float).ravel(), *(float(x[0]) for x in pdfs)
     out = si.to_world(wo)
-    cosines = (float(dr.abs(dr.dot(si.n, w))[0]) for w in (out, si.to_world(si.wi)))
-    return _Event(value, to_light, to_camera, *cosines), out
+    cosines = dr.abs(dr.dot(si.n, out)), dr.abs(dr.dot(si.n, si.to_world(si.wi)))
+    dr.eval(out, cosines)
+    return _Event(value, to_light, to_camera, *(float(x[0]) for x in cosines)), out
 
 
 def _lobe(ctx, bsdf, si, wo, i: int):
     """Direction and weight of the delta lobe that leads along ``wo``."""
-    for u in LOBES:
-        bs, weight = bsdf.sample(ctx, si, mi.Float(u), mi.Point2f(0.5))
-        delta = bool(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)[0])
-        if delta and float(dr.dot(bs.wo, wo)[0]) > SAME_DIRECTION:
-            return bs.wo, np.array(weight, dtype=float).ravel()
-    raise Lost(f"no delta lobe at vertex {i} leads to the next vertex")
+    bs, weight = bsdf.sample(ctx, si, mi.Float(LOBES), mi.Point2f(0.5))
+    leads = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (dr.dot(bs.wo, wo) > SAME_DIRECTION)
+    dr.eval(bs.wo, weight, leads)
+    found = np.flatnonzero(np.array(leads))
+    if not len(found):
+        raise Lost(f"no delta lobe at vertex {i} leads to the next vertex")
+    lobe = mi.UInt32(int(found[0]))
+    weights = np.array(weight, dtype=float).reshape(3, -1)
+    return dr.gather(mi.Vector3f, bs.wo, lobe), weights[:, found[0] % weights.shape[1]]
 
 
 def _densities(scene, emitters, path, events, end):
@@ -151,9 +157,9 @@ def _densities(scene, emitters, path, events, end):
     if infinite:
         dist2[-1] = 1.0
     cos_end = 1.0 if infinite else float(dr.abs(dr.dot(end.n, end.to_world(end.wi)))[0])
-    connect, first, second = (
-        float(x[0]) for x in emitters.hit_densities(end, _point(path.p[-2]), mi.Bool(True))
-    )
+    densities = emitters.hit_densities(end, _point(path.p[-2]), mi.Bool(True))
+    dr.eval(densities)
+    connect, first, second = (float(x[0]) for x in densities)
     direct = connect if infinite else connect * dist2[-1] / cos_end
     events = events[::-1]  # x_1 first
 
@@ -179,8 +185,8 @@ def _densities(scene, emitters, path, events, end):
 
 
 def _point(p):
-    return mi.Point3f(*(float(x) for x in p))
+    return dr.opaque(mi.Point3f, [float(x) for x in p])  # a literal would make each vertex a kernel of its own
 
 
 def _vector(d):
-    return mi.Vector3f(*(float(x) for x in d))
+    return dr.opaque(mi.Vector3f, [float(x) for x in d])
