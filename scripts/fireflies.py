@@ -145,7 +145,7 @@ def line(name: str, found: list[Firefly], total: float, examined: int) -> list[s
     path = worst.path
     return [
         f"`{name}`",
-        f"{100 * sum(f.error for f in found) / total:.2g} %",
+        f"{100 * sum(f.error for f in found) / total:.3g} %",
         f"{worst.off:.3g}",
         f"{len(found)} of {examined}",
         f"s = {path.s}, t = {path.t}",

@@ -185,7 +185,9 @@ def _densities(scene, emitters, path, events, end):
 
 
 def _point(p):
-    return dr.opaque(mi.Point3f, [float(x) for x in p])  # a literal would make each vertex a kernel of its own
+    return dr.opaque(
+        mi.Point3f, [float(x) for x in p]
+    )  # a literal would make each vertex a kernel of its own
 
 
 def _vector(d):
