@@ -5,16 +5,17 @@
 
 renders each scene with the benchmark's parameters and takes the samples that are worst against the reference:
 those that by themselves are off by more than ``--level`` times the value of their pixel. It traces them again
-(`recording`), finds each path anew with Mitsuba's own calls (`reconstruct`), and prints one line for each kind of
-path:
+(`recording`), finds each path anew with Mitsuba's own calls (`reconstruct`), and prints one line for each
+kind of path:
 
 * error: the share of the squared error of all renders that these samples have; largest: how far one is off,
   in values of its pixel; samples: how many of the samples examined (``--top`` of each render).
 * path: from the lamp L to the eye E in P. Heckbert's letters, S for delta events, G for rough ones, D for
   diffuse ones, and the materials on the way; `|` is where the strategy joins light and camera vertices.
-* other strategies: the densest other one, with its density over that of the strategy that made the path, by one
-  sample of each; "none" if no other can make it.
-* `path`: what Mitsuba's `path` adds with the same path (s = 0 and s = 1, balance heuristic) over what was added.
+* other strategies: the densest other one, with its density over that of the strategy that made the path, by
+  one sample of each; "none" if no other can make it.
+* `path`: what Mitsuba's `path` adds with the same path (s = 0 and s = 1, balance heuristic) over what was
+  added.
 * found anew: how many of these paths were found again from their vertices with the same estimate and weight.
 """
 
@@ -44,8 +45,9 @@ AGREE = 1e-2
 @dataclass(frozen=True)
 class Firefly:
     """A sample that stands out, with the path that adds most to it: ``off`` by so many values of its pixel,
-    ``error`` its sum of squared relative errors; ``kappa`` of the k + 2 strategies; ``rebuilt`` None if the path could not be found anew, ``doubt``
-    why, or in what it then differed from what the render says, empty if in nothing."""
+    ``error`` its sum of squared relative errors; ``kappa`` of the k + 2 strategies; ``rebuilt`` None if the
+    path could not be found anew, ``doubt`` why, or in what it then differed from what the render says, empty
+    if in nothing."""
 
     path: recording.Path
     letters: str
@@ -206,7 +208,10 @@ def lines(name: str, options) -> tuple[list, str]:
     total = sum(raw for raw, _ in errors) * target.size
     rows = sorted(kinds.values(), key=lambda found: -sum(f.error for f in found))
     pairs = ", ".join(f"{raw:.3g} ({trimmed:.2g})" for raw, trimmed in errors)
-    return [line(name, found, total, examined) for found in rows[: options.lines]], f"`{name}`: {pairs}"
+    anew = sum(not f.doubt for found in rows for f in found)
+    return [
+        line(name, found, total, examined) for found in rows[: options.lines]
+    ], f"`{name}`: {pairs}, found anew {anew} of {examined}"
 
 
 def main(arguments=None) -> int:

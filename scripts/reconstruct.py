@@ -30,7 +30,7 @@ class Lost(ValueError):
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """``f`` of a path, three colours, and ``log_p`` of its k + 2 strategies, s = 0 first, in the same units."""
+    """``f`` of a path, three colours, and ``log_p`` of its k + 2 strategies, s = 0 first, in one unit."""
 
     f: np.ndarray
     log_p: np.ndarray
@@ -144,8 +144,8 @@ def _lobe(ctx, bsdf, si, wo, i: int):
 
 
 def _densities(scene, emitters, path, events, end):
-    """What the oracle asks for, with the first vertex on the emitter, and log of the importance of the sensor,
-    its cosine and the density of its point included."""
+    """What the oracle asks for, with the first vertex on the emitter, and log of the sensor's importance, its
+    cosine and the density of its point included."""
     sensor = scene.sensors()[0]
     lens, lens_pdf = sensor.class_name() == "ThinLensCamera", 1.0
     if lens:

@@ -132,11 +132,11 @@ def render(scene, integrator, least, spp: int, seed: int):
 
 @dataclass
 class Path:
-    """A path by its vertices, z_0 first and y_0 last: positions ``p`` (k + 1, 3), of an emitter at infinity the
-    direction to it (``infinite``); ``shapes`` numbers of Dr.Jit, 0 for none; ``delta``: the event was a delta
-    event. ``value`` (three colours) what the strategy (``s``, ``t``) adds with the ``weight``, roulette and
-    the draw of a connection included; ``estimate`` without these two, unweighted. ``pdf_w`` of the sensor's
-    direction."""
+    """A path by its vertices, z_0 first and y_0 last: positions ``p`` (k + 1, 3), of an emitter at infinity
+    the direction to it (``infinite``); ``shapes`` numbers of Dr.Jit, 0 for none; ``delta``: the event was a
+    delta event. ``value`` (three colours) what the strategy (``s``, ``t``) adds with the ``weight``, roulette
+    and the draw of a connection included; ``estimate`` without these two, unweighted. ``pdf_w`` of the
+    sensor's direction."""
 
     s: int
     t: int
@@ -152,8 +152,9 @@ class Path:
 
 @dataclass
 class _Visit:
-    """What a walk left at a vertex, arrays of the lanes: ``joined`` position (or direction, where ``infinite``)
-    of the endpoint with which the vertex was joined, ``pdf_w`` of the sensor's direction there."""
+    """What a walk left at a vertex, arrays of the lanes: ``joined`` position (or direction, where
+    ``infinite``) of the endpoint with which the vertex was joined, ``pdf_w`` of the sensor's direction
+    there."""
 
     p: np.ndarray
     shape: np.ndarray
@@ -341,8 +342,8 @@ class Recorder:
         return Path(s, t, *numbers, pdf_w, np.array(p), list(shapes), list(delta), infinite)
 
     def _vertices(self, subpath, count: int, i: int, joined: bool) -> list:
-        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath; at the
-        last one there is no event, and none of delta where it is ``joined``."""
+        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath; no
+        event at the endpoint, and none of delta where it is ``joined``."""
         if not count:
             return []
         found = [(subpath.start[:, i], 0, False)]

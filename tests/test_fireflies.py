@@ -6,8 +6,8 @@ import fireflies
 import mitsuba as mi
 import numpy as np
 import pytest
-import recording
 import reconstruct
+import recording
 from scene_parts import T, grey
 
 
@@ -63,8 +63,8 @@ def worst(scene, depth, count, level, **parameters):
 
 
 def test_a_path_that_one_strategy_alone_makes_is_named():
-    """A lamp that faces a mirror, a floor that is seen in that mirror: of paths of up to 4 edges only lamp, mirror,
-    floor, mirror, eye brings light, by s = 0 alone.
+    """A lamp that faces a mirror, a floor that is seen in that mirror: of paths of up to 4 edges only lamp,
+    mirror, floor, mirror, eye brings light, by s = 0 alone.
 
     Expected: every sample that stands out is that path, found anew from its vertices, with its estimate
     (radiance times reflectance: 50), weight 1, no other strategy, and `path` has the same firefly.
@@ -82,8 +82,8 @@ def test_a_path_that_one_strategy_alone_makes_is_named():
 
 
 def test_the_worst_samples_of_all_strategies_are_found_anew():
-    """Rationale: what is named has to be what happened, whichever strategy it was, drawn connections and light
-    subpaths that several camera subpaths share included. A glossy ceiling takes all strategies.
+    """Rationale: what is named has to be what happened, whichever strategy it was, drawn connections and
+    light subpaths that several camera subpaths share included. A glossy ceiling takes all strategies.
 
     Expected: each of the 40 worst samples has the estimate and the weight that follow from its vertices by
     Mitsuba's own calls and the densities of all strategies (1 %: directions between float32 vertices at a
@@ -96,8 +96,8 @@ def test_the_worst_samples_of_all_strategies_are_found_anew():
 
 
 def test_replays_add_up_to_what_was_rendered():
-    """Expected: the strategies of a camera sample, traced again, add up to what the render put into the pixel,
-    and each splat is found again (the same arithmetic: float32)."""
+    """Expected: the strategies of a camera sample, traced again, add up to what the render put into the
+    pixel, and each splat is found again (the same arithmetic: float32)."""
     room = mi.cornell_box()
     room["sensor"]["film"] |= {"width": 12, "height": 12}
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.25})

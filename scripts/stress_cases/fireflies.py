@@ -1,4 +1,4 @@
-"""The worst samples of a render: whether each is what its path says, and whether another strategy would do."""
+"""The worst samples of a render: whether each is what its path says, and whether others would do."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _explained(name: str) -> Outcome:
     large = [f for f in found if f.off > LARGE]
     avoidable = [f for f in large if fireflies.in_use(f).sum() > 1]
     strategies = {(f.path.s, f.path.t) for f in found}
-    text = f"{len(found)} samples by {len(strategies)} strategies, {len(large)} of them off by more than {LARGE:g}"
+    text = f"{len(found)} samples by {len(strategies)} strategies, {len(large)} off by more than {LARGE:g}"
     if doubts:
         text += f"; {doubts[0]}"
     if avoidable:
@@ -53,10 +53,11 @@ def _case(name: str, quick: bool = False) -> Case:
     return Case(
         f"explained-{name.replace('_', '-')}",
         SECTION,
-        f"`{name}`, {RESOLUTION}², {SPP} samples per pixel: the {TOP} worst samples of each of {SEEDS} renders, each "
-        "path found anew with Mitsuba's calls, densities of all strategies written out",
-        "all have the estimate and the weight that follow from their vertices (1 %: float32 directions at rough "
-        f"surfaces); those that are off by more than {LARGE:g} values of their pixel can be made by one strategy alone",
+        f"`{name}`, {RESOLUTION}², {SPP} samples per pixel: the {TOP} worst samples of each of {SEEDS} "
+        "renders, each path found anew with Mitsuba's calls, densities of all strategies written out",
+        "all have the estimate and the weight that follow from their vertices (1 %: float32 directions at "
+        f"rough surfaces); those that are off by more than {LARGE:g} values of their pixel can be made by "
+        "one strategy alone",
         partial(_explained, name),
         quick,
     )
