@@ -125,6 +125,18 @@ def efficiency(ours, theirs, error="rel_mse_trimmed") -> Spread:
     return spread(pair_ratios(ours, theirs, error))
 
 
+def gap(rows) -> Spread:
+    """Spread of raw over trimmed relMSE: how much of the error the worst values of an image carry. Raises
+    `Refused` as `efficiency` does."""
+    if len(rows) < 2:
+        raise Refused("fewer than two renders")
+    for error in OWN:
+        if any(row[error] == 0 for row in rows):
+            raise Refused(f"{rows[0]['method']} is exact here")
+        check_judged(rows, error)
+    return spread([row["rel_mse"] / row["rel_mse_trimmed"] for row in rows])
+
+
 def widths(rows, methods) -> dict[str, float]:
     """Width of the interval of the median ratio of efficiencies (trimmed) of the first method over each
     other one, without regard to the reference."""
@@ -218,6 +230,21 @@ class Results:
         if scene not in self.references:
             raise Refused("not rendered")
         return bias(self.of(scene, method), self.references[scene])
+
+    def gap(self, scene: str, method: str) -> Spread:
+        """`gap` of an integrator at the deciding budget."""
+        return gap(self.of(scene, method, self.deciding))
+
+    def by_gap(self, method: str) -> list[str]:
+        """Scenes with the largest `gap` first, and at last those without such a figure."""
+
+        def size(scene):
+            try:
+                return self.gap(scene, method).median
+            except Refused:
+                return 0.0
+
+        return sorted(self.scenes, key=size, reverse=True)
 
     def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Spread:
         """Of the first integrator over another one, at the deciding budget unless said."""

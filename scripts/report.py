@@ -42,6 +42,7 @@ from analysis import (
 )
 from metrics import rel_mse_epsilon
 from mitsuba_bdpt.files import replacing
+from tables import ranged, ratio, said, table
 
 
 def load(folder: Path) -> tuple[Results, dict]:
@@ -69,32 +70,6 @@ def load(folder: Path) -> tuple[Results, dict]:
     return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made
 
 
-def table(head, rows) -> str:
-    """A Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def ratio(x: float) -> str:
-    """A ratio with three digits."""
-    return f"{x:.3g}x" if x < 999.5 else f"{round(x, -1):.0f}x"
-
-
-def ranged(spread: Spread) -> str:
-    """Median (smallest–largest)."""
-    return f"{ratio(spread.median)} ({ratio(spread.smallest)[:-1]}–{ratio(spread.largest)[:-1]})"
-
-
-def said(figure, form=ranged) -> str:
-    """A figure in words, or why there is none."""
-    try:
-        return form(figure())
-    except NotJudged as why:
-        return f"not judged: reference {100 * why.share:.2g} %"
-    except Refused as why:
-        return str(why)
-
-
 def efficiency_table(results: Results) -> str:
     """Per scene, against each rival: trimmed and raw; missing energy where the rival fails the bias check."""
     head = ["scene", *(f"over {rival}, {kind}" for rival in RIVALS for kind in ("trimmed", "raw"))]
@@ -116,6 +91,17 @@ def efficiency_table(results: Results) -> str:
             ]
         lines.append([*line, said(lambda s=scene: results.efficiency(s, NONE))])
     return table(head, lines)
+
+
+def gaps_table(results: Results) -> str:
+    """How much of the error single values carry: raw over trimmed relMSE, of the first integrator and of
+    `path`, scenes with most of it first."""
+    methods = results.methods[0], RIVALS[0]
+    rows = [
+        [f"`{scene}`", *(said(lambda s=scene, m=method: results.gap(s, m)) for method in methods)]
+        for scene in results.by_gap(methods[0])
+    ]
+    return table(["scene", *methods], rows)
 
 
 GALLERY = "docs/images/gallery"  # from the README
@@ -499,7 +485,11 @@ holds the median in 90 % of cases, not 95 %).
 
 By budget, over the stronger `path` that passes the bias check:
 
-{budgets_table(results)}"""
+{budgets_table(results)}
+How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel;
+[which paths they are](../fireflies.md):
+
+{gaps_table(results)}"""
     )
     parts.append(
         f"""## What was skipped

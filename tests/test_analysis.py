@@ -100,6 +100,35 @@ def test_trimmed_errors_are_judged_by_the_trimmed_error_of_the_reference():
         analysis.efficiency(ours, theirs, "rel_mse")
 
 
+def test_the_gap_is_what_the_worst_values_carry():
+    """Raw over trimmed errors of 2, 4 and 9: median 4. A gap of which the reference carries a part, raw or
+    trimmed, is refused."""
+    rows = [row(seed=seed, rel_mse=0.02 * times) for seed, times in enumerate((2, 9, 4))]
+    found = analysis.gap(rows)
+    assert (found.median, found.smallest, found.largest, found.count) == pytest.approx((4, 2, 9, 3))
+    for error in analysis.OWN.values():
+        with pytest.raises(Refused, match="reference carries"):
+            analysis.gap([r | {error: 0.005} for r in rows])
+    with pytest.raises(Refused, match="bdpt is exact here"):
+        analysis.gap([r | {"rel_mse": 0.0, "rel_mse_trimmed": 0.0} for r in rows])
+    with pytest.raises(Refused, match="fewer than two renders"):
+        analysis.gap(rows[:1])
+
+
+def test_scenes_with_the_largest_gap_come_first():
+    """`even` has no gap, `spots` one of 8 with `bdpt` and 2 with `path`; `alone` has a single render."""
+    rows = [r | {"scene": "even"} for r in runs("bdpt", 2) + runs("path", 2)]
+    rows += [r | {"scene": "alone"} for r in runs("bdpt", 1)]
+    spots = runs("bdpt", 2, rel_mse=0.16) + runs("path", 2, rel_mse=0.04)
+    rows += [r | {"scene": "spots"} for r in spots]
+    found = Results(rows, {}, {})
+    assert found.by_gap("bdpt") == ["spots", "even", "alone"]
+    text = report.gaps_table(found)
+    assert [line.split("`")[1] for line in text.splitlines()[2:]] == ["spots", "even", "alone"]
+    assert cells(text, "`spots`") == ["8x (8–8)", "2x (2–2)"]
+    assert cells(text, "`alone`") == ["fewer than two renders"] * 2
+
+
 def test_widths_are_those_of_the_interval_of_the_median():
     """Ratios 1, 1, 1 have an interval of width 0; of 1, 2, 3 the bootstrap's goes from 1 to 3."""
     rows = runs("bdpt", 3) + runs("path", 3)

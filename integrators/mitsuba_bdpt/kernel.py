@@ -123,20 +123,10 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     """Trace one batch and put its contributions into ``sink`` (see `sinks`); ``spp`` is the render's total,
     which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
     after the other); nothing is evaluated yet."""
-    total = batch.pixels * batch.samples
-    lanes = -(-total // kernel.plan.served)
+    total, lanes = _size(kernel, batch)
     kernel = kernel.bound(points, lanes / total)  # exact also where S does not divide the batch
     lane = dr.arange(mi.UInt32, lanes)
-    place = _Places(kernel, batch, spp)
-
-    stream = kernel.points.stream("light", place.index(lane), lane)
-    shared = _shared(kernel, stream)
-    path = connect.allocate_light_path(kernel, lanes)
-    of_light = {}
-    if kernel.plan.light:
-        path, of_light = _light_subpath(kernel, sink, stream, shared, path)
-
-    common = _Lane(place, shared, path)
+    common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), lane)
 
     def body(served, counters):
         slot = lane + served * dr.opaque(mi.UInt32, lanes)
@@ -155,6 +145,33 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
             label="camera subpaths of one light subpath",
         )
     return _sum(of_light, counters)
+
+
+def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
+    """Trace some camera samples of a batch again, as `trace` does: those of these ``slot``s (``UInt32``) with
+    the light subpath of the lane that each is in."""
+    total, lanes = _size(kernel, batch)
+    kernel = kernel.bound(points, lanes / total)
+    common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), slot % lanes)
+    counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
+    return _sum(of_light, _camera_subpath(kernel, sink, common, slot, counters, mi.Bool(True)))
+
+
+def _size(kernel, batch: Batch) -> tuple[int, int]:
+    """Number of camera samples in a batch, and of lanes."""
+    total = batch.pixels * batch.samples
+    return total, -(-total // kernel.plan.served)
+
+
+def _begin(kernel, sink, place: _Places, lane):
+    """Trace the light subpaths of these ``lane``s: what their camera subpaths share, and the counters."""
+    stream = kernel.points.stream("light", place.index(lane), lane)
+    shared = _shared(kernel, stream)
+    path = connect.allocate_light_path(kernel, dr.width(lane))
+    counters = {}
+    if kernel.plan.light:
+        path, counters = _light_subpath(kernel, sink, stream, shared, path)
+    return _Lane(place, shared, path), counters
 
 
 @dataclass

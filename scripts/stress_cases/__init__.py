@@ -5,7 +5,16 @@ from importlib import import_module
 from .case import Case
 
 # Modules of this package, in the order of the table; each has a tuple ``CASES``.
-SECTIONS = ("place", "geometry", "transport", "weights", "non_finite", "bad_input", "processes")
+SECTIONS = (
+    "place",
+    "geometry",
+    "transport",
+    "weights",
+    "fireflies",
+    "non_finite",
+    "bad_input",
+    "processes",
+)
 
 
 def cases() -> list[Case]:

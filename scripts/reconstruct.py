@@ -1,0 +1,194 @@
+"""A path found anew from its vertices, with Mitsuba's own calls alone, and the densities of all strategies.
+
+A check of what `recording` says of a path, and the answer to whether another strategy would find it: rays are
+aimed at the next vertex where a strategy may join vertices, and go where the BSDF sends them at delta events.
+Densities are written out one by one, by `oracle`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import numpy as np
+from stress_cases import oracle
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
+# Lobes of a delta BSDF are looked for with these numbers; a direction is the same up to this cosine, a vertex
+# is the same up to this part of the edge to it.
+LOBES, SAME_DIRECTION, SAME_PLACE = (1e-4, 1 - 1e-4, 0.5, 0.2, 0.8), 1 - 1e-5, 1e-2
+
+# Rays start so far on the way to the next vertex: Mitsuba's own offset is too large for short edges.
+STEP = 1e-3
+
+
+class Lost(ValueError):
+    """The path cannot be found anew; the text says where it differs."""
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """``f`` of a path, three colours, and ``log_p`` of its k + 2 strategies, s = 0 first, in one unit."""
+
+    f: np.ndarray
+    log_p: np.ndarray
+
+    def estimate(self, s: int) -> np.ndarray:
+        """f / p of a strategy."""
+        return self.f * np.exp(-self.log_p[s])
+
+    def relative(self, s: int) -> np.ndarray:
+        """Densities of all strategies over that of one."""
+        return np.exp(np.minimum(self.log_p - self.log_p[s], 700))
+
+
+@dataclass(frozen=True)
+class _Event:
+    """What happens at a vertex: f cos (of delta events over their probability), densities of going on to the
+    light and to the camera, cosines with the geometric normal on the two sides."""
+
+    value: np.ndarray
+    to_light: float
+    to_camera: float
+    cos_light: float
+    cos_camera: float
+
+
+def rebuild(scene, emitters, path) -> Rebuilt:
+    """The `recording.Path` found anew; ``emitters`` of the render know their densities. Raises `Lost`."""
+    events, end = _follow(scene, path)
+    radiance = np.array(end.emitter(scene).eval(end), dtype=float).ravel()
+    if not radiance.any():
+        raise Lost("the last vertex emits nothing")
+    paths, sensor = _densities(scene, emitters, path, events, end)
+    log_p = oracle.log_densities(paths)[0]
+    to_area = np.log(paths.cos_light[0]) - np.log(paths.dist2[0])
+    if path.infinite:
+        to_area[0] = 0
+    log_f = to_area.sum() + sensor
+    return Rebuilt(radiance * np.prod([e.value for e in events], axis=0) * np.exp(log_f), log_p)
+
+
+def _follow(scene, path):
+    """The `_Event` of each inner vertex, z_1 first, and where the last ray ends."""
+    k = len(path.p) - 1
+    ray = mi.Ray3f(_point(path.p[0]), _vector(_direction(path, 0)))
+    events = []
+    for i in range(1, k):
+        si = scene.ray_intersect(ray)
+        dr.eval(si)
+        _check_place(si, path, i)
+        event, d = _scatter(si, _direction(path, i), path.delta[i], i)
+        events.append(event)
+        # From the vertex that was written down, so that a chain of reflections does not enlarge the rounding.
+        length = 1.0 if path.infinite and i == k - 1 else np.linalg.norm(path.p[i + 1] - path.p[i])
+        ray = mi.Ray3f(_point(path.p[i]) + d * dr.opaque(mi.Float, STEP * length), d)
+    end = scene.ray_intersect(ray)
+    dr.eval(end)
+    if not path.infinite:
+        _check_place(end, path, k)
+    elif bool(end.is_valid()[0]):
+        raise Lost("a shape is in the way of light from infinity")
+    if int(dr.reinterpret_array(mi.UInt32, end.emitter(scene))[0]) == 0:
+        raise Lost("the last vertex is not on an emitter that can be hit")
+    return events, end
+
+
+def _direction(path, i: int):
+    """From vertex ``i`` to the next."""
+    last = path.infinite and i == len(path.p) - 2
+    d = path.p[-1] if last else path.p[i + 1] - path.p[i]
+    return d / np.linalg.norm(d)
+
+
+def _check_place(si, path, i: int):
+    if not bool(si.is_valid()[0]):
+        raise Lost(f"nothing is hit at vertex {i}")
+    edge = np.linalg.norm(path.p[i] - path.p[i - 1])
+    off = np.linalg.norm(np.array(si.p).ravel() - path.p[i]) / edge
+    if off > SAME_PLACE:
+        raise Lost(f"vertex {i} is off by {off:.2g} of the edge to it")
+
+
+def _scatter(si, d, delta: bool, i: int):
+    """The `_Event` at a vertex that goes on along ``d``, and the direction in which it really goes on."""
+    ctx, bsdf, wo = mi.BSDFContext(), si.bsdf(), si.to_local(_vector(d))
+    to_light = to_camera = 1.0
+    if delta:
+        wo, value = _lobe(ctx, bsdf, si, wo, i)
+    else:
+        back = mi.SurfaceInteraction3f(si)
+        back.wi = wo
+        value, *pdfs = bsdf.eval(ctx, si, wo), bsdf.pdf(ctx, si, wo), bsdf.pdf(ctx, back, si.wi)
+        dr.eval(value, pdfs)
+        value, to_light, to_camera = np.array(value, dtype=float).ravel(), *(float(x[0]) for x in pdfs)
+    out = si.to_world(wo)
+    cosines = dr.abs(dr.dot(si.n, out)), dr.abs(dr.dot(si.n, si.to_world(si.wi)))
+    dr.eval(out, cosines)
+    return _Event(value, to_light, to_camera, *(float(x[0]) for x in cosines)), out
+
+
+def _lobe(ctx, bsdf, si, wo, i: int):
+    """Direction and weight of the delta lobe that leads along ``wo``."""
+    bs, weight = bsdf.sample(ctx, si, mi.Float(LOBES), mi.Point2f(0.5))
+    leads = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (dr.dot(bs.wo, wo) > SAME_DIRECTION)
+    dr.eval(bs.wo, weight, leads)
+    found = np.flatnonzero(np.array(leads))
+    if not len(found):
+        raise Lost(f"no delta lobe at vertex {i} leads to the next vertex")
+    lobe = mi.UInt32(int(found[0]))
+    weights = np.array(weight, dtype=float).reshape(3, -1)
+    return dr.gather(mi.Vector3f, bs.wo, lobe), weights[:, found[0] % weights.shape[1]]
+
+
+def _densities(scene, emitters, path, events, end):
+    """What the oracle asks for, with the first vertex on the emitter, and log of the sensor's importance, its
+    cosine and the density of its point included."""
+    sensor = scene.sensors()[0]
+    lens, lens_pdf = sensor.class_name() == "ThinLensCamera", 1.0
+    if lens:
+        lens_pdf = 1 / (np.pi * float(mi.traverse(sensor)["aperture_radius"][0]) ** 2)
+    axis = np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4)[:3, 2]
+    cos_sensor = abs(axis @ _direction(path, 0)) / np.linalg.norm(axis)
+    k, infinite = len(path.p) - 1, path.infinite
+    dist2 = [np.sum((path.p[i + 1] - path.p[i]) ** 2) for i in range(k)]
+    if infinite:
+        dist2[-1] = 1.0
+    cos_end = 1.0 if infinite else float(dr.abs(dr.dot(end.n, end.to_world(end.wi)))[0])
+    densities = emitters.hit_densities(end, _point(path.p[-2]), mi.Bool(True))
+    dr.eval(densities)
+    connect, first, second = (float(x[0]) for x in densities)
+    direct = connect if infinite else connect * dist2[-1] / cos_end
+    events = events[::-1]  # x_1 first
+
+    def row(*values):
+        return np.array([values], dtype=float)
+
+    paths = oracle.Paths(
+        dist2=row(*dist2[::-1]),
+        cos_light=row(cos_end, *(e.cos_camera for e in events)),
+        cos_camera=row(*(e.cos_light for e in events), cos_sensor),
+        to_camera=row(1, *(e.to_camera for e in events), 1),
+        to_light=row(1, *(e.to_light for e in events), 1),
+        delta=np.array([path.delta[::-1]]),
+        kind=np.array([oracle.ENVIRONMENT if infinite else oracle.AREA]),
+        first=np.array([first]),
+        second=np.array([second]),
+        direct=np.array([direct]),
+        lens=np.array([lens]),
+        lens_pdf=np.array([lens_pdf]),
+        sensor_pdf=np.array([path.pdf_w]),
+    )
+    return paths, np.log(lens_pdf) + np.log(path.pdf_w)
+
+
+def _point(p):
+    return dr.opaque(
+        mi.Point3f, [float(x) for x in p]
+    )  # a literal would make each vertex a kernel of its own
+
+
+def _vector(d):
+    return dr.opaque(mi.Vector3f, [float(x) for x in d])

@@ -1,0 +1,372 @@
+"""Samples of a render that stand out, and the paths that made them.
+
+`render` renders as always, and keeps which camera samples and splats are large. `replay` traces these again,
+loop by loop, with the code and the random numbers of the render, and writes down every vertex and every
+contribution on the way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from copy import copy
+from dataclasses import dataclass, field
+from unittest import mock
+
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import numpy as np
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+from mitsuba_bdpt import bsdf, connect, emitters, kernel, rendering, sinks  # isort: skip
+
+# Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
+CAPACITY, COLUMNS = 1 << 16, 8
+
+
+@dataclass(frozen=True)
+class Launch:
+    """The arguments of `kernel.trace`, with the kernel as it was then, and the width of the film."""
+
+    kernel: object
+    batch: object
+    points: object
+    spp: int
+    width: int
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A sample that adds ``value`` (three colours) over the samples of the pixel (``x``, ``y``) to it: the
+    camera sample ``slot`` of a ``launch``, or a splat of its light subpath; ``s`` and ``t`` of a splat, 0 for
+    camera samples, in which several strategies are summed."""
+
+    launch: Launch
+    slot: int
+    x: int
+    y: int
+    value: np.ndarray
+    s: int
+    t: int
+
+
+class Collector(sinks.Image):
+    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel)."""
+
+    def __init__(self, film, least, lanes: int):
+        super().__init__(film)
+        self._least, self._lanes, self._width = mi.Float(least.ravel()), lanes, film.size[0]
+        dr.make_opaque(self._least)
+        # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
+        self.kept = []
+
+    def splat(self, kernel, c, position, shared, counters):
+        """Add a contribution with t <= 1."""
+        super().splat(kernel, c, position, shared, counters)
+        self._keep(position, c.weighted() * shared.weight, shared, (c.s, c.t), c.active)
+
+    def end(self, kernel, lane, sample, total, seen, counters):
+        """Add a camera sample."""
+        super().end(kernel, lane, sample, total, seen, counters)
+        self._keep(sample.start.counted, total * lane.shared.weight, lane.shared, (0, 0), sample.covered)
+
+    def _keep(self, position, value, shared, strategy, active):
+        colours = mi.Color3f(*self._film.colour(value, shared.wavelengths))
+        pixel = mi.Point2i(dr.floor(position)) - mi.Point2i(self._film.offset)
+        active = active & dr.all((pixel >= 0) & (pixel < mi.Point2i(self._film.size)))
+        index = mi.UInt32(pixel.y * self._width + pixel.x)
+        active &= dr.any(colours > dr.gather(mi.Color3f, self._least, index, active))
+        count, rows = dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, CAPACITY * COLUMNS)
+        dr.make_opaque(count, rows)
+        self.kept.append((count, rows))
+        row = dr.scatter_inc(count, mi.UInt32(0), active)
+        values = [dr.arange(mi.UInt32, self._lanes), pixel.x, pixel.y, *colours, *strategy]
+        packet = mi.ArrayXf([mi.Float(x) for x in values])
+        dr.scatter_reduce(dr.ReduceOp.Add, rows, packet, row, active & (row < CAPACITY))
+
+    def found(self, launch: Launch) -> list[Outlier]:
+        """What was kept, the launch being over; raises ``ValueError`` if that was too much."""
+        found = []
+        for number, rows in self.kept:
+            count = int(number[0])
+            if count > CAPACITY:
+                raise ValueError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
+            numbers = np.array(rows, dtype=float).reshape(-1, COLUMNS)[:count]
+            found += [_outlier(launch, row, self._lanes) for row in numbers]
+        return found
+
+
+def _outlier(launch: Launch, row, lanes: int) -> Outlier:
+    """An outlier from what was kept of it."""
+    lane, x, y, s, t = (int(row[i]) for i in (0, 1, 2, 6, 7))
+    slot = lane
+    if not s:  # of the camera samples of a lane, which lie in different pixels, that in this one
+        batch = launch.batch
+        pixel = y * launch.width + x - batch.first_pixel
+        slots = range(lane, batch.pixels * batch.samples, lanes)
+        slot = next(i for i in slots if i // batch.samples == pixel)
+    return Outlier(launch, slot, x, y, row[3:6], s, t)
+
+
+def render(scene, integrator, least, spp: int, seed: int):
+    """The image of a render, and the `Outlier` objects in it: all samples larger than ``least`` (of the
+    image's shape) in one of the colours, largest first."""
+    outliers = []
+
+    def trace(traced, image, batch, points, of):
+        launch = Launch(copy(traced), batch, points, of, int(scene.sensors()[0].film().crop_size()[0]))
+        lanes = -(-batch.pixels * batch.samples // traced.plan.served)
+        collector = Collector(image._film, least, lanes)
+        counts = kernel.trace(traced, collector, batch, points, of)
+        image._film.evaluate(counts, collector.kept)
+        outliers.extend(collector.found(launch))
+        return counts
+
+    with mock.patch.object(rendering, "trace", trace):
+        image = np.array(integrator.render(scene, spp=spp, seed=seed))[..., :3]
+    outliers.sort(key=lambda found: -(found.value / least[found.y, found.x]).max())
+    return image, outliers
+
+
+# -- replaying --------------------------------------------------------------------------------
+
+
+@dataclass
+class Path:
+    """A path by its vertices, z_0 first and y_0 last: positions ``p`` (k + 1, 3), of an emitter at infinity
+    the direction to it (``infinite``); ``shapes`` numbers of Dr.Jit, 0 for none; ``delta``: the event was a
+    delta event. ``value`` (three colours) what the strategy (``s``, ``t``) adds with the ``weight``, roulette
+    and the draw of a connection included; ``estimate`` without these two, unweighted. ``pdf_w`` of the
+    sensor's direction."""
+
+    s: int
+    t: int
+    value: np.ndarray
+    estimate: np.ndarray
+    weight: float
+    pdf_w: float
+    p: np.ndarray
+    shapes: list
+    delta: list
+    infinite: bool
+
+
+@dataclass
+class _Visit:
+    """What a walk left at a vertex, arrays of the lanes: ``joined`` position (or direction, where
+    ``infinite``) of the endpoint with which the vertex was joined, ``pdf_w`` of the sensor's direction
+    there."""
+
+    p: np.ndarray
+    shape: np.ndarray
+    delta: np.ndarray
+    hit: np.ndarray
+    joined: np.ndarray | None = None
+    infinite: np.ndarray | None = None
+    pdf_w: np.ndarray | None = None
+
+
+@dataclass
+class _Subpath:
+    """The position of its endpoint (at infinity, where ``infinite``, the direction to it), and the further
+    vertices."""
+
+    start: np.ndarray
+    infinite: np.ndarray | None = None
+    visits: list = field(default_factory=list)
+
+    def ends_at(self, s: int, i: int):
+        """Position of the vertex ``s`` - 1 in lane ``i``; infinite if there is none."""
+        return self.visits[s - 2].p[:, i] if 2 <= s <= len(self.visits) + 1 else np.full(3, np.inf)
+
+
+class Recorder:
+    """Sink (see `sinks`) of a replay of ``count`` samples: writes down contributions, and, `watching`, the
+    vertices of the walks."""
+
+    alpha = False
+
+    def __init__(self, count: int):
+        self._count, self._step = count, None
+        self.camera = self.light = self.pdf_w = None
+        self.contributions = []
+
+    @contextlib.contextmanager
+    def watching(self):
+        """Walks are written down; Dr.Jit runs loops step by step, so that their state can be read."""
+        with contextlib.ExitStack() as stack:
+            for owner, name, watch in (
+                (kernel, "random_walk", self._watch_walk),
+                (bsdf, "sample", self._watch_step),
+                (bsdf, "sample_adjoint", self._watch_step),
+                (emitters.Emitters, "sample_emission", self._watch_emission),
+            ):
+                stack.enter_context(mock.patch.object(owner, name, watch(getattr(owner, name))))
+            for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
+                stack.enter_context(dr.scoped_set_flag(flag, False))
+            yield
+
+    def _watch_emission(self, sample_emission):
+        def watched(*args):
+            e = sample_emission(*args)
+            start = self._numbers(dr.select(e.infinite, mi.Point3f(-e.d), mi.Point3f(e.si.p)), 3)
+            self.light = _Subpath(start, self._numbers(e.infinite).astype(bool))
+            return e
+
+        return watched
+
+    def _watch_step(self, sample):
+        def watched(*args):
+            self._step, evaluation = sample(*args)
+            return self._step, evaluation
+
+        return watched
+
+    def _watch_walk(self, random_walk):
+        def watched(traced, side, walk, stream, visit, state):
+            if not side.adjoint:
+                self.camera = _Subpath(self._numbers(walk.previous, 3))
+            subpath = self.light if side.adjoint else self.camera
+
+            def noted(vertex, state, walk):
+                subpath.visits.append(self._visit(side, vertex))
+                return visit(vertex, state, walk)
+
+            return random_walk(traced, side, walk, stream, noted, state)
+
+        return watched
+
+    def _visit(self, side, vertex) -> _Visit:
+        shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
+        away = mi.Point3f(-vertex.si.wi)  # of rays that have left the scene: their direction, in world space
+        delta = mi.Bool(False) if self._step is None else self._step.delta
+        found = _Visit(
+            self._numbers(dr.select(vertex.hit, mi.Point3f(vertex.si.p), away), 3),
+            self._numbers(dr.select(vertex.hit, shape, 0)).astype(int),
+            self._numbers(delta).astype(bool),
+            self._numbers(vertex.hit).astype(bool),
+        )
+        end = vertex.endpoint
+        if end is not None and side.adjoint:
+            found.joined, found.pdf_w = self._numbers(end.p, 3), self._numbers(end.pdf_w)
+        elif end is not None:
+            found.infinite = self._numbers(end.infinite).astype(bool)
+            joined = dr.select(end.infinite, mi.Point3f(end.d), mi.Point3f(end.anchor.p))
+            found.joined = self._numbers(joined, 3)
+        return found
+
+    def _numbers(self, x, rows: int = 0):
+        """An array of Dr.Jit as one of NumPy, with an entry for each lane."""
+        shape = (rows, self._count) if rows else (self._count,)
+        return np.broadcast_to(np.array(x, dtype=float).reshape(*shape[:-1], -1), shape).copy()
+
+    def begin(self):
+        """Nothing found yet."""
+        return dr.zeros(mi.Spectrum)
+
+    def add(self, traced, c, total, start, shared):
+        """Add a contribution with t >= 2."""
+        self._note(c, c.weighted())
+        return total + c.weighted()
+
+    def splat(self, traced, c, position, shared, counters):
+        """Add a contribution with t <= 1."""
+        self._note(c, c.weighted())
+
+    def connect(self, traced, z, lane, stream, counters, total, start):
+        """Join the camera vertex ``z`` with the light vertices of its lane."""
+        found = []
+
+        def add(c, visible, total):
+            c.active = visible
+            found.append(c)
+            return total
+
+        connect.connect_all(traced, z, lane.path, dict(counters), total, add)
+        if traced.plan.connections == "all":
+            for c in found:
+                total = self.add(traced, c, total, start, lane.shared)
+            return total
+        value, end = self._draw(traced, z, lane, stream, counters)
+        for c in found:
+            y = [self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))]
+            drawn = np.abs(end.T - y).max(axis=1) < 1e-3
+            self._note(c, dr.select(mi.Bool(drawn), value, 0))
+        return total + value
+
+    def _draw(self, traced, z, lane, stream, counters):
+        """What the draw of one connection gives, and the position of the vertex drawn."""
+        ends = []
+
+        def segment_to(anchor, end, like):
+            ends.append(self._numbers(end, 3))
+            return original(anchor, end, like)
+
+        original = connect.rays.segment_to
+        with mock.patch.object(connect.rays, "segment_to", segment_to):
+            value = connect.connect_one(traced, z, lane.path, stream, counters)
+        return value, ends[-1]
+
+    def end(self, traced, lane, sample, total, seen, counters):
+        """The camera sample is complete."""
+        self.pdf_w = self._numbers(sample.start.pdf_w)
+
+    def _note(self, c, value):
+        numbers = {name: self._numbers(getattr(c, name)) for name in ("s", "t", "weight", "active")}
+        numbers |= {"value": self._numbers(value, 3), "estimate": self._numbers(c.value, 3)}
+        self.contributions.append(numbers)
+
+    def paths(self, i: int) -> list[Path]:
+        """The paths of sample ``i``, those that add most first."""
+        found = []
+        for c in self.contributions:
+            if c["active"][i] and c["value"][:, i].any():
+                found.append(self._path(i, {name: x[..., i] for name, x in c.items()}))
+        return sorted(found, key=lambda path: -path.value.max())
+
+    def _path(self, i: int, c) -> Path:
+        s, t = int(c["s"]), int(c["t"])
+        towards, pdf_w = self._vertices(self.camera, t, i, joined=s > 0), self.pdf_w[i]
+        if s == 0:
+            back, infinite = [], not self.camera.visits[t - 2].hit[i]
+        elif s == 1 and t > 1:  # next-event estimation has a point of its own
+            last = self.camera.visits[t - 2]
+            back, infinite = [(last.joined[:, i], 0, False)], bool(last.infinite[i])
+        else:
+            back = self._vertices(self.light, s, i, joined=True)[::-1]
+            infinite = bool(self.light.infinite[i])
+        if t == 1 and s > 1:  # and so has light tracing
+            last = self.light.visits[s - 2]
+            towards, pdf_w = [(last.joined[:, i], 0, False)], last.pdf_w[i]
+        p, shapes, delta = zip(*towards, *back, strict=True)
+        numbers = (c["value"], c["estimate"], float(c["weight"]))
+        return Path(s, t, *numbers, pdf_w, np.array(p), list(shapes), list(delta), infinite)
+
+    def _vertices(self, subpath, count: int, i: int, joined: bool) -> list:
+        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath; no
+        event at the endpoint, and none of delta where it is ``joined``."""
+        if not count:
+            return []
+        found = [(subpath.start[:, i], 0, False)]
+        found += [(v.p[:, i], int(v.shape[i]), bool(v.delta[i])) for v in subpath.visits[: count - 1]]
+        if joined or count > 1:
+            found[-1] = (*found[-1][:2], False)
+        return found
+
+
+def replay(outliers: list[Outlier]) -> list[list[Path]]:
+    """The paths in each outlier, those that add most first: of camera samples all that have t >= 2, of splats
+    those of the same strategy."""
+    found = [None] * len(outliers)
+    for launch in {id(o.launch): o.launch for o in outliers}.values():
+        numbers = [i for i, o in enumerate(outliers) if o.launch is launch]
+        slots = [outliers[i].slot for i in numbers]
+        slots += slots[:1]  # Dr.Jit takes arrays of width 1 for constants
+        recorder = Recorder(len(slots))
+        with rendering.nothing_freed(), recorder.watching():
+            drawn = launch.kernel, recorder, launch.batch, launch.points, launch.spp
+            dr.eval(kernel.retrace(*drawn, mi.UInt32(slots)))
+        for lane, i in enumerate(numbers):
+            o = outliers[i]
+            wanted = (lambda p, o=o: (p.s, p.t) == (o.s, o.t)) if o.s else (lambda p: p.t >= 2)
+            found[i] = [path for path in recorder.paths(lane) if wanted(path)]
+    return found

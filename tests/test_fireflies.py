@@ -1,0 +1,135 @@
+"""The paths behind the worst values: scripts/fireflies.py, with recording.py and reconstruct.py."""
+
+from dataclasses import replace
+
+import fireflies
+import mitsuba as mi
+import numpy as np
+import pytest
+import reconstruct
+import recording
+from scene_parts import T, grey
+
+
+def between_mirrors(bsdf="conductor"):
+    """A small lamp that lights the floor only by a mirror, and a camera that sees it only in another one."""
+    mirror = {"type": "twosided", "bsdf": {"type": bsdf}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "fov": 30,
+                "to_world": T().look_at([2, 1, 0], [2, 2, -0.8], [0, 1, 0]),
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 12,
+                    "height": 12,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+            },
+            # Facing up, away from the floor.
+            "lamp": {
+                "type": "disk",
+                "to_world": T().translate([-0.5, 1, -1]).rotate([1, 0, 0], -90).scale(0.35),
+                "bsdf": {"type": "diffuse", "reflectance": 0.0},
+                "emitter": {"type": "area", "radiance": 100.0},
+            },
+            "upper": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(4),
+                "bsdf": mirror | {"id": "ceiling"},
+            },
+            "lower": {
+                "type": "rectangle",
+                "to_world": T().rotate([1, 0, 0], -90).scale(4),
+                "bsdf": grey(0.5) | {"id": "floor"},
+            },
+        }
+    )
+
+
+def worst(scene, depth, count, level, **parameters):
+    """The worst samples of a render, ``level`` times the image's mean over it."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth} | parameters)
+    plain = np.array(integrator.render(scene, spp=64, seed=1))
+    target = np.full_like(plain, plain.mean(), dtype=float)
+    image, found = fireflies.fireflies(scene, integrator, target, 64, 1, level, count)
+    # It is the render that it watches; sums are added in another order.
+    assert np.allclose(image, plain, rtol=1e-4, atol=1e-6 * plain.mean())
+    return found
+
+
+def test_a_path_that_one_strategy_alone_makes_is_named():
+    """A lamp that faces a mirror, a floor that is seen in that mirror: of paths of up to 4 edges only lamp,
+    mirror, floor, mirror, eye brings light, by s = 0 alone.
+
+    Expected: every sample that stands out is that path, found anew from its vertices, with its estimate
+    (radiance times reflectance: 50), weight 1, no other strategy, and `path` has the same firefly.
+    """
+    found = worst(between_mirrors(), 4, 8, 0.3)
+    assert len(found) == 8
+    for firefly in found:
+        assert firefly.kind == ((0, 5), "L S D S E", "ceiling, floor, ceiling")
+        assert firefly.doubt == "" and firefly.path.weight == 1
+        assert firefly.path.value == pytest.approx([50] * 3, rel=1e-4)
+        assert np.flatnonzero(firefly.rebuilt.relative(0)).tolist() == [0]
+        assert fireflies.in_use(firefly).sum() == pytest.approx(1)
+    row = fireflies.line("room", found, sum(f.error for f in found), 8)
+    assert row[1] == "100 %" and row[3] == "8 of 8" and row[6:] == ["none", "1x", "8 of 8"]
+
+
+def test_the_worst_samples_of_all_strategies_are_found_anew():
+    """Rationale: what is named has to be what happened, whichever strategy it was, drawn connections and
+    light subpaths that several camera subpaths share included. A glossy ceiling takes all strategies.
+
+    Expected: each of the 40 worst samples has the estimate and the weight that follow from its vertices by
+    Mitsuba's own calls and the densities of all strategies (1 %: directions between float32 vertices at a
+    rough surface); several strategies are among them.
+    """
+    scene = between_mirrors("roughconductor")
+    found = worst(scene, 5, 40, 0.02, light_paths=0.25, connections="one", skip="impossible")
+    assert len(found) == 40 and [f.doubt for f in found if f.doubt] == []
+    assert len({(f.path.s, f.path.t) for f in found}) >= 3
+
+
+def test_replays_add_up_to_what_was_rendered():
+    """Expected: the strategies of a camera sample, traced again, add up to what the render put into the
+    pixel, and each splat is found again (the same arithmetic: float32)."""
+    room = mi.cornell_box()
+    room["sensor"]["film"] |= {"width": 12, "height": 12}
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.25})
+    _, outliers = recording.render(mi.load_dict(room), integrator, np.full((12, 12, 3), 0.01), 16, 3)
+    splats, samples = ([o for o in outliers if bool(o.s) is splat][:10] for splat in (True, False))
+    assert len(splats) == len(samples) == 10
+    outliers = splats + samples
+    for outlier, paths in zip(outliers, recording.replay(outliers), strict=True):
+        assert sum(path.value for path in paths) == pytest.approx(outlier.value, rel=1e-4)
+
+
+def test_wrong_paths_are_not_found():
+    """Expected: a vertex that is moved, an event that is called delta, a weight that is another: each is
+    noticed."""
+    scene = between_mirrors()
+    target = np.full((12, 12, 3), 0.1)
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 4})
+    _, outliers = recording.render(scene, integrator, 64 * target, 64, 1)
+    ((path, *_),) = recording.replay(outliers[:1])
+    kernel = outliers[0].launch.kernel
+    kappa = fireflies.coefficients(kernel.plan, 4)
+    assert fireflies._found_anew(scene, kernel, kappa, path)[1] == ""
+
+    def doubt(**changes):
+        return fireflies._found_anew(scene, kernel, kappa, replace(path, **changes))[1]
+
+    moved = path.p + np.array([0, 0, 0.1]) * (np.arange(5) == 2)[:, None]
+    assert "leads to the next vertex" in doubt(p=moved)
+    along = path.p[4] + 0.1 * (path.p[4] - path.p[3])
+    assert "vertex 4 is off by" in doubt(p=np.array([*path.p[:4], along]))
+    assert "no delta lobe at vertex 2" in doubt(delta=[False, True, True, True, False])
+    assert "weight is 0.5, that of the path 1" in doubt(weight=0.5)
+    assert "estimate is 2 times" in doubt(estimate=2 * path.estimate)
+    with pytest.raises(reconstruct.Lost, match="not on an emitter"):
+        reconstruct.rebuild(scene, kernel.emitters, replace(path, p=path.p[:4], delta=path.delta[:4]))
