@@ -180,7 +180,8 @@ def room(bsdf=None, **parts):
         "lamp": {"type": "rectangle", "to_world": lamp_at, "emitter": {"type": "area", "radiance": 4.0}},
     }
     parts = {name: part for name, part in (inside | parts).items() if part is not None}
-    return mi.load_dict({"type": "scene", "sensor": camera(), **parts})
+    # Loaded in parallel, emitters come in any order, and random numbers would choose others in the twin.
+    return mi.load_dict({"type": "scene", "sensor": camera(), **parts}, parallel=False)
 
 
 def filled(bsdf, **parts):
