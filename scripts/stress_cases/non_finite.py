@@ -180,8 +180,7 @@ def room(bsdf=None, **parts):
         "lamp": {"type": "rectangle", "to_world": lamp_at, "emitter": {"type": "area", "radiance": 4.0}},
     }
     parts = {name: part for name, part in (inside | parts).items() if part is not None}
-    # Loaded in parallel, emitters come in any order, and random numbers would choose others in the twin.
-    return mi.load_dict({"type": "scene", "sensor": camera(), **parts}, parallel=False)
+    return mi.load_dict({"type": "scene", "sensor": camera(), **parts})
 
 
 def filled(bsdf, **parts):
@@ -289,9 +288,10 @@ def lamp_cases():
 
     def glowing(value):
         at = mi.ScalarTransform4f().translate([-0.4, 0.5, -0.3]).rotate([1, 0, 0], 60).scale(0.2)
-        return {
-            "other": {"type": "rectangle", "to_world": at, "emitter": {"type": "area", "radiance": value}}
-        }
+        other = {"type": "rectangle", "to_world": at, "emitter": {"type": "area", "radiance": value}}
+        # Mitsuba orders shapes by their addresses: with two lamps on shapes, random numbers would choose
+        # another one in the twin.
+        return {"other": other, "lamp": {"type": "point", "position": [0.3, 0.7, 0], "intensity": 0.5}}
 
     def spot(value):
         lamp = {"type": "spot", "intensity": 5.0, "cutoff_angle": 40, "to_world": down()}
