@@ -16,8 +16,10 @@ import json
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import reference
+from mitsuba_bdpt.__main__ import number
 from mitsuba_bdpt.files import replacing
 from report import table
 from stress_cases import cases
@@ -103,6 +105,8 @@ def main(arguments=None) -> int:
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help="cases; default: all, and the page is written"
     )
+    text = "cases at a time; much of one is compiling kernels, on one core (default: %(default)s)"
+    parser.add_argument("--jobs", type=number(int, 1), default=2, help=text)
     parser.add_argument("--list", action="store_true", help="print the names of all cases")
     parser.add_argument("--here", metavar="NAME", help=argparse.SUPPRESS)
     args = parser.parse_args(arguments)
@@ -115,7 +119,8 @@ def main(arguments=None) -> int:
         outcome = here(args.here)
         print(json.dumps({"ok": bool(outcome.ok), "happened": outcome.happened}))
         return 0
-    record = [tried(known[name]) for name in args.names or known]
+    with ThreadPoolExecutor(args.jobs) as pool:
+        record = list(pool.map(tried, [known[name] for name in args.names or known]))
     if not args.names:
         write(record)
     return 0 if all(row["ok"] for row in record) else 1

@@ -63,14 +63,24 @@ class Ball:
         """Of a shape of Mitsuba's; None if it is not a sphere."""
         if shape.shape_type() != mi.ShapeType.Sphere.value:
             return None
-        to_world = own_parameters(shape)["to_world"]
-        center = mi.Point3f(to_world @ mi.Point3f(0, 0, 0))
+        matrix = np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        axes, radius = matrix[:3, :3], float(np.linalg.norm(matrix[:3, 0]))
+        if np.allclose(axes, radius * np.eye(3), atol=1e-7 * radius):  # one kernel instead of three
+            n, p = (np.array(v)[:, 0] for v in _evaluated(shape.sample_position(0, mi.Point2f(0.5))))
+            outward = 1.0 if n @ (p - matrix[:3, 3]) > 0 else -1.0
+            return Ball(mi.ScalarPoint3f(matrix[:3, 3]), radius, outward, False)
+        center = mi.Point3f(matrix[:3, 3])
         d = mi.Vector3f(1, 0, 0)
         si = shape.ray_intersect(mi.Ray3f(center, d))
         outward = 1.0 if dr.slice(dr.dot(si.n, d)) > 0 else -1.0
         ps = shape.sample_position(0, mi.Point2f([0.5, 0.1], [0.5, 0.3]))
         wrong = dr.squared_norm(ps.n - normal_of_ball(ps.p, center, outward)) > 1e-6
         return Ball(dr.slice(center), float(dr.slice(si.t)), outward, bool(dr.slice(dr.any(wrong))))
+
+
+def _evaluated(ps):
+    dr.eval(ps.n, ps.p)
+    return ps.n, ps.p
 
 
 def normal_of_ball(p, center, outward):
