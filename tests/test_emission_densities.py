@@ -225,7 +225,8 @@ def test_spheres_that_to_world_turns(inwards, radiance):
     for p, n in ((e.si.p, e.anchor.n), (direct.anchor.p, direct.anchor.n), (ps.p, ps.n), (ps.p, anchor.n)):
         away = dr.normalize(p - mi.Point3f(1, 2, 3)) * (-1 if inwards else 1)
         np.testing.assert_allclose(column(n), column(away), atol=1e-5)
-    assert (column(dr.dot(e.anchor.n, e.d)) > -1e-5).all()
+    made = column(dr.max(e.weight)) > 0  # Mitsuba has no point for 3e-4 of the samples of a texture
+    assert (column(dr.dot(e.anchor.n, e.d))[made] > -1e-5).all() and made.mean() > 0.999
     lit = column(dr.max(direct.weight)) > 0
     assert (column(dr.dot(direct.anchor.n, direct.d))[lit] < 1e-5).all()
     assert lit.mean() > (0.99 if inwards or radiance == "uniform" else 0.2)

@@ -148,12 +148,14 @@ def _spot_for_point(root):
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene of scenes/: what of it matters here, and what is changed in its file."""
+    """A scene of scenes/: what of it matters here, what is changed in its file, whether `path` sees its
+    light, and how many times the usual samples it takes."""
 
     scene: str
     words: str
     edit: object = None
     by_path: bool = True
+    samples: int = 1
 
     def load(self, place: Place = Place(), size: int = SIZE):  # noqa: B008 (frozen)
         """The scene in its place."""
@@ -181,7 +183,7 @@ SUBJECTS = {
     ),
     "envmap": Subject("window_room", "`window_room` (environment with a sun)"),
     "sun": Subject("smallvcm_cornell_sun", "`smallvcm_cornell_sun` (directional light, glass, mirror)"),
-    "lens": Subject("thin_lens", "`thin_lens` (thin lens, lamps on spheres and a disk, glass)"),
+    "lens": Subject("thin_lens", "`thin_lens` (thin lens, lamps on spheres and a disk, glass)", samples=4),
 }
 
 
@@ -243,6 +245,7 @@ def _alike(subject: Subject, places: dict) -> Outcome:
     p, gap, error = [], 0.0, 0.0
     for parameters, spp in SIDES.values():
         parameters = {"type": "bdpt"} | parameters
+        spp *= subject.samples
         plain = _tiles(subject.load(), parameters, spp, range(5))
         for number, place in enumerate(places.values(), 1):
             other = _tiles(subject.load(place), parameters, spp, range(10 * number, 10 * number + 5))
@@ -262,7 +265,7 @@ AWAY = Place(shift=(7000.0, -5000.0, 5000.0))  # 1e4 units
 def _deviation(subject: Subject, parameters, spp) -> float:
     """Root mean square of what the tiles of the moved scene are off, over the image's mean, less noise."""
     plain, moved = (
-        Sample.of(_tiles(subject.load(place), parameters, spp, seeds))
+        Sample.of(_tiles(subject.load(place), parameters, spp * subject.samples, seeds))
         for place, seeds in ((Place(), range(5)), (AWAY, range(10, 15)))
     )
     difference = welch(plain, moved)
