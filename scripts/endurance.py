@@ -47,7 +47,7 @@ SKIPS = ("auto", "none")
 
 
 def settings(number: int) -> tuple[dict, int]:
-    """Parameters of the plugin and width of the film for the ``number``-th render of a scene: over 24 renders
+    """Parameters of the plugin and width of the film for the ``number``-th render of a scene: over 48 renders
     every size meets both kinds of skip and every heuristic."""
     turn = number // len(SKIPS)
     return {

@@ -80,7 +80,7 @@ class Names:
                 flags = self._shapes[path.shapes[i]].bsdf().flags()
                 found[i] = "D" if mi.has_flag(flags, mi.BSDFFlags.Diffuse) else "G"
         if path.s and path.t:
-            found.insert(path.t, "|")
+            found.insert(path.t, "¦")
         return " ".join(found[::-1])
 
     def vertices(self, path) -> str:

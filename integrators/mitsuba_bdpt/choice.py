@@ -229,12 +229,12 @@ class Choice:
         return self.cost * self.variance
 
 
-def expected_samples(settings: Settings, samples: int) -> int:
-    """Samples of a render of so many at most: under ``timeout`` and ``until_error`` nobody knows how many it
-    will be, and a pilot that takes half of them would be as bad as one that sees rare paths which they do not
-    meet."""
+def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
+    """Samples still to come of a render with ``left`` more at most. Under ``timeout`` and ``until_error``
+    nobody knows: as many as are ``done``, or `PROVISIONAL_SAMPLES`. (A pilot that takes half of the render
+    would be as bad as one that sees rare paths which the render does not meet.)"""
     open_end = settings.until_error > 0 or 0 <= settings.timeout < math.inf
-    return min(samples, PROVISIONAL_SAMPLES) if open_end else samples
+    return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 
 def lanes(samples: int) -> int:

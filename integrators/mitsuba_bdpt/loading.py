@@ -16,11 +16,13 @@ KEPT = ("max_depth", "rr_depth", "hide_emitters")
 def in_proportion(scene: Path, definitions: dict) -> dict:
     """``definitions`` with the height ``resolution_y`` that belongs to the ``resolution`` among them, if the
     scene file has such defaults and it is not given: the image keeps its proportions."""
-    text = scene.read_text()
+    if "resolution" not in definitions or "resolution_y" in definitions:
+        return definitions
+    text = scene.read_text(encoding="utf-8", errors="replace")
     width, height = (
         re.search(rf'<default name="{key}" value="(\d+)"', text) for key in ("resolution", "resolution_y")
     )
-    if not (width and height and "resolution" in definitions) or "resolution_y" in definitions:
+    if not (width and height):
         return definitions
     scaled = int(definitions["resolution"]) * int(height[1]) / int(width[1])
     return definitions | {"resolution_y": max(round(scaled), 1)}

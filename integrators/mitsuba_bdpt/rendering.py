@@ -23,7 +23,7 @@ from .parameters import check_film, check_scene, check_variant, integer
 from .passes import REPLICATES, Step, batches, schedule
 from .plan import Settings, lost_paths, plan
 from .sinks import Image
-from .snapshot import Snapshot
+from .snapshot import FORMAT, Snapshot
 from .strategies import strategy_count
 from .world import World
 
@@ -105,7 +105,7 @@ class Render:
             self._adopt(decision, choice.BY_SCENE)
         if settled:
             return []
-        samples = self._samples(sum(self.accumulator.passes))
+        samples = self._expected()
         count = choice.lanes(samples)
         self._wait()  # earlier passes are not the pilot's time
         started, compiled = time.perf_counter(), self.compile_seconds
@@ -143,16 +143,18 @@ class Render:
             return f"there is nothing to choose: {why}", None
         if self._pixels < choice.FEW_PIXELS:
             return f"it says nothing about films of fewer than {choice.FEW_PIXELS} pixels", None
-        if decision := choice.by_scene(self.world, self._full, self.settings, self._samples()):
+        samples = self._expected()
+        whole = sum(self.accumulator.passes) * self._pixels + samples
+        if decision := choice.by_scene(self.world, self._full, self.settings, whole):
             return "the scene alone decides in a render as short as this", decision
-        samples = self._samples(sum(self.accumulator.passes))
         if not choice.lanes(samples):
             return f"{samples} samples are too few, it takes {choice.LEAST_SAMPLES}", None
         return "", None
 
-    def _samples(self, done: int = 0) -> int:
-        """Of the render after ``done`` samples per pixel, as far as that is known."""
-        return choice.expected_samples(self.settings, (self.spp - done) * self._pixels)
+    def _expected(self) -> int:
+        """Samples still to come, as far as that is known."""
+        done = sum(self.accumulator.passes)
+        return choice.expected_samples(self.settings, (self.spp - done) * self._pixels, done * self._pixels)
 
     def _has_stratified_points(self) -> bool:
         if self.settings.points == "sampler":
@@ -339,6 +341,7 @@ class Render:
         settings["until_error"] = bool(self.settings.until_error)  # the passes depend on whether there is one
         values = settings | {
             "version": __version__,
+            "format": FORMAT,
             "variant": mi.variant(),
             "seed": int(self.seed[0]),
             "spp": self.spp,
