@@ -23,9 +23,8 @@ def path_of(output: Path) -> Path:
 
 def named_files(scene: Path) -> list[Path]:
     """Meshes and textures that a scene file names by constants, as far as they exist."""
-    names = re.findall(
-        r'name="filename" value="([^"$]+)"', scene.read_text(encoding="utf-8", errors="replace")
-    )
+    text = scene.read_text(encoding="utf-8", errors="replace")
+    names = re.findall(r'name="filename" value="([^"$]+)"', text)
     return [path for path in (scene.parent / name for name in names) if path.is_file()]
 
 
