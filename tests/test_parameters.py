@@ -884,6 +884,19 @@ def test_a_broken_emitting_mesh_is_refused():
         integrator().render(scene, spp=1)
 
 
+def test_a_lamp_without_area_is_refused():
+    """Rationale: its points have an infinite density, and every sample of them is NaN. Expected: said in
+    words."""
+    mesh = mi.Mesh("flat", 3, 1, props=emitting())
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = [0.0, 0, 0, 0, 0, 0, 1, 0, 0]
+    params["faces"] = [0, 1, 2]
+    params.update()
+    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": mesh})
+    with pytest.raises(ValueError, match="is on a shape without area"):
+        integrator().render(scene, spp=1)
+
+
 def emitting():
     """Properties of a shape that emits."""
     props = mi.Properties()
