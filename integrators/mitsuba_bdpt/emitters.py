@@ -173,12 +173,6 @@ class Emitters:
             dr.slice(e.get_shape().surface_area()) if s else 1.0
             for e, s in zip(emitters, sampled, strict=True)
         ]
-        if 0 in areas:
-            emitter = emitters[areas.index(0)]
-            raise ValueError(
-                f"bdpt: emitter '{emitter.id()}' is on a shape without area ('{emitter.get_shape().id()}'); "
-                "remove it, or give it some"
-            )
         self._inv_area = dr.rcp(mi.Float(areas))
         textured = [is_textured(e, k) for e, k in pairs]
         # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
@@ -198,6 +192,12 @@ class Emitters:
         self._smooth_meshes = SmoothMeshes.of(
             [e if s else None for e, s in zip(emitters, sampled, strict=True)]
         )
+        if 0 in areas:
+            emitter = emitters[areas.index(0)]
+            raise ValueError(
+                f"bdpt: emitter '{emitter.id()}' is on a shape without area ('{emitter.get_shape().id()}'); "
+                "remove it, or give it some"
+            )
         # The radiance of a directional area is told by its texture alone.
         self._beam_radiances = [
             (i, children(e)["radiance"]) for i, (e, k) in enumerate(pairs) if k == DIRECTIONAL_AREA
