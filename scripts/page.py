@@ -58,7 +58,7 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
         lost = all(what == NOTHING for what in why.lacks.values())
         return (math.inf if lost else math.nan), f"path fails the bias check here: {why}."
     except Refused as why:
-        return math.nan, f"No figure: {why}."
+        return math.nan, f"No figure: {str(why).rstrip('.')}."
     if found.median >= 1:
         span = f"({report.ratio(found.smallest)[:-1]} to {report.ratio(found.largest)})"
         return found.median, f"path takes {report.ratio(found.median)} the time for the same error {span}."
