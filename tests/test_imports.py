@@ -25,7 +25,7 @@ ORDER = (
     ("plan", "emitters", "sensors", "points", "strategies", "suspects"),
     ("cameras", "other_sensors"),
     ("emitter_tables", "infinity", "sensor_records"),
-    ("emitter_kinds",),
+    ("emitter_kinds", "spheres"),
     ("bsdf", "rays", "mis", "sobol"),
     ("objects",),
     ("llvm", "files", "spread", "_version"),

@@ -8,17 +8,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_projector
+from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_projector, is_textured
 from .objects import children, own_parameters
+from .spheres import Sphere, is_small
 
 
 @dataclass
 class Placement:
     """Where an emitter is: axes ``x``, ``y``, ``z`` and ``position`` of point and spot lights, their
     constant density of emission ``density_w`` (solid angle) within ``cos_cutoff``; ``position`` of
-    projectors. Of a sphere that emits inwards, ``position`` and the ``radius`` up to which it samples as
-    from inside; 0 for all others. Of a sphere that is rotated, ``position`` and ``outward`` of `Ball`, 0 for
-    all others. Scalars for one emitter, Dr.Jit arrays for a table of them."""
+    projectors. Of spheres ``position``; the ``radius`` up to which one that emits inwards samples as from
+    inside, ``outward`` of a rotated one (see `Sphere`), the radius ``far`` of one that may be so small, as
+    seen from the scene, that Mitsuba's density is wrong (see `spheres.cone_density`); 0 for all others.
+    Scalars for one emitter, Dr.Jit arrays for a table of them."""
 
     x: object = (1, 0, 0)
     y: object = (0, 1, 0)
@@ -28,6 +30,7 @@ class Placement:
     cos_cutoff: object = -1.0
     radius: object = 0.0
     outward: object = 0.0
+    far: object = 0.0
 
     @staticmethod
     def table(rows):
@@ -47,55 +50,8 @@ class Placement:
         return Placement(**{k: dr.gather(type(v), v, index, active) for k, v in vars(self).items()})
 
 
-@dataclass
-class Ball:
-    """A sphere: ``center``, ``radius``, and ``outward``, 1 or -1, whether its normals point outwards.
-    ``turned``: Mitsuba's ``sample_position`` rotates the point, but not its normal (and
-    ``eval_parameterization``, by which it samples a texture, does not rotate the point)."""
-
-    center: object
-    radius: float
-    outward: float
-    turned: bool
-
-    @staticmethod
-    def of(shape) -> Ball | None:
-        """Of a shape of Mitsuba's; None if it is not a sphere."""
-        if shape.shape_type() != mi.ShapeType.Sphere.value:
-            return None
-        matrix = np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-        axes, radius = matrix[:3, :3], float(np.linalg.norm(matrix[:3, 0]))
-        if np.allclose(axes, radius * np.eye(3), atol=1e-7 * radius):  # one kernel instead of three
-            n, p = (np.array(v)[:, 0] for v in _evaluated(shape.sample_position(0, mi.Point2f(0.5))))
-            outward = 1.0 if n @ (p - matrix[:3, 3]) > 0 else -1.0
-            return Ball(mi.ScalarPoint3f(matrix[:3, 3]), radius, outward, False)
-        center = mi.Point3f(matrix[:3, 3])
-        d = mi.Vector3f(1, 0, 0)
-        si = shape.ray_intersect(mi.Ray3f(center, d))
-        outward = 1.0 if dr.slice(dr.dot(si.n, d)) > 0 else -1.0
-        ps = shape.sample_position(0, mi.Point2f([0.5, 0.1], [0.5, 0.3]))
-        wrong = dr.squared_norm(ps.n - normal_of_ball(ps.p, center, outward)) > 1e-6
-        return Ball(dr.slice(center), float(dr.slice(si.t)), outward, bool(dr.slice(dr.any(wrong))))
-
-
-def _evaluated(ps):
-    dr.eval(ps.n, ps.p)
-    return ps.n, ps.p
-
-
-def normal_of_ball(p, center, outward):
-    """Normal at the point ``p`` of a sphere, see `Ball`."""
-    return mi.Normal3f(dr.normalize(p - center) * outward)
-
-
-def is_turned_ball(shape) -> bool:
-    """Whether ``shape`` is a sphere that Mitsuba samples wrongly, see `Ball`."""
-    ball = Ball.of(shape)
-    return ball is not None and ball.turned
-
-
-def placement(emitter, kind) -> Placement:
-    """The row of one emitter."""
+def placement(emitter, kind, extent) -> Placement:
+    """The row of one emitter in a scene of the diameter ``extent``."""
     if kind == POINT:
         position = dr.slice(mi.Point3f(own_parameters(emitter)["position"]))
         return Placement(position=position, density_w=1 / (4 * dr.pi))
@@ -118,11 +74,16 @@ def placement(emitter, kind) -> Placement:
     if kind == PROJECTOR:
         to_world = own_parameters(emitter)["to_world"]
         return Placement(position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))))
-    ball = Ball.of(emitter.get_shape()) if kind in (AREA, DIRECTIONAL_AREA) else None
-    if ball is not None:
-        # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
-        radius = ball.radius * (1 + 1500 * 2.0**-24) if ball.outward < 0 else 0.0
-        return Placement(position=ball.center, radius=radius, outward=ball.outward if ball.turned else 0.0)
+    sphere = Sphere.of(emitter.get_shape()) if kind in (AREA, DIRECTIONAL_AREA) else None
+    if sphere is not None:
+        small = kind == AREA and not is_textured(emitter, kind) and is_small(sphere, extent)
+        return Placement(
+            position=sphere.center,
+            # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
+            radius=sphere.radius * (1 + 1500 * 2.0**-24) if sphere.outward < 0 else 0.0,
+            outward=sphere.outward if sphere.turned else 0.0,
+            far=sphere.radius if small else 0.0,
+        )
     return Placement()
 
 

@@ -52,12 +52,11 @@ from .emitter_tables import (
     Projectors,
     SmoothMeshes,
     inverse_table,
-    is_turned_ball,
-    normal_of_ball,
     placement,
 )
 from .infinity import Disks
 from .objects import children, living_emitters, number, share_functions
+from .spheres import cone_density, is_turned_sphere, sphere_normal
 
 
 @dataclass
@@ -150,10 +149,12 @@ class Emitters:
         foreign = any(is_foreign(name) for name in living)
         self._ask_shapes = foreign and not _all_answer(self._pointers)
         self._read_shapes(scene, emitters, kinds)
-        placements = [placement(e, k) for e, k in zip(emitters, kinds, strict=True)]
+        extent = 2 * scene.bbox().bounding_sphere().radius
+        placements = [placement(e, k, extent) for e, k in zip(emitters, kinds, strict=True)]
         self._placements = Placement.table(placements)
         self._inward_spheres = any(p.radius > 0 for p in placements)
         self._turned_spheres = any(p.outward for p in placements)
+        self._small_spheres = any(p.far for p in placements)
         self._projectors = Projectors.of(emitters, kinds)
         self._inverse = inverse_table(self._pointers)
         self.disks = Disks(scene) if self.at_infinity else None
@@ -177,7 +178,7 @@ class Emitters:
         textured = [is_textured(e, k) for e, k in pairs]
         # Where Mitsuba samples the texture: elsewhere its map to the surface misses parts of it.
         by_texture = [
-            not self._ask_shapes and is_sampled_by_texture(e, k) and not is_turned_ball(e.get_shape())
+            not self._ask_shapes and is_sampled_by_texture(e, k) and not is_turned_sphere(e.get_shape())
             for e, k in pairs
         ]
         by_shape = [t and not b for t, b in zip(textured, by_texture, strict=True)]
@@ -291,11 +292,11 @@ class Emitters:
         return self._upright(ps, index, active)
 
     def _upright(self, ps, index, active):
-        """A point that a shape has sampled, with its normal as it should be, see `Ball`."""
+        """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
         if self._turned_spheres:
-            ball = self._placements.at(index, active)
-            n = normal_of_ball(ps.p, ball.position, ball.outward)
-            ps.n = dr.select(ball.outward != 0, n, ps.n)
+            sphere = self._placements.at(index, active)
+            n = sphere_normal(ps.p, sphere.position, sphere.outward)
+            ps.n = dr.select(sphere.outward != 0, n, ps.n)
         return ps
 
     def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
@@ -382,7 +383,16 @@ class Emitters:
             by_area |= self._is_by_shape(index, active)
         inv_area = dr.gather(mi.Float, self._inv_area, index, active)
         cos = dr.abs(dr.dot(ds.d, ds.n))
-        return dr.select(by_area, inv_area * dr.square(ds.dist) / cos, pdf)
+        pdf = dr.select(by_area, inv_area * dr.square(ds.dist) / cos, pdf)
+        if self._small_spheres:
+            narrow = self._cone_density(index, it.p, active)
+            pdf = dr.select(narrow > 0, narrow, pdf)
+        return pdf
+
+    def _cone_density(self, index, p, active):
+        """`spheres.cone_density` of the emitter ``index``; 0 for one that is no small sphere."""
+        sphere = self._placements.at(index, active)
+        return dr.select(active, cone_density(sphere.position, sphere.far, p), 0)
 
     def _is_by_shape(self, index, active):
         return active & dr.gather(mi.Bool, self._by_shape, index, active)
@@ -517,6 +527,11 @@ class Emitters:
             ps = self._upright(emitter.get_shape().sample_position(si.time, u, mask), index, mask)
             by_shape, its_weight = _sample_shape(emitter, ps, si, mask)
             ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
+        if self._small_spheres:
+            density = self._cone_density(index, si.p, active)
+            narrow = density > 0
+            ds.pdf = dr.select(narrow, density, ds.pdf)
+            weight = dr.select(narrow, _radiance_over_density(emitter, ds, si, narrow), weight)
         area = self._is(index, active, AREA)
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
         delta = self._is(index, active, *POSITIONS, DIRECTIONAL)
@@ -533,7 +548,7 @@ class Emitters:
         to_geometric = dr.select(area & (cos != dr.abs(cos_shading)), dr.abs(cos_shading) / cos, 1)
         pdf = dr.select(delta, 1, ds.pdf * to_geometric) * pmf
         weight = dr.select(ds.pdf == 0, 0, weight / (to_geometric * pmf))
-        weight = dr.select(dr.isnan(ds.pdf), dr.nan, weight)  # no weight of strategies follows from it
+        weight = dr.select(dr.isfinite(ds.pdf), weight, dr.nan)  # no weight of strategies follows from it
         if UNSAMPLED in self.kinds:  # what Mitsuba samples of it has no radiance or the wrong one
             weight = dr.select(self._is(index, active, UNSAMPLED), 0, weight)
         ratio = mi.Float(0)
@@ -636,7 +651,11 @@ def _sample_shape(emitter, ps, si, active):
     ds.d = between / ds.dist
     cos = dr.abs(dr.dot(ds.n, ds.d))
     ds.pdf = dr.select(active & (cos > 0), ps.pdf * dr.square(ds.dist) / cos, 0)
-    there = mi.SurfaceInteraction3f(ps, si.wavelengths)
+    return ds, _radiance_over_density(emitter, ds, si, active)
+
+
+def _radiance_over_density(emitter, ds, si, active):
+    """Radiance of the point ``ds`` of an emitter on a surface towards ``si``, over the density ``ds.pdf``."""
+    there = mi.SurfaceInteraction3f(ds, si.wavelengths)
     there.wi = there.to_local(-ds.d)
-    radiance = emitter.eval(there, active)
-    return ds, dr.select(ds.pdf == 0, 0, radiance / ds.pdf)
+    return dr.select(ds.pdf == 0, 0, emitter.eval(there, active) / ds.pdf)

@@ -7,9 +7,10 @@ import mitsuba as mi
 import numpy as np
 
 from . import rays
-from .emitter_tables import Ball, SmoothMeshes, normal_of_ball
+from .emitter_tables import SmoothMeshes
 from .objects import number
 from .sensor_records import Arrival, CameraJoin, CameraStart, Sensor, view_at
+from .spheres import Sphere, sphere_normal
 
 
 class _Parallel(Sensor):
@@ -128,8 +129,8 @@ class IrradianceMeter(Sensor):
         super().__init__(sensor)
         self._shape, self._quadrics = sensor.get_shape(), quadrics
         self._smooth_mesh = SmoothMeshes.of([sensor])
-        ball = Ball.of(self._shape)
-        self._ball = ball if ball is not None and ball.turned else None
+        sphere = Sphere.of(self._shape)
+        self._sphere = sphere if sphere is not None and sphere.turned else None
         self._density = dr.opaque(mi.Float, 1 / number(self._shape.surface_area()))
         # A light subpath tells its point of the shape, but not the film position that chooses it.
         self.area = self.region.box
@@ -138,8 +139,8 @@ class IrradianceMeter(Sensor):
     def _sample(self, u, like, reference=None):
         """A point of the shape, and its anchor for rays to and from ``reference`` (the point itself)."""
         ps = self._shape.sample_position(like.time, u)
-        if self._ball is not None:
-            ps.n = normal_of_ball(ps.p, self._ball.center, self._ball.outward)
+        if self._sphere is not None:
+            ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
         n = ps.n
         if self._smooth_mesh is not None:
             n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
