@@ -4,7 +4,7 @@
     python scripts/endurance.py                    # until the scenes have 1e10 camera samples together
     python scripts/endurance.py --show             # the record, as a table
 
-The scene with the fewest samples comes next, with another seed, another size and another heuristic each
+The scene that had the least time comes next, with another seed, another size and another heuristic each
 time, and skip=auto and skip=none in turn. Every render is added to the record at once; Ctrl-C ends the one
 that runs, whose finished passes count. Exit status 1 if the record has a value that is not finite, or a
 render that failed.
@@ -37,8 +37,8 @@ RECORD = reference.ROOT / "docs" / "endurance.json"
 # Camera samples of all scenes together.
 TARGET = 10**10
 
-# Camera samples of one render: some seconds on two cores, so that starting costs little.
-RENDER_SAMPLES = 1 << 24
+# One render ends after so many camera samples or so many seconds: starting costs little, settings change.
+RENDER_SAMPLES, RENDER_SECONDS = 1 << 28, 20.0
 
 # Widths in turn; a prime number, and one more and one less than a power of two, for what divides evenly.
 SIZES = (256, 127, 640, 65, 512, 31)
@@ -162,19 +162,19 @@ def add(path: Path, name: str, found: dict) -> dict:
 
 
 def run(path: Path, names: list[str], target: int, seconds: float, samples: int) -> bool:
-    """Render until the record has ``target`` samples or the time is over; returns whether it was
-    interrupted."""
+    """Renders of ``samples`` each until the record has ``target`` or the time is over; returns whether it
+    was interrupted."""
     end, record = time.monotonic() + seconds, read(path)
     while samples_of(record) < target and (left := end - time.monotonic()) > 0:
         # A scene that fails at once must not be the next one for ever.
         entries = {name: record["scenes"].get(name, empty()) for name in names}
-        name = min(names, key=lambda name: (entries[name]["samples"], entries[name]["renders"]))
+        name = min(names, key=lambda name: (entries[name]["seconds"], entries[name]["renders"]))
         if len(entries[name]["failed"]) > 2:
             names = [other for other in names if other != name]
             if not names:
                 return False
             continue
-        found, interrupted = rendered(name, entries[name]["renders"], samples, min(left, 1e6))
+        found, interrupted = rendered(name, entries[name]["renders"], samples, min(left, RENDER_SECONDS))
         record = add(path, name, found)
         rate = found["samples"] / max(found["seconds"], 1e-9)
         print(

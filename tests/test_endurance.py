@@ -26,7 +26,7 @@ def run(path, *more):
 
 def test_runs_add_up(tmp_path, capsys):
     """Expected: a second run goes on where the first one ended, with other settings and seeds; sums of all
-    samples, and of those of each setting, agree; the scene with the fewest samples is next."""
+    samples, and of those of each setting, agree; the scene that had the least time is next."""
     path = tmp_path / "record.json"
     first, status = run(path, "--samples", 70_000)  # a pixel has one sample at least, a film 256^2 pixels
     assert status == 0

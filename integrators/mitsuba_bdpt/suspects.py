@@ -48,7 +48,7 @@ def _largest(texture) -> float:
     data = own_parameters(texture).get("data")
     if data is None:
         return 0.0
-    step = -(-dr.width(data) // _QUICKLY_READ)
+    step = max(-(-dr.width(data) // _QUICKLY_READ), 1)
     return float(np.nanmax(np.array(data.array[::step], dtype=np.float32), initial=0))
 
 
