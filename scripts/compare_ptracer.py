@@ -118,6 +118,19 @@ def lamp(radiance=8.0, **keys):
     } | keys
 
 
+def round_lamp(turned):
+    """A lamp on a sphere, which no turn changes."""
+    placed = transform().translate([0.4, 2.2, 0]).scale(0.3)
+    if turned:
+        placed = placed.rotate([0.6, 0, 0.8], 100)
+    return {
+        "type": "sphere",
+        "to_world": placed,
+        "bsdf": grey(0.0),
+        "emitter": {"type": "area", "radiance": 8.0},
+    }
+
+
 def ball(bsdf=None, **keys):
     shape = {"type": "sphere", "center": [-0.5, 0.6, 0.2], "radius": 0.5}
     return shape | {"bsdf": bsdf or {"type": "roughplastic", "alpha": 0.3}} | keys
@@ -403,6 +416,11 @@ CASES = [
             lamp=lamp({"type": "rgb", "value": 8.0}),
         ),
         variant="llvm_ad_spectral",
+    ),
+    Case(
+        "area light on a sphere that is rotated: points turn, their normals do not",
+        lambda: scene(lamp=round_lamp(turned=True)),
+        equal=lambda: scene(lamp=round_lamp(turned=False)),
     ),
     Case(
         "a scene 0.4 mm wide (scaled by 1e-4): offsets of rays swallow it; of `path` too",

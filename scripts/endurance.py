@@ -6,8 +6,8 @@
 
 The scene that had the least time comes next, with another seed, another size and another heuristic each
 time, and skip=auto and skip=none in turn. Every render is added to the record at once; Ctrl-C ends the one
-that runs, whose finished passes count. Exit status 1 if the record has a value that is not finite, or a
-render that failed.
+that runs after its pass, a second Ctrl-C at once, and then it is not in the record. Exit status 1 if the
+record has a value that is not finite, or a render that failed.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import resource
 import signal
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
@@ -101,10 +102,33 @@ def peak() -> int:
     return most if sys.platform == "darwin" else most * 1024
 
 
-def rendered(name: str, number: int, samples: int, timeout: float) -> tuple[dict, bool]:
-    """What the ``number``-th render of a scene adds to its entry, and whether it was interrupted."""
+class Interruption:
+    """Whether Ctrl-C or SIGTERM came. No exception: Python drops one that comes in a destructor, and Mitsuba
+    makes another one of it while it loads a scene."""
+
+    def __init__(self):
+        self.asked = False
+
+    @contextmanager
+    def listening(self):
+        """While this lasts."""
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        before = [signal.signal(number, self._ask) for number in numbers]
+        try:
+            yield
+        finally:
+            for number, handler in zip(numbers, before, strict=True):
+                signal.signal(number, handler)
+
+    def _ask(self, number, frame):
+        self.asked = True
+        signal.signal(number, signal.SIG_DFL)
+
+
+def rendered(name: str, number: int, samples: int, timeout: float, interruption: Interruption) -> dict:
+    """What the ``number``-th render of a scene adds to its entry."""
     parameters, width = settings(number)
-    found, interrupted = empty() | {"renders": 1}, False
+    found = empty() | {"renders": 1}
     reset_peak()
     started = time.perf_counter()
     statistics = {}
@@ -114,15 +138,12 @@ def rendered(name: str, number: int, samples: int, timeout: float) -> tuple[dict
         pixels = math.prod(int(n) for n in film.crop_size())
         depth = scene.integrator().max_depth
         bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "timeout": timeout, **parameters})
-        try:
-            bdpt.render(scene, seed=number, spp=max(samples // pixels, 1), develop=False)
-        except KeyboardInterrupt:
-            interrupted = True
+        bdpt.on_pass = lambda report: interruption.asked and bdpt.cancel()
+        bdpt.render(scene, seed=number, spp=max(samples // pixels, 1), develop=False)
         statistics = bdpt.statistics
-        if statistics.get("passes"):
-            image = np.array(film.develop())
-            found["samples"] = pixels * sum(statistics["passes"])
-            found["pixels_not_finite"] = int((~np.isfinite(image)).any(axis=-1).sum())
+        image = np.array(film.develop())
+        found["samples"] = pixels * sum(statistics["passes"])
+        found["pixels_not_finite"] = int((~np.isfinite(image)).any(axis=-1).sum())
     except (RuntimeError, ValueError, NotImplementedError) as error:  # other scenes go on
         found["failed"] = [
             f"render {number}, {parameters}, width {width}: {' '.join(str(error).split())[:300]}"
@@ -133,7 +154,7 @@ def rendered(name: str, number: int, samples: int, timeout: float) -> tuple[dict
     found["peak_memory"] = peak()
     key = f"skip={parameters['skip']} heuristic={parameters['heuristic']} width={width}"
     found["samples_by"] = {key: found["samples"]}
-    return found, interrupted
+    return found
 
 
 def added(entry: dict, found: dict) -> dict:
@@ -161,29 +182,26 @@ def add(path: Path, name: str, found: dict) -> dict:
     return record
 
 
-def run(path: Path, names: list[str], target: int, seconds: float, samples: int) -> bool:
-    """Renders of ``samples`` each until the record has ``target`` or the time is over; returns whether it
-    was interrupted."""
+def run(path: Path, names: list[str], target: int, seconds: float, samples: int, interruption) -> None:
+    """Renders of ``samples`` each until the record has ``target``, the time is over, or an interruption."""
     end, record = time.monotonic() + seconds, read(path)
-    while samples_of(record) < target and (left := end - time.monotonic()) > 0:
+    while samples_of(record) < target and (left := end - time.monotonic()) > 0 and not interruption.asked:
         # A scene that fails at once must not be the next one for ever.
         entries = {name: record["scenes"].get(name, empty()) for name in names}
         name = min(names, key=lambda name: (entries[name]["seconds"], entries[name]["renders"]))
         if len(entries[name]["failed"]) > 2:
             names = [other for other in names if other != name]
             if not names:
-                return False
+                return
             continue
-        found, interrupted = rendered(name, entries[name]["renders"], samples, min(left, RENDER_SECONDS))
+        timeout = min(left, RENDER_SECONDS)
+        found = rendered(name, entries[name]["renders"], samples, timeout, interruption)
         record = add(path, name, found)
         rate = found["samples"] / max(found["seconds"], 1e-9)
         print(
             f"{name}: {found['samples']:.3g} samples, {rate:.2g} per second, {samples_of(record):.4g} in all"
         )
         sys.stdout.flush()
-        if interrupted:
-            return True
-    return False
 
 
 def text(record: dict) -> str:
@@ -212,10 +230,6 @@ def is_clean(record: dict) -> bool:
     return not any(entry[key] for entry in record["scenes"].values() for key in wrong)
 
 
-def _terminated(number, frame):
-    raise KeyboardInterrupt
-
-
 def main(arguments=None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -232,19 +246,16 @@ def main(arguments=None) -> int:
     args = parser.parse_args(arguments)
     if unknown := set(args.scenes) - set(known):
         parser.error(f"not in scenes/: {', '.join(sorted(unknown))}")
-    interrupted = False
+    interruption = Interruption()
     if not args.show:
         mi.set_variant("llvm_ad_rgb")
-        signal.signal(signal.SIGTERM, _terminated)
-        try:
-            names = args.scenes or known
-            interrupted = run(args.record, names, int(args.samples), args.seconds, args.render_samples)
-        except KeyboardInterrupt:  # between two renders
-            interrupted = True
+        names = args.scenes or known
+        with interruption.listening():
+            run(args.record, names, int(args.samples), args.seconds, args.render_samples, interruption)
     record = read(args.record)
     print(text(record))
-    print(f"{samples_of(record):.4g} samples in all" + (", interrupted" if interrupted else ""))
-    return 130 if interrupted else not is_clean(record)
+    print(f"{samples_of(record):.4g} samples in all" + (", interrupted" if interruption.asked else ""))
+    return 130 if interruption.asked else not is_clean(record)
 
 
 if __name__ == "__main__":
