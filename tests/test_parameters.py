@@ -784,6 +784,17 @@ def test_films_that_are_refused(width, height, words):
         assert image(integrator(), scene, spp=1).shape == (3, 4, 3)
 
 
+def test_layers_count_among_what_a_film_takes(monkeypatch):
+    """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
+    Expected: on a machine that has room for the film alone, each of them is refused in words."""
+    monkeypatch.setattr("mitsuba_bdpt.parameters._memory", lambda: 300 * 64 * 64)
+    scene = glowing_sphere(size=64)
+    assert image(integrator(), scene, spp=8).shape == (64, 64, 3)
+    for more in ({"variance": True}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
+        with pytest.raises(ValueError, match="bdpt: the film of 64 x 64 takes .* crop windows"):
+            integrator(**more).render(scene, spp=8)
+
+
 def test_scenes_that_are_refused():
     """Expected: one sentence that names the object and what to do."""
     bdpt = integrator()

@@ -225,20 +225,22 @@ def check_film(sensor, settings: Settings):
             f"bdpt: strategy_images=True is not possible with film '{sensor.film().id()}' of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
-    _check_size(sensor.film(), len(colour.names))
+    _check_size(sensor.film(), len(colour.names), settings)
     return colour
 
 
-def _check_size(film, colours: int):
+def _check_size(film, colours: int, settings: Settings):
     width, height = (int(x) for x in film.crop_size())
     if width < 1 or height < 1:
         raise ValueError(f"bdpt: the film of {width} x {height} has no pixels; it needs one at least")
     # Sums of a pass, of all passes and, while they are added, of both (see `film.Accumulator`).
-    camera, light = (
-        n + n % 2 for n in (colours + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + 1, colours)
-    )
+    layers = 1 + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + len(features.feature_names(settings.aovs))
+    camera, light = (n + n % 2 for n in (colours + layers, colours))
     numbers = width * height * max(camera, light)
-    needed, there = width * height * (camera * (4 + 16) + light * (8 + 16)), _memory()
+    per_pixel = camera * (4 + 16) + light * (8 + 16)
+    if settings.variance:  # sums at the last replicate; means and squares of two halves
+        per_pixel += 8 * (camera + light) + 2 * 2 * 8 * colours
+    needed, there = width * height * per_pixel, _memory()
     if needed > there or numbers >= MOST_NUMBERS:
         raise ValueError(
             f"bdpt: the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
@@ -250,4 +252,6 @@ def _memory() -> float:
     """What the machine has, in bytes."""
     if mi.variant().startswith("cuda"):
         return math.inf  # what a GPU has is not known here
+    if not hasattr(os, "sysconf"):
+        return math.inf  # Windows: Dr.Jit says it
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
