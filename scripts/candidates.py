@@ -29,7 +29,7 @@ import drjit as dr
 import metrics
 import reference
 from mitsuba_bdpt import choice, pilot, rendering
-from preset import benchmark_depth
+from reference import benchmark_depth
 
 RESOLUTION, SPP, LANES, ROUNDS = 128, 64, 1 << 15, 4
 

@@ -21,7 +21,7 @@ import reference
 from equal_time import RESOLUTION, integrator, timed
 from metrics import TRIM, rel_mse
 from mitsuba_bdpt.__main__ import number
-from preset import benchmark_depth
+from reference import benchmark_depth
 from report import table
 
 import mitsuba as mi  # isort: skip

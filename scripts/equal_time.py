@@ -21,7 +21,7 @@ import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from mitsuba_bdpt.__main__ import number, property_
 from mitsuba_bdpt.files import replacing
-from preset import benchmark_depth
+from reference import benchmark_depth
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip

@@ -31,7 +31,7 @@ import reconstruct
 import recording
 import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon
-from preset import benchmark_depth
+from reference import benchmark_depth
 from stress_cases import oracle
 from tables import table
 

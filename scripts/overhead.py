@@ -22,7 +22,7 @@ import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
 import drjit as dr
 import reference
-from preset import benchmark_depth
+from reference import benchmark_depth
 from report import table
 
 ROUNDS, SHORT, LONG = 7, 4, 64

@@ -19,7 +19,7 @@ import mitsuba as mi  # isort: skip
 import metrics
 import numpy as np
 import reference
-from preset import benchmark_depth
+from reference import benchmark_depth
 from report import table
 
 RESOLUTION, BUDGETS, SEEDS = 128, (16, 64), 5

@@ -42,10 +42,9 @@ from pathlib import Path
 import probes
 import reference
 from metrics import TILES
+from reference import benchmark_depth  # noqa: F401 (stress_cases take it from here)
 
 MATCHES = ("seconds", "spp")
-
-BENCHMARK = Path(__file__).resolve().parents[1] / "presets" / "benchmark.toml"
 
 
 @dataclass(frozen=True)
@@ -135,12 +134,6 @@ def read_preset(path: Path) -> Preset:
     )
 
 
-def benchmark_depth(name: str) -> int:
-    """The ``max_depth`` at which the benchmark renders a scene."""
-    scenes = tomllib.loads(BENCHMARK.read_text())["scene"]
-    return scenes.get(name, {}).get("max_depth") or reference.default_depth(name)
-
-
 def _check_keys(path, entry, needed, allowed, what):
     if unknown := sorted(set(entry) - allowed):
         raise ValueError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
@@ -175,10 +168,8 @@ def _subject(path, data, name) -> Subject:
     else:
         seeds = (_whole(path, "seeds", seeds),) * len(spp)
     if "max_depth" in merged:
-        depth = _whole(path, "max_depth", merged["max_depth"])
-    else:
-        depth = reference.default_depth(name)
-    return Subject(name, depth, spp, seeds)
+        _whole(path, "max_depth", merged["max_depth"])
+    return Subject(name, reference.depth_in(data, name), spp, seeds)
 
 
 def _method(path, entry, scenes) -> Method:

@@ -24,6 +24,7 @@ import json
 import math
 import platform
 import time
+import tomllib
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -53,6 +54,9 @@ from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = ROOT / "references"
 SUMS = ROOT / "renders"
+BENCHMARK = ROOT / "presets" / "benchmark.toml"
+
+RESOLUTION = 128  # width of the references, and of what scripts render to be judged by them
 
 # Where `path` is black, or would take hours: light through glass, small lamps seen by reflection only.
 NOT_BY_PATH = {
@@ -139,6 +143,18 @@ def load_file(path: Path, **definitions):
 def default_depth(name: str) -> int:
     """The ``max_depth`` of a scene's file."""
     return load_scene(name, resolution=1).integrator().max_depth
+
+
+def depth_in(preset: dict, name: str) -> int:
+    """The ``max_depth`` at which a preset, as read from TOML, renders a scene: its own, else that of all
+    scenes, else that of the scene's file."""
+    own = preset.get("scene", {}).get(name, {})
+    return (preset | own).get("max_depth") or default_depth(name)
+
+
+def benchmark_depth(name: str) -> int:
+    """The ``max_depth`` at which the benchmark renders a scene."""
+    return depth_in(tomllib.loads(BENCHMARK.read_text()), name)
 
 
 def reference_path(name: str, resolution: int, max_depth: int) -> Path:
@@ -326,7 +342,7 @@ class Job:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it; also whether it is good
     enough. One that the time has cut short does not replace a better one."""
-    depth = job.max_depth or default_depth(job.scene)
+    depth = job.max_depth or benchmark_depth(job.scene)
     reference, reached = (_known if job.scene in KNOWN else _rendered)(job, depth)
     stored = None if reached else _stored(job, depth)
     if stored is not None and stored.error < reference.error:
@@ -477,8 +493,8 @@ def main() -> int:
     parser.add_argument("--all", action="store_true", help="all scenes")
     parser.add_argument("--spp", type=int, default=64, help="of the renders to judge; default %(default)s")
     parser.add_argument("--seconds", type=float, default=600, help="per scene; default %(default)s")
-    parser.add_argument("--resolution", type=int, default=128, help="width; default %(default)s")
-    parser.add_argument("--max-depth", type=int, help="default: the scene's own")
+    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="width; default %(default)s")
+    parser.add_argument("--max-depth", type=int, help="default: that of the benchmark")
     args = parser.parse_args()
     for key in ("spp", "resolution"):
         if getattr(args, key) < 1:

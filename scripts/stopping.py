@@ -16,7 +16,7 @@ import numpy as np
 import reference
 from metrics import rel_mse
 from mitsuba_bdpt.__main__ import number
-from preset import benchmark_depth
+from reference import benchmark_depth
 
 import mitsuba as mi  # isort: skip
 

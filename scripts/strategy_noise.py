@@ -15,7 +15,7 @@ import sys
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 from metrics import TRIM
-from preset import benchmark_depth
+from reference import benchmark_depth
 from report import table
 
 import mitsuba as mi  # isort: skip
