@@ -35,7 +35,6 @@ Further keys of an integrator are parameters of the plugin.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -97,7 +96,7 @@ class Preset:
 
 def read_preset(path: Path) -> Preset:
     """Read and check a TOML file; raises ``ValueError`` naming the file and the key."""
-    data = tomllib.loads(path.read_text())
+    data = reference.read_toml(path)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
     for key in {"resolution", "max_depth"} & set(data):

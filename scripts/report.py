@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -41,6 +40,7 @@ from analysis import (
     spread,
 )
 from metrics import rel_mse_epsilon
+from mistakes import answered
 from mitsuba_bdpt.files import replacing
 from tables import ranged, ratio, said, table
 
@@ -530,7 +530,7 @@ def main():
     args = parser.parse_args()
     results, made = load(args.folder)
     files = {name: args.folder / f"{name}.toml" for name in ("goals", "notes")}
-    kept = {name: tomllib.loads(f.read_text()) if f.exists() else {} for name, f in files.items()}
+    kept = {name: reference.read_toml(f) if f.exists() else {} for name, f in files.items()}
     goals, notes = kept["goals"].get("goal", []), kept["notes"]
     write_text(args.folder / "README.md", page(results, made, goals, notes))
     figures.efficiencies(results, RIVALS, args.folder / "efficiency.png")
@@ -549,4 +549,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(answered(main))

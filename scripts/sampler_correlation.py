@@ -20,7 +20,7 @@ from __future__ import annotations
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from metrics import TRIM, rel_mse
-from reference import load_reference, load_scene
+from reference import RESOLUTION, load_reference, load_scene
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -97,7 +97,6 @@ def correlation_table() -> list[str]:
 
 
 SCENES = {"cornell_box": 6, "many_lights": 6, "open_sky": 6}  # and the depth of their references
-RESOLUTION = 128
 SEEDS = 5
 
 
