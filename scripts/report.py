@@ -32,12 +32,12 @@ from analysis import (
     NotJudged,
     Refused,
     Results,
-    Spread,
+    Summary,
     convergence,
     cost,
     efficiency,
     geometric_mean,
-    spread,
+    summary,
 )
 from metrics import rel_mse_epsilon
 from mistakes import answered
@@ -283,7 +283,7 @@ def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
 MANY, NARROW = 20, 0.04
 
 
-def _near(found: Spread) -> str:
+def _near(found: Summary) -> str:
     wide = found.count >= MANY and found.high - found.low > NARROW
     text = f"{found.median:.3f}x, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
     return text + (f" (not narrower than {NARROW})" if wide else "")
@@ -356,7 +356,7 @@ def _pilot(results: Results, scene: str) -> str:
 
 
 def _floor(results: Results) -> str:
-    return ", ".join(f"{ranged(spread(v))} `{name}`" for name, v in _values(results, "floor").items())
+    return ", ".join(f"{ranged(summary(v))} `{name}`" for name, v in _values(results, "floor").items())
 
 
 def _values(results, name) -> dict:
@@ -371,7 +371,7 @@ def _values(results, name) -> dict:
 
 def _coldstart(results: Results) -> str:
     values = _values(results, "coldstart")
-    ratios = spread([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
+    ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
     return f"{np.median(values['bdpt']):.2f} s, {ranged(ratios)} `path`'s"
 
 
