@@ -2,6 +2,7 @@
 
 Taken for mistakes is what names something that the user gave:
 
+* ``argparse.ArgumentTypeError``: words of the command line that are read after the rest of it.
 * ``OSError``: a file or a folder that is missing, or cannot be written.
 * ``ValueError``, ``TypeError`` and ``NotImplementedError``, but only if a ``raise`` of this project raised
   them: its checks say in words what is wrong with which name, path or parameter. The same types out of NumPy,
@@ -14,6 +15,7 @@ All else is a bug, whose traceback must be seen.
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 import traceback
@@ -43,7 +45,7 @@ def answered(main: Callable[[], int | None]) -> int | None:
 
 def is_mistake(error: Exception) -> bool:
     """Whether the user is to mend it, see above."""
-    if isinstance(error, OSError):
+    if isinstance(error, OSError | argparse.ArgumentTypeError):
         return True
     if isinstance(error, NotImplementedError | ValueError | TypeError):  # the first is a RuntimeError too
         return _is_raised_here(error)

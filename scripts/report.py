@@ -46,9 +46,14 @@ from tables import ranged, ratio, said, table
 
 
 def load(folder: Path) -> tuple[Results, dict]:
-    """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if the errors
-    were taken against other references."""
-    rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
+    """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if no sweep has
+    filled it, and if the errors were taken against other references."""
+    try:
+        rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
+    except (FileNotFoundError, pyarrow.ArrowInvalid) as error:
+        raise ValueError(
+            f"{folder}: rows.parquet is missing or not whole; run scripts/sweep.py -o {folder}"
+        ) from error
     made, digests = {}, {}
     for row in rows:
         key = row["scene"], row["resolution"], row["max_depth"]

@@ -17,9 +17,12 @@ The second table is the error of whole images by the points that made them.
 
 from __future__ import annotations
 
+import sys
+
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from metrics import TRIM, rel_mse
+from mistakes import answered
 from reference import RESOLUTION, load_reference, load_scene
 
 import drjit as dr  # isort: skip
@@ -132,11 +135,13 @@ def error_table() -> list[str]:
     return lines
 
 
-def main():
+def main() -> int:
+    """Print both tables."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)  # samplers warn of each count that they round
     print("\n".join([*correlation_table(), "", *error_table()]))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(answered(main))

@@ -33,6 +33,8 @@ def here(tmp_path, monkeypatch):
     monkeypatch.setattr(reference, "REFERENCES", tmp_path)
     Path("room.xml").write_text(ROOM)
     Path("words.toml").write_text("scenes = [")
+    Path("broken").mkdir()
+    Path("broken/rows.parquet").write_text("cut short")
     return tmp_path
 
 
@@ -61,14 +63,15 @@ def by_user(monkeypatch, script, *arguments):
         ("equal_time.py words.toml --reference flat.exr", "Parsing of XML"),
         ("equal_time.py room.xml --reference flat.exr -i nope bdpt", "nope"),
         ("equal_time.py room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
+        ("equal_time.py room.xml --reference flat.exr -i 'bdpt nothing' path", "the form KEY=VALUE"),
         ("fireflies.py nowhere", "scene='nowhere' is not in scenes/"),
         ("floor.py nowhere", "scene='nowhere' is not in scenes/"),
         ("overhead.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("page.py nowhere", "nowhere"),
+        ("page.py broken", "broken: rows.parquet is missing or not whole; run scripts/sweep.py"),
         ("page.py . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page.py . -o words.toml/a.html", "words.toml"),
         ("point_error.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("report.py nowhere", "nowhere"),
+        ("report.py nowhere", "nowhere: rows.parquet is missing or not whole; run scripts/sweep.py"),
         ("stopping.py nowhere", "scene='nowhere' is not in scenes/"),
         ("strategies.py nowhere", "scene='nowhere' is neither a file"),
         ("strategies.py room.xml -o words.toml/a", "words.toml"),
