@@ -171,12 +171,14 @@ def _make_class():
 
         def decide(self, scene, sensor=0, seed=0, spp=0):
             """What the pilot of such a render chooses, as in ``statistics["decisions"]``: an empty list
-            without a pilot. The parameter ``decisions`` of other renders of the scene takes it as JSON."""
+            without a pilot, about which ``statistics["no_pilot"]`` says why. The parameter ``decisions`` of
+            other renders of the scene takes it as JSON."""
             check_made_for(self, scene)
             sensor = _resolve(scene, sensor)
             render = Render(scene, sensor, self.settings, seed, _samples(sensor, spp, self.settings))
             render.decide()
-            _warn_of_what_was_lost(render.statistics(), scene)
+            self.statistics = render.statistics()
+            _warn_of_what_was_lost(self.statistics, scene)
             return [decision.record() for decision in render.decisions]
 
         def assemble(self, snapshot, scene, sensor=0, develop=True, evaluate=True):
