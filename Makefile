@@ -75,7 +75,7 @@ endurance: $(INSTALLED)
 references: $(INSTALLED)
 	$(VENV)/bin/python scripts/reference.py --all --seconds 3600
 	$(VENV)/bin/python scripts/reference.py glass_caustics --spp 256 --seconds 7200
-	$(VENV)/bin/python scripts/reference.py cornell_box --max-depth 6 --spp 256 --seconds 3600
+	$(VENV)/bin/python scripts/reference.py cornell_box --spp 256 --seconds 3600
 
 # The tables and plots of the README, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)

@@ -62,7 +62,7 @@ class Biased(Refused):
 
 
 @dataclass(frozen=True)
-class Spread:
+class Summary:
     """Median, extremes and 95 % interval of the median of ``count`` ratios."""
 
     median: float
@@ -73,10 +73,10 @@ class Spread:
     count: int
 
 
-def spread(values) -> Spread:
-    """`Spread` of at least two values."""
+def summary(values) -> Summary:
+    """`Summary` of at least two values."""
     middle = bootstrap_median(values)
-    return Spread(middle.value, middle.low, middle.high, min(values), max(values), len(values))
+    return Summary(middle.value, middle.low, middle.high, min(values), max(values), len(values))
 
 
 def select(rows, **wanted) -> list[dict]:
@@ -114,19 +114,19 @@ def pair_ratios(ours, theirs, error="rel_mse_trimmed") -> list[float]:
     return [equal_time_speedup(*(Measurement(row["seconds"], row[error]) for row in pair)) for pair in pairs]
 
 
-def efficiency(ours, theirs, error="rel_mse_trimmed") -> Spread:
-    """Spread of `pair_ratios`; raises `Refused` where the reference is too noisy or an error is 0."""
+def efficiency(ours, theirs, error="rel_mse_trimmed") -> Summary:
+    """Summary of `pair_ratios`; raises `Refused` where the reference is too noisy or an error is 0."""
     if len(ours) < 2 or len(theirs) < 2:
         raise Refused("fewer than two renders")
     for rows in (ours, theirs):
         if any(row[error] == 0 for row in rows):
             raise Refused(f"{rows[0]['method']} is exact here")
         check_judged(rows, error)
-    return spread(pair_ratios(ours, theirs, error))
+    return summary(pair_ratios(ours, theirs, error))
 
 
-def gap(rows) -> Spread:
-    """Spread of raw over trimmed relMSE: how much of the error the worst values of an image carry. Raises
+def gap(rows) -> Summary:
+    """Summary of raw over trimmed relMSE: how much of the error the worst values of an image carry. Raises
     `Refused` as `efficiency` does."""
     if len(rows) < 2:
         raise Refused("fewer than two renders")
@@ -134,7 +134,7 @@ def gap(rows) -> Spread:
         if any(row[error] == 0 for row in rows):
             raise Refused(f"{rows[0]['method']} is exact here")
         check_judged(rows, error)
-    return spread([row["rel_mse"] / row["rel_mse_trimmed"] for row in rows])
+    return summary([row["rel_mse"] / row["rel_mse_trimmed"] for row in rows])
 
 
 def widths(rows, methods) -> dict[str, float]:
@@ -145,9 +145,9 @@ def widths(rows, methods) -> dict[str, float]:
     return {name: middle.high - middle.low for name, middle in found.items()}
 
 
-def cost(ours, theirs) -> Spread:
-    """Spread of the ratio of seconds per sample per pixel, pairs of seeds."""
-    return spread([a["seconds"] / a["spp"] / (b["seconds"] / b["spp"]) for a, b in paired(ours, theirs)])
+def cost(ours, theirs) -> Summary:
+    """Summary of the ratio of seconds per sample per pixel, pairs of seeds."""
+    return summary([a["seconds"] / a["spp"] / (b["seconds"] / b["spp"]) for a, b in paired(ours, theirs)])
 
 
 def convergence(rows, error="rel_mse") -> Estimate:
@@ -231,7 +231,7 @@ class Results:
             raise Refused("not rendered")
         return bias(self.of(scene, method), self.references[scene])
 
-    def gap(self, scene: str, method: str) -> Spread:
+    def gap(self, scene: str, method: str) -> Summary:
         """`gap` of an integrator at the deciding budget."""
         return gap(self.of(scene, method, self.deciding))
 
@@ -246,12 +246,12 @@ class Results:
 
         return sorted(self.scenes, key=size, reverse=True)
 
-    def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Spread:
+    def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Summary:
         """Of the first integrator over another one, at the deciding budget unless said."""
         budget = budget or self.deciding
         return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
 
-    def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Spread:
+    def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Summary:
         """As `efficiency`; raises `Biased` where the other fails the bias check. (With too few seeds for one
         there is none to fail, but an image that is black where the reference is not.)"""
         try:
@@ -265,7 +265,7 @@ class Results:
             raise Biased({rival: missing(check)})
         return self.efficiency(scene, rival, error, budget)
 
-    def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Spread:
+    def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Summary:
         """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
         that were rendered and pass the bias check; raises `Biased` if none does."""
         found, biased = [], {}

@@ -17,21 +17,21 @@ import argparse
 import json
 import statistics
 import sys
-import time
 from collections import Counter
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
-import numpy as np
 from report import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr
 import metrics
 import reference
+from mistakes import answered
 from mitsuba_bdpt import choice, pilot, rendering
-from preset import benchmark_depth
+from reference import RESOLUTION, benchmark_depth
+from timing import timed
 
-RESOLUTION, SPP, LANES, ROUNDS = 128, 64, 1 << 15, 4
+SPP, LANES, ROUNDS = 64, 1 << 15, 4
 
 # (share of a light subpath, connections, kappa of t = 1 over its count)
 SELECTION = (
@@ -71,9 +71,8 @@ def rendered(scene, depth: int, made: choice.Decision, expected) -> tuple[float,
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": decisions})
     errors, seconds = [], []
     for seed in range(ROUNDS + 1):
-        started = time.perf_counter()
-        image = np.array(integrator.render(scene, seed=seed, spp=SPP))[..., :3]
-        seconds.append(time.perf_counter() - started)
+        image, taken = timed(scene, integrator, SPP, seed)
+        seconds.append(taken)
         errors.append(metrics.rel_mse(image, expected, metrics.TRIM) * SPP)
     return statistics.median(errors[1:]), statistics.median(seconds[1:])
 
@@ -152,4 +151,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -18,11 +18,13 @@ from dataclasses import dataclass
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import reference
-from equal_time import RESOLUTION, integrator, timed
+from equal_time import integrator
 from metrics import TRIM, rel_mse
+from mistakes import answered
 from mitsuba_bdpt.__main__ import number
-from preset import benchmark_depth
+from reference import RESOLUTION, benchmark_depth
 from report import table
+from timing import timed
 
 import mitsuba as mi  # isort: skip
 
@@ -104,4 +106,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
+from mistakes import answered
 from report import replace_part, table, write_text
 
 import mitsuba as mi  # isort: skip
@@ -498,4 +499,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -26,6 +26,7 @@ from pathlib import Path
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import reference
+from mistakes import answered
 from mitsuba_bdpt.files import replacing
 from mitsuba_bdpt.mis import HEURISTICS
 from report import table
@@ -235,7 +236,7 @@ def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    known = sorted(path.stem for path in (reference.ROOT / "scenes").glob("*.xml"))
+    known = reference.scene_names()
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; default: all")
     parser.add_argument("--seconds", type=float, default=math.inf, help="default: until there are --samples")
     parser.add_argument("--samples", type=float, default=TARGET, help="of all; default: %(default).0e")
@@ -259,4 +260,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(answered(main))

@@ -2,16 +2,19 @@
 
     python scripts/equal_time.py veach_bidir --spp 25    # renders/equal_time_veach_bidir.png: path, bdpt
     python scripts/equal_time.py veach_mis --spp 16 -i "bdpt heuristic=power" "bdpt heuristic=balance"
+    python scripts/equal_time.py my_room.xml --reference my_room_4096spp.exr
 
 The last integrator has ``--spp`` samples per pixel, the others as many as fit into its seconds. Errors are
-against the scene's reference in references/; windows are where they differ most.
+against the scene's reference in references/, at its size and the depth of the benchmark; for a file that is
+not in scenes/ against ``--reference``, at the file's own size and depth. Windows are where the errors differ
+most.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import time
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,19 +22,20 @@ import matplotlib
 import numpy as np
 import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
+from mistakes import answered, check_output
 from mitsuba_bdpt.__main__ import number, property_
 from mitsuba_bdpt.files import replacing
-from preset import benchmark_depth
+from mitsuba_bdpt.loading import choose_sensor
+from reference import RESOLUTION, benchmark_depth
+from timing import timed
 
 import mitsuba as mi  # isort: skip
-import drjit as dr  # isort: skip
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib.colors import LogNorm  # noqa: E402
 from matplotlib.patches import Rectangle  # noqa: E402
 
-RESOLUTION = 128  # as the references
 WINDOW = 6  # a window's side is this part of the image's
 COLOURS = ("#E69F00", "#56B4E9")  # of the two windows
 TIMED = 3  # renders of which the median is the time
@@ -60,13 +64,33 @@ def integrator(words: str, depth: int):
     return mi.load_dict({"type": kind, "max_depth": depth} | dict(property_(text) for text in properties))
 
 
-def timed(scene, made, spp: int, seed: int) -> tuple[np.ndarray, float]:
-    """Image and seconds of a render."""
-    started = time.perf_counter()
-    image = mi.render(scene, integrator=made, spp=spp, seed=seed)
-    dr.eval(image)
-    dr.sync_thread()
-    return np.array(image, dtype=np.float64)[..., :3], time.perf_counter() - started
+def subject(path: Path, sampler: str | None, exr: Path | None):
+    """Scene, reference and ``max_depth`` of a scene's file, whose reference is in ``exr`` if given."""
+    own = {"sampler": sampler} if sampler else {}
+    if path.resolve().parent == reference.SCENES and exr is None:
+        depth = benchmark_depth(path.stem)
+        target = reference.load_reference(path.stem, RESOLUTION, depth).image
+        return reference.load_file(path, resolution=RESOLUTION, **own), target, depth
+    if exr is None:
+        raise ValueError(
+            f"scene={str(path)!r} is not in scenes/ and has no reference; give one with --reference "
+            f"FILE.exr, which python -m mitsuba_bdpt render {path} --spp 4096 -o FILE.exr makes"
+        )
+    (target,), _ = reference.read_exr(exr, "")
+    scene = reference.load_file(path, **own)
+    width, height = (int(n) for n in choose_sensor(scene, 0).film().crop_size())
+    if target.shape[:2] != (height, width):
+        raise ValueError(
+            f"reference={str(exr)!r} has {target.shape[1]} x {target.shape[0]} pixels, the film of "
+            f"{str(path)!r} {width} x {height}; render it from this file"
+        )
+    return scene, target, depth_of(scene.integrator())
+
+
+def depth_of(made) -> int:
+    """The ``max_depth`` of an integrator, which Mitsuba's own tell in their text alone; -1 without one."""
+    found = re.search(r"\bmax_depth = (\d+)", str(made))
+    return int(found[1]) if found and int(found[1]) < 2**31 else -1
 
 
 def seconds(scene, made, spp: int) -> float:
@@ -130,32 +154,33 @@ def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
     for axis in axes.flat:
         axis.set_axis_off()
     figure.suptitle(title, fontsize=11)
-    file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file) as temporary:
         figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})
     plt.close(figure)
 
 
-def main() -> int:
+def main(arguments=None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scene", help="name of a scene of scenes/ that has a reference")
+    parser.add_argument("scene", help="a scene file, or a name in scenes/ that has a reference")
     parser.add_argument("--spp", type=number(int, 1), default=64, help="of the last integrator")
     text = "TYPE KEY=VALUE …, each in quotes; default: path bdpt"
     parser.add_argument("-i", "--integrators", nargs="+", default=["path", "bdpt"], help=text)
-    text = "of the sensor; default: %(default)s, Mitsuba's own default"
-    parser.add_argument("--sampler", default="independent", help=text)
+    text = "value of $sampler in the scene file, of the sensor; default: the file's"
+    parser.add_argument("--sampler", help=text)
+    text = "image to take errors against; default: the one in references/"
+    parser.add_argument("--reference", type=Path, metavar="EXR", help=text)
     parser.add_argument("-o", "--output", type=Path, help="default: renders/equal_time_SCENE.png")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
-    depth = benchmark_depth(args.scene)
-    target = reference.load_reference(args.scene, RESOLUTION, depth).image
-    scene = reference.load_scene(args.scene, resolution=RESOLUTION, sampler=args.sampler)
+    path = reference.find_scene(args.scene)
+    file = args.output or reference.ROOT / "renders" / f"equal_time_{path.stem}.png"
+    check_output(file, ".png")
+    scene, target, depth = subject(path, args.sampler, args.reference)
     found = shots(scene, target, args.integrators, depth, args.spp)
-    file = args.output or reference.ROOT / "renders" / f"equal_time_{args.scene}.png"
-    draw(found, target, f"{args.scene}, equal time", file)
+    draw(found, target, f"{path.stem}, equal time", file)
     print(file)
     for shot in found:
         print(shot.caption.replace("\n", ", "))
@@ -163,4 +188,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(answered(main))

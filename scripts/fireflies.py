@@ -31,7 +31,8 @@ import reconstruct
 import recording
 import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon
-from preset import benchmark_depth
+from mistakes import answered
+from reference import benchmark_depth
 from stress_cases import oracle
 from tables import table
 
@@ -222,7 +223,8 @@ def main(arguments=None) -> int:
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
     parser.add_argument("--seeds", type=int, default=5, help="renders of each scene")
     parser.add_argument("--spp", type=int, default=64)
-    parser.add_argument("--resolution", type=int, default=128, help="one for which there is a reference")
+    text = "one for which there is a reference; default %(default)s"
+    parser.add_argument("--resolution", type=int, default=reference.RESOLUTION, help=text)
     parser.add_argument("--max-depth", type=int, help="default: that of the benchmark")
     parser.add_argument("--level", type=float, default=0.5, help="values of its pixel, see above")
     parser.add_argument("--top", type=int, default=12, help="samples examined of each render")
@@ -239,4 +241,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -21,6 +21,7 @@ import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import mitsuba as mi  # isort: skip
 import drjit as dr
 import reference
+from mistakes import answered
 from mitsuba_bdpt import passes, points, rendering, sinks
 from mitsuba_bdpt.kernel import trace
 from mitsuba_bdpt.objects import step_by_step
@@ -68,7 +69,7 @@ class Pass:
     """One pass of a scene at 128^2, as a render of 64 samples per pixel decides it."""
 
     def __init__(self, name: str, parameters: dict):
-        self._scene = reference.load_scene(name, resolution=128)
+        self._scene = reference.load_scene(name, resolution=reference.RESOLUTION)
         depth = reference.default_depth(name)
         integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
         self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
@@ -133,4 +134,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -15,15 +15,15 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import time
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import drjit as dr
 import reference
-from preset import benchmark_depth
+from mistakes import answered
+from reference import benchmark_depth
 from report import table
+from timing import timed
 
 ROUNDS, SHORT, LONG = 7, 4, 64
 
@@ -41,20 +41,12 @@ METHODS = {
 }
 
 
-def seconds(integrator, scene, spp: int, seed: int) -> float:
-    """Of a whole render."""
-    dr.sync_thread()
-    start = time.perf_counter()
-    dr.eval(integrator.render(scene, seed=seed, spp=spp))
-    dr.sync_thread()
-    return time.perf_counter() - start
-
-
 def measure(name: str) -> list[str]:
     """A row of the table."""
     depth = benchmark_depth(name)
     scenes = {
-        s: reference.load_scene(name, resolution=128, sampler=s) for s in ("independent", "multijitter")
+        s: reference.load_scene(name, resolution=reference.RESOLUTION, sampler=s)
+        for s in ("independent", "multijitter")
     }
     made = {k: (mi.load_dict(d | {"max_depth": depth}), scenes[s]) for k, (d, s) in METHODS.items()}
     chosen = mi.load_dict({"type": "bdpt", "max_depth": depth})
@@ -63,9 +55,9 @@ def measure(name: str) -> list[str]:
     pilot = {LONG: [], 4 * LONG: []}
     for seed in range(ROUNDS + 1):
         for k, (integrator, scene) in made.items():
-            short, long = (seconds(integrator, scene, spp, seed) for spp in (SHORT, LONG))
+            short, long = (timed(scene, integrator, spp, seed)[1] for spp in (SHORT, LONG))
             cost[k].append((long - short) / (LONG - SHORT))
-        first.append(seconds(made["path tracing alone"][0], scenes["independent"], 1, seed))
+        first.append(timed(scenes["independent"], made["path tracing alone"][0], 1, seed)[1])
         for spp, found in pilot.items():
             chosen.render(scenes["independent"], seed=seed, spp=spp)
             spent = chosen.statistics["seconds"]
@@ -94,4 +86,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -22,6 +22,7 @@ import numpy as np
 import reference
 import report
 from analysis import NOTHING, RIVALS, Biased, Refused, Results
+from mistakes import answered, check_output
 from mitsuba_bdpt.explain import subpaths
 from mitsuba_bdpt.files import replacing
 
@@ -210,6 +211,7 @@ def main() -> int:
     parser.add_argument("-o", "--output", type=Path, help="default: FOLDER/page.html")
     args = parser.parse_args()
     output = args.output or args.folder / "page.html"
+    check_output(output, ".html")
     text = page(args.folder, *report.load(args.folder))
     with replacing(output) as temporary:
         temporary.write_text(text)
@@ -218,4 +220,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(answered(main))

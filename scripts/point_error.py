@@ -19,10 +19,11 @@ import mitsuba as mi  # isort: skip
 import metrics
 import numpy as np
 import reference
-from preset import benchmark_depth
+from mistakes import answered
+from reference import RESOLUTION, benchmark_depth
 from report import table
 
-RESOLUTION, BUDGETS, SEEDS = 128, (16, 64), 5
+BUDGETS, SEEDS = (16, 64), 5
 
 METHODS = {"path tracing alone": {"light_paths": 0}, "light_paths=1/4": {"light_paths": 1 / 4}}
 SAMPLERS = ("stratified", "multijitter", "orthogonal", "ldsampler")
@@ -63,4 +64,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

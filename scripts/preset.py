@@ -35,17 +35,15 @@ Further keys of an integrator are parameters of the plugin.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 import probes
 import reference
 from metrics import TILES
+from reference import benchmark_depth  # noqa: F401 (stress_cases take it from here)
 
 MATCHES = ("seconds", "spp")
-
-BENCHMARK = Path(__file__).resolve().parents[1] / "presets" / "benchmark.toml"
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class Preset:
 
 def read_preset(path: Path) -> Preset:
     """Read and check a TOML file; raises ``ValueError`` naming the file and the key."""
-    data = tomllib.loads(path.read_text())
+    data = reference.read_toml(path)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
     for key in {"resolution", "max_depth"} & set(data):
@@ -135,12 +133,6 @@ def read_preset(path: Path) -> Preset:
     )
 
 
-def benchmark_depth(name: str) -> int:
-    """The ``max_depth`` at which the benchmark renders a scene."""
-    scenes = tomllib.loads(BENCHMARK.read_text())["scene"]
-    return scenes.get(name, {}).get("max_depth") or reference.default_depth(name)
-
-
 def _check_keys(path, entry, needed, allowed, what):
     if unknown := sorted(set(entry) - allowed):
         raise ValueError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
@@ -175,10 +167,8 @@ def _subject(path, data, name) -> Subject:
     else:
         seeds = (_whole(path, "seeds", seeds),) * len(spp)
     if "max_depth" in merged:
-        depth = _whole(path, "max_depth", merged["max_depth"])
-    else:
-        depth = reference.default_depth(name)
-    return Subject(name, depth, spp, seeds)
+        _whole(path, "max_depth", merged["max_depth"])
+    return Subject(name, reference.depth_in(data, name), spp, seeds)
 
 
 def _method(path, entry, scenes) -> Method:

@@ -24,6 +24,7 @@ import json
 import math
 import platform
 import time
+import tomllib
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +43,7 @@ from metrics import (
     rel_mse,
     tile_columns,
 )
+from mistakes import answered
 
 import mitsuba as mi  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
@@ -53,6 +55,10 @@ from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = ROOT / "references"
 SUMS = ROOT / "renders"
+SCENES = ROOT / "scenes"
+BENCHMARK = ROOT / "presets" / "benchmark.toml"
+
+RESOLUTION = 128  # width of the references, and of what scripts render to be judged by them
 
 # Where `path` is black, or would take hours: light through glass, small lamps seen by reflection only.
 NOT_BY_PATH = {
@@ -117,13 +123,28 @@ class Reference:
         return reference_rel_mse(self.difference, image, self.image, trim)
 
 
+def scene_names() -> list[str]:
+    """The scenes of scenes/."""
+    return sorted(path.stem for path in SCENES.glob("*.xml"))
+
+
 def scene_file(name: str) -> Path:
     """The XML file of a scene of scenes/; raises ``ValueError`` if there is none."""
-    path = ROOT / "scenes" / f"{name}.xml"
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in path.parent.glob("*.xml")))
-        raise ValueError(f"scene={name!r} is not in scenes/; there are {known}")
-    return path
+    if name not in scene_names():
+        raise ValueError(f"scene={name!r} is not in scenes/; there are {', '.join(scene_names())}")
+    return SCENES / f"{name}.xml"
+
+
+def find_scene(name: str) -> Path:
+    """A scene's file, given itself or by its name in scenes/; raises ``ValueError`` if there is none."""
+    if Path(name).is_file():
+        return Path(name)
+    if name not in scene_names():
+        raise ValueError(
+            f"scene={name!r} is neither a file nor the name of one in scenes/; there are "
+            f"{', '.join(scene_names())}"
+        )
+    return scene_file(name)
 
 
 def load_scene(name: str, **definitions):
@@ -139,6 +160,26 @@ def load_file(path: Path, **definitions):
 def default_depth(name: str) -> int:
     """The ``max_depth`` of a scene's file."""
     return load_scene(name, resolution=1).integrator().max_depth
+
+
+def read_toml(path: Path) -> dict:
+    """A TOML file; raises ``ValueError`` naming it if it is none."""
+    try:
+        return tomllib.loads(path.read_text())
+    except ValueError as error:  # of TOML, or of text that is not UTF-8
+        raise ValueError(f"{path} is not TOML: {error}") from error
+
+
+def depth_in(preset: dict, name: str) -> int:
+    """The ``max_depth`` at which a preset, as read from TOML, renders a scene: its own, else that of all
+    scenes, else that of the scene's file."""
+    own = preset.get("scene", {}).get(name, {})
+    return (preset | own).get("max_depth") or default_depth(name)
+
+
+def benchmark_depth(name: str) -> int:
+    """The ``max_depth`` at which the benchmark renders a scene."""
+    return depth_in(read_toml(BENCHMARK), name)
 
 
 def reference_path(name: str, resolution: int, max_depth: int) -> Path:
@@ -326,7 +367,7 @@ class Job:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it; also whether it is good
     enough. One that the time has cut short does not replace a better one."""
-    depth = job.max_depth or default_depth(job.scene)
+    depth = job.max_depth or benchmark_depth(job.scene)
     reference, reached = (_known if job.scene in KNOWN else _rendered)(job, depth)
     stored = None if reached else _stored(job, depth)
     if stored is not None and stored.error < reference.error:
@@ -461,9 +502,17 @@ def write_exr(path: Path, layers: dict, header: dict, dtype=np.float16):
 
 
 def read_exr(path: Path, *layers: str):
-    """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_exr`, and its header."""
+    """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_exr`, and its header; raises
+    ``ValueError`` for another file."""
+    with path.open("rb") as file:  # OpenEXR does not say what hinders it
+        start = file.read(4)
+    if start != render.MAGIC[".exr"]:
+        raise ValueError(f"{str(path)!r} is not an EXR")
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels, header = file.channels(), dict(file.header())
+        missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
+        if missing:
+            raise ValueError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")
         images = [np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1) for layer in layers]
     return [image.astype(np.float64) for image in images], header
 
@@ -477,8 +526,8 @@ def main() -> int:
     parser.add_argument("--all", action="store_true", help="all scenes")
     parser.add_argument("--spp", type=int, default=64, help="of the renders to judge; default %(default)s")
     parser.add_argument("--seconds", type=float, default=600, help="per scene; default %(default)s")
-    parser.add_argument("--resolution", type=int, default=128, help="width; default %(default)s")
-    parser.add_argument("--max-depth", type=int, help="default: the scene's own")
+    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="width; default %(default)s")
+    parser.add_argument("--max-depth", type=int, help="default: that of the benchmark")
     args = parser.parse_args()
     for key in ("spp", "resolution"):
         if getattr(args, key) < 1:
@@ -487,7 +536,7 @@ def main() -> int:
         parser.error(f"--resolution {args.resolution} must be divisible by {TILES}")
     if args.max_depth == 0 or (args.max_depth or 1) < -1:
         parser.error(f"--max-depth {args.max_depth} must be at least 1, or -1 for no limit")
-    names = sorted(p.stem for p in (ROOT / "scenes").glob("*.xml")) if args.all else args.scenes
+    names = scene_names() if args.all else args.scenes
     if not names:
         parser.error("name a scene, or give --all")
     mi.set_variant("llvm_ad_rgb")
@@ -511,4 +560,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(answered(main))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import re
-import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -33,22 +32,28 @@ from analysis import (
     NotJudged,
     Refused,
     Results,
-    Spread,
+    Summary,
     convergence,
     cost,
     efficiency,
     geometric_mean,
-    spread,
+    summary,
 )
 from metrics import rel_mse_epsilon
+from mistakes import answered
 from mitsuba_bdpt.files import replacing
 from tables import ranged, ratio, said, table
 
 
 def load(folder: Path) -> tuple[Results, dict]:
-    """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if the errors
-    were taken against other references."""
-    rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
+    """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if no sweep has
+    filled it, and if the errors were taken against other references."""
+    try:
+        rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
+    except (FileNotFoundError, pyarrow.ArrowInvalid) as error:
+        raise ValueError(
+            f"{folder}: rows.parquet is missing or not whole; run scripts/sweep.py -o {folder}"
+        ) from error
     made, digests = {}, {}
     for row in rows:
         key = row["scene"], row["resolution"], row["max_depth"]
@@ -283,7 +288,7 @@ def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
 MANY, NARROW = 20, 0.04
 
 
-def _near(found: Spread) -> str:
+def _near(found: Summary) -> str:
     wide = found.count >= MANY and found.high - found.low > NARROW
     text = f"{found.median:.3f}x, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
     return text + (f" (not narrower than {NARROW})" if wide else "")
@@ -356,7 +361,7 @@ def _pilot(results: Results, scene: str) -> str:
 
 
 def _floor(results: Results) -> str:
-    return ", ".join(f"{ranged(spread(v))} `{name}`" for name, v in _values(results, "floor").items())
+    return ", ".join(f"{ranged(summary(v))} `{name}`" for name, v in _values(results, "floor").items())
 
 
 def _values(results, name) -> dict:
@@ -371,7 +376,7 @@ def _values(results, name) -> dict:
 
 def _coldstart(results: Results) -> str:
     values = _values(results, "coldstart")
-    ratios = spread([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
+    ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
     return f"{np.median(values['bdpt']):.2f} s, {ranged(ratios)} `path`'s"
 
 
@@ -530,7 +535,7 @@ def main():
     args = parser.parse_args()
     results, made = load(args.folder)
     files = {name: args.folder / f"{name}.toml" for name in ("goals", "notes")}
-    kept = {name: tomllib.loads(f.read_text()) if f.exists() else {} for name, f in files.items()}
+    kept = {name: reference.read_toml(f) if f.exists() else {} for name, f in files.items()}
     goals, notes = kept["goals"].get("goal", []), kept["notes"]
     write_text(args.folder / "README.md", page(results, made, goals, notes))
     figures.efficiencies(results, RIVALS, args.folder / "efficiency.png")
@@ -549,4 +554,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(answered(main))

@@ -17,10 +17,13 @@ The second table is the error of whole images by the points that made them.
 
 from __future__ import annotations
 
+import sys
+
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from metrics import TRIM, rel_mse
-from reference import load_reference, load_scene
+from mistakes import answered
+from reference import RESOLUTION, load_reference, load_scene
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -97,7 +100,6 @@ def correlation_table() -> list[str]:
 
 
 SCENES = {"cornell_box": 6, "many_lights": 6, "open_sky": 6}  # and the depth of their references
-RESOLUTION = 128
 SEEDS = 5
 
 
@@ -133,11 +135,13 @@ def error_table() -> list[str]:
     return lines
 
 
-def main():
+def main() -> int:
+    """Print both tables."""
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)  # samplers warn of each count that they round
     print("\n".join([*correlation_table(), "", *error_table()]))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(answered(main))

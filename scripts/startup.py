@@ -13,6 +13,7 @@ import os
 import sys
 import tempfile
 
+from mistakes import answered
 from probes import numbers
 from report import table
 
@@ -69,4 +70,4 @@ def main(arguments=None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

@@ -27,23 +27,12 @@ import matplotlib.pyplot as plt  # noqa: E402
 import mitsuba as mi  # noqa: E402
 import reference  # noqa: E402
 from metrics import tone_map  # noqa: E402
+from mistakes import answered, check_output  # noqa: E402
 from mitsuba_bdpt.render import write_images  # noqa: E402
-
-ROOT = Path(__file__).resolve().parents[1]
 
 KINDS = ("weighted", "unweighted")
 
 SHORTEST = 2  # edges: of single ones the emitters themselves are seen
-
-
-def scene_file(name: str) -> Path:
-    """A file, or one of scenes/ by its name; raises ``ValueError`` if there is none."""
-    if Path(name).is_file():
-        return Path(name)
-    try:
-        return reference.scene_file(name)
-    except ValueError as error:
-        raise ValueError(f"scene={name!r} is neither a file nor the name of one in scenes/") from error
 
 
 def technique_images(image, names: list, kind: str) -> dict:
@@ -124,19 +113,20 @@ def main(arguments=None) -> int:
     if options.max_depth < SHORTEST:
         raise ValueError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     mi.set_variant("llvm_ad_rgb")
-    path = scene_file(options.scene)
-    output = options.output and options.output.with_suffix("") or ROOT / "renders" / f"pyramid_{path.stem}"
+    path = reference.find_scene(options.scene)
+    default = reference.ROOT / "renders" / f"pyramid_{path.stem}"
+    output = options.output.with_suffix("") if options.output else default
+    image = output.with_name(f"{output.name}.exr")
+    pictures = {kind: output.with_name(f"{output.name}_{kind}.png") for kind in KINDS}
+    for file in (image, *pictures.values()):
+        check_output(file, file.suffix)
     film, images = render(path, options)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    write_images(
-        film, output.with_name(f"{output.name}.exr"), {"heuristic": options.heuristic}, options.exposure
-    )
-    for kind in KINDS:
-        file = output.with_name(f"{output.name}_{kind}.png")
+    write_images(film, image, {"heuristic": options.heuristic}, options.exposure)
+    for kind, file in pictures.items():
         draw(panels(images[kind]), file, options.exposure)
         print(file)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))

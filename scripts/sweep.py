@@ -29,7 +29,6 @@ import os
 import platform
 import sys
 import tempfile
-import time
 from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache
 from itertools import groupby
@@ -41,8 +40,10 @@ import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import probes
 import reference
+from mistakes import answered, check_output
 from preset import Preset, Subject, read_preset
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from timing import timed
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
@@ -182,12 +183,7 @@ class Bench:
 
     def timed(self, cell: Cell, spp: int, seed: int):
         """Image and wall seconds of a render."""
-        scene, integrator = self.scene(cell.sampler), self.integrator(cell)
-        start = time.perf_counter()
-        image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
-        dr.eval(image)
-        dr.sync_thread()
-        return np.array(image, dtype=np.float64)[..., :3], time.perf_counter() - start
+        return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
     def compile_seconds(self, cell: Cell, spp: int) -> float:
         """Seconds for the kernels of an integrator (less where they come from the cache on disk); afterwards
@@ -302,7 +298,7 @@ def measured(preset: str, scene: str, cells: list[dict]) -> list:
             try:
                 found.append(measure(bench, cell))
             except Exception as error:  # one cell must not cost the others
-                found.append(str(error))
+                found.append(render.message(error))
         return found
 
 
@@ -409,7 +405,7 @@ class Sweep:
             self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
             raise_interrupt(error)
-            self.failed.append(f"{_description(cell)}: {error}")
+            self.failed.append(f"{_description(cell)}: {render.message(error)}")
         self.progress.advance(self._task)
 
     def _store(self, cells: Cells, cell: Cell, result):
@@ -570,6 +566,7 @@ def main() -> int:
     mi.set_variant("llvm_ad_rgb")
     whole = read_preset(args.preset)
     preset = chosen(whole, args.scenes) if args.scenes else whole
+    check_output(output / "rows.csv", ".csv")  # complain before hours of rendering, not after
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns) as progress:
         sweep = Sweep(preset, output, progress)
@@ -588,4 +585,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(answered(main))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis import NotJudged, Refused, Spread
+from analysis import NotJudged, Refused, Summary
 
 
 def table(head, rows) -> str:
@@ -16,9 +16,9 @@ def ratio(x: float) -> str:
     return f"{x:.3g}x" if x < 999.5 else f"{round(x, -1):.0f}x"
 
 
-def ranged(spread: Spread) -> str:
+def ranged(found: Summary) -> str:
     """Median (smallest–largest)."""
-    return f"{ratio(spread.median)} ({ratio(spread.smallest)[:-1]}–{ratio(spread.largest)[:-1]})"
+    return f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]})"
 
 
 def said(figure, form=ranged) -> str:

@@ -55,6 +55,9 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
     pixels, statistics = image(tmp_path / "a.exr")
     assert sum(statistics["passes"]) == statistics["spp"] == 256
     (decided,) = statistics["decisions"]
+    assert statistics["no_pilot"] == ""
+    assert main(arguments(workers, tmp_path / "short.exr", "--spp", "16")) == 0
+    assert "samples are too few" in image(tmp_path / "short.exr")[1]["no_pilot"]
     scene = mi.load_file(str(SCENE), resolution=32)
     options = Namespace(
         **{"scene": SCENE, "defines": [("resolution", "32")], "properties": [], "variant": mi.variant()},

@@ -536,17 +536,10 @@ def test_a_texture_needs_coordinates():
         integrator().render(mi.load_dict(room() | {"lamp": lamp}), spp=1)
 
 
-@pytest.mark.parametrize("name", TEXTURED)
-def test_textured_lamps_are_the_same_from_all_sides(name, tmp_path):
-    """Rationale: Mitsuba samples a lamp's texture and maps the point to the surface, which on a cube finds
-    one face of six and on cylinders has another density than stated (`path` itself loses light there).
-    Expected: what camera subpaths hit is what emission and next-event estimation make: (0,2) equals
-    (1,1), and (0,3), (1,2) and (2,1) equal each other. Tolerance: the confidence interval, below 4 % and
-    10 % of the mean. Statistic: Welch over tiles, 10 seeds a side.
-    """
-    lamp = TEXTURED[name]() | {"emitter": {"type": "area", "radiance": texture() | {"to_uv": T().scale(3)}}}
-    if name == "smooth mesh":
-        lamp["filename"] = egg_with_coordinates(tmp_path)
+def check_strategies_agree(lamp):
+    """In a room with this lamp what camera subpaths hit is what emission and next-event estimation make:
+    (0,2) equals (1,1), and (0,3), (1,2) and (2,1) equal each other. Tolerance: the confidence interval, below
+    4 % and 10 % of the mean. Statistic: Welch over tiles, 10 seeds a side."""
     scene = mi.load_dict(room() | {"lamp": lamp})
     bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
     a, b, c = (render(scene, bdpt, range(s, s + 10), 512) for s in (0, 50, 100))
@@ -557,6 +550,18 @@ def test_textured_lamps_are_the_same_from_all_sides(name, tmp_path):
     agree(images(a, "s0t2"), images(b, "s1t1"), 0.04)
     agree(images(a, "s0t3"), images(b, "s1t2"), 0.1)
     agree(images(c, "s2t1"), images(b, "s1t2"), 0.1)
+
+
+@pytest.mark.parametrize("name", TEXTURED)
+def test_textured_lamps_are_the_same_from_all_sides(name, tmp_path):
+    """Rationale: Mitsuba samples a lamp's texture and maps the point to the surface, which on a cube finds
+    one face of six and on cylinders has another density than stated (`path` itself loses light there).
+    Expected, tolerance, statistic: those of `check_strategies_agree`.
+    """
+    lamp = TEXTURED[name]() | {"emitter": {"type": "area", "radiance": texture() | {"to_uv": T().scale(3)}}}
+    if name == "smooth mesh":
+        lamp["filename"] = egg_with_coordinates(tmp_path)
+    check_strategies_agree(lamp)
 
 
 TURNED = T().translate([-1, 1.6, 0.5]).rotate([0.26726124, 0.53452248, 0.80178373], 130)
@@ -572,22 +577,12 @@ TURNED_SPHERES = {
 def test_rotated_spheres_shine_like_any(name):
     """Rationale: Mitsuba's `sample_position` rotates the points of a sphere but not their normals, so that
     light left a rotated sphere into it (turned by 180 degrees `ptracer` lacks 62 % of a floor's light, and
-    we lacked 42 %); where it samples a texture, it does not even rotate the points. Expected: (0,2) equals
-    (1,1), and (0,3), (1,2) and (2,1) equal each other, as above. Tolerance: the confidence interval, below
-    4 % and 10 % of the mean. Statistic: Welch over tiles, 10 seeds a side.
+    we lacked 42 %); where it samples a texture, it does not even rotate the points. Expected, tolerance,
+    statistic: those of `check_strategies_agree`.
     """
     radiance = texture() if name == "textured" else 5.0
     lamp = {"type": "sphere", "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": radiance}}
-    scene = mi.load_dict(room() | {"lamp": lamp | TURNED_SPHERES[name]})
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
-    a, b, c = (render(scene, bdpt, range(s, s + 10), 512) for s in (0, 50, 100))
-
-    def images(x, name):
-        return tiles(layer(x, bdpt, f"unweighted.{name}"))
-
-    agree(images(a, "s0t2"), images(b, "s1t1"), 0.04)
-    agree(images(a, "s0t3"), images(b, "s1t2"), 0.1)
-    agree(images(c, "s2t1"), images(b, "s1t2"), 0.1)
+    check_strategies_agree(lamp | TURNED_SPHERES[name])
 
 
 def test_a_rotated_sphere_measures_irradiance():

@@ -186,6 +186,9 @@ def test_until_an_error(capsys):
         (["--checkpoint", "1", "-P", "points=sampler"], "checkpoint with points=sampler"),
         (["--integrator", "path", "--checkpoint", "1"], "checkpoint is for the integrator bdpt"),
         (["--integrator", "path", "--scheduler", "x:1"], "scheduler is for the integrator bdpt"),
+        (["--time", "2", "-P", "timeout=3"], "-P timeout=3 together with --time 2 is not possible"),
+        (["--until-error", "1", "-P", "until_error=2"], "-P until_error=2 together with --until-error 1"),
+        (["--until-error", "1", "-P", "variance=false"], "-P variance=False together with --until-error 1"),
         (["--integrator", "path", "--until-error", "1"], "until_error is for the integrator bdpt"),
     ],
 )

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import page
 import pytest
-from analysis import Biased, NotJudged, Spread
+from analysis import Biased, NotJudged, Summary
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian's package chromium)")
@@ -159,8 +159,8 @@ def results(outcome, statistics):
 @pytest.mark.parametrize(
     ("outcome", "ratio", "words"),
     [
-        (Spread(24.0, 23, 25, 20.0, 30.0, 5), 24, "path takes 24x the time for the same error (20 to 30x)"),
-        (Spread(0.8, 0.7, 0.9, 0.5, 1.0, 5), 0.8, "path is ahead: its efficiency is 1.25x ours (1 to 2x)"),
+        (Summary(24.0, 23, 25, 20.0, 30.0, 5), 24, "path takes 24x the time for the same error (20 to 30x)"),
+        (Summary(0.8, 0.7, 0.9, 0.5, 1.0, 5), 0.8, "path is ahead: its efficiency is 1.25x ours (1 to 2x)"),
         (Biased({"path": "all energy is missing"}), np.inf, "fails the bias check here: all energy"),
         (Biased({"path": "2 % too much energy"}), np.nan, "path fails the bias check here: 2 % too"),
         (NotJudged("too noisy", 0.02), np.nan, "No figure: too noisy"),

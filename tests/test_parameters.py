@@ -881,16 +881,22 @@ def test_endpoints_that_are_refused(name, tmp_path):
         integrator().render(scene, spp=1)
 
 
+def triangle_lamp(positions, face, **attributes):
+    """A scene with an emitting mesh of one face and three vertices, and other attributes of these."""
+    mesh = mi.Mesh("triangle", 3, 1, has_vertex_normals="vertex_normals" in attributes, props=emitting())
+    params = mi.traverse(mesh)
+    for name, values in ({"vertex_positions": positions} | attributes).items():
+        params[name] = [float(value) for value in values]
+    params["faces"] = face
+    params.update()
+    return mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": mesh})
+
+
 def test_a_broken_emitting_mesh_is_refused():
     """Rationale: Mitsuba loads faces of vertices that do not exist, and reads beyond its memory. Expected:
     said in words where we read the mesh ourselves, which is where it emits and has normals of its own."""
-    mesh = mi.Mesh("bent", 3, 1, has_vertex_normals=True, props=emitting())
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = [0.0, 0, 0, 1, 0, 0, 0, 1, 0]
-    params["vertex_normals"] = [0.0, 0, 1, 0, 1, 0, 0, 0, 1]
-    params["faces"] = [0, 1, 3]
-    params.update()
-    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": mesh})
+    positions, normals = [0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 0, 1, 0, 1, 0, 0, 0, 1]
+    scene = triangle_lamp(positions, [0, 1, 3], vertex_normals=normals)
     with pytest.raises(ValueError, match="bdpt: the emitting mesh 'mesh' has a face with vertex 3 of 3"):
         integrator().render(scene, spp=1)
 
@@ -898,12 +904,7 @@ def test_a_broken_emitting_mesh_is_refused():
 def test_a_lamp_without_area_is_refused():
     """Rationale: its points have an infinite density, and every sample of them is NaN. Expected: said in
     words."""
-    mesh = mi.Mesh("flat", 3, 1, props=emitting())
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = [0.0, 0, 0, 0, 0, 0, 1, 0, 0]
-    params["faces"] = [0, 1, 2]
-    params.update()
-    scene = mi.load_dict({"type": "scene", "sensor": sensor(), "mesh": mesh})
+    scene = triangle_lamp([0, 0, 0, 0, 0, 0, 1, 0, 0], [0, 1, 2])
     with pytest.raises(ValueError, match="is on a shape without area"):
         integrator().render(scene, spp=1)
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import choice, kernel, mis, passes, pilot, rendering, sinks
 from mitsuba_bdpt.kernel import Batch, _Places
+from stress_cases.non_finite import Warned
 
 T = mi.ScalarTransform4f
 
@@ -396,6 +397,7 @@ def test_not_asked():
         integrator = bdpt(**parameters)
         integrator.render(target, spp=spp)
         assert integrator.statistics["decisions"] == [] and integrator.statistics["seconds"]["pilot"] == 0
+        assert integrator.statistics["no_pilot"]
 
 
 def test_light_that_only_connections_find():
@@ -512,6 +514,12 @@ def test_changed_decisions_change_the_points():
         ('""', "a list of decisions is needed"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"pass": n} for n in (3, 1)]), "[3, 1] must rise"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 0.5}]), "pass=0.5"),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": False}]), "pass=False"),
+        (
+            json.dumps([decision(ALONE, 1, "none").record() | {"light_paths": True}]),
+            "light_paths=True must be",
+        ),
+        (json.dumps([decision(ALONE, 1, "none").record() | {"cost": "1"}]), "cost='1' must be a number"),
         (json.dumps([decision(ALONE, 1, "none").record() | {"colour": 0}]), "colour is no part"),
         ("[{}]", "KeyError 'light_paths'"),
         ("[" * 100000, "RecursionError"),
@@ -541,6 +549,16 @@ def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     assert "time to the same error" not in integrator.explain(scene, spp=1024)
     integrator.render(scene, spp=1024)
     assert integrator.statistics["decisions"] == []
+    assert integrator.statistics["no_pilot"] == "it saw nothing, or no finite value"
+
+
+def test_decisions_that_never_begin_are_named():
+    """Expected: one warning names the passes that the render does not have; none where all begin."""
+    made = decision(ALONE, 1, "none")
+    for integrator, late in ((forced(made), ""), (forced(made, replace(made, first_pass=7)), "pass 7 on")):
+        with Warned() as warnings:
+            integrator.render(cornell(8), spp=2)
+        assert len(warnings) == bool(late) and all(late in text for text in warnings)
 
 
 def test_decisions_by_two_hands():

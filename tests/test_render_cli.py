@@ -191,7 +191,15 @@ def test_bdpt_reports_its_statistics(scene, capsys):
     statistics = json.loads(read("a.exr")[1]["bdptStatistics"])
     assert statistics["spp"] == sum(statistics["passes"]) == 4
     assert statistics["rays"]["camera"] == 4 * 6 * 4
-    assert "rays (camera 96" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "rays (camera 96" in out and out.count("\n") == 1
+    assert "no pilot: there is nothing to choose: chosen by hand" in out
+    for arguments, why in (
+        (["--spp", "4"], "no pilot: it says nothing about films of fewer than 64 pixels"),
+        (["-P", "light_paths=0"], "no pilot: there is nothing to choose: chosen by hand"),
+    ):
+        assert main(["render", str(scene), "-Dintegrator=bdpt", *arguments, "-o", "a.exr"]) == 0
+        assert why in capsys.readouterr().out
 
 
 def test_interrupted_rendering_writes_what_is_done(scene, capsys):

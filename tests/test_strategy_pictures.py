@@ -4,6 +4,7 @@ import matplotlib.image
 import numpy as np
 import OpenEXR
 import pytest
+import reference
 import strategies
 
 SCENE = """<scene version="3.0.0">
@@ -58,6 +59,10 @@ def test_panels_are_those_that_contribute():
 
 def test_scenes_by_name_or_file(tmp_path):
     """Expected: a name in scenes/, or a file; else an error that says so."""
-    assert strategies.scene_file("cornell_box").name == "cornell_box.xml"
-    with pytest.raises(ValueError, match="scene='nothing' is neither a file nor the name of one in scenes/"):
-        strategies.scene_file("nothing")
+    assert reference.find_scene("cornell_box").name == "cornell_box.xml"
+    file = tmp_path / "cornell_box"
+    file.write_text(SCENE)
+    assert reference.find_scene(str(file)) == file
+    for name in ("nothing", "scenes/nothing"):
+        with pytest.raises(ValueError, match=f"scene='{name}' is neither .* there are ajar_door, "):
+            reference.find_scene(name)

@@ -477,6 +477,22 @@ def test_the_command_line_of_references_tells_what_failed(folder, monkeypatch, c
             run("cornell_box", *wrong)
 
 
+def test_a_reference_is_of_the_depth_that_presets_ask_for(folder, monkeypatch):
+    """Rationale: the scene's file had a depth of its own, and a reference of the benchmark's scene could not
+    serve it. Expected: the default is the depth that the preset is read with, its own before that of all
+    scenes before the file's."""
+    depths = []
+    monkeypatch.setattr(reference, "_rendered", lambda job, depth: (depths.append(depth), True))
+    monkeypatch.setattr(reference, "write", lambda path, made: None)
+    for name in ("cornell_box", "pool"):
+        reference.make(reference.Job(name, 8))
+    subjects = {subject.name: subject for subject in read_preset(reference.BENCHMARK).subjects}
+    assert depths == [subjects[name].max_depth for name in ("cornell_box", "pool")]
+    assert depths[0] != reference.default_depth("cornell_box")
+    data = {"max_depth": 3, "scene": {"pool": {"max_depth": 4}}}
+    assert [reference.depth_in(data, name) for name in ("pool", "cornell_box")] == [4, 3]
+
+
 def test_a_failing_cell_does_not_cost_the_others(folder, capsys, monkeypatch):
     """Expected: the cells of a plugin that does not exist fail, are named, and the others are there."""
     reference.make(job(3))

@@ -145,7 +145,7 @@ def read_decisions(text: str) -> tuple[Decision, ...]:
 
 
 def _read_decision(entry: dict) -> Decision:
-    light_paths, connections = float(entry["light_paths"]), entry["connections"]
+    light_paths, connections = _number(entry, "light_paths"), entry["connections"]
     if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
         raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
     if not light_paths and connections != "none":
@@ -160,19 +160,27 @@ def _read_decision(entry: dict) -> Decision:
         "mean",
     }:
         raise ValueError(f"{sorted(unknown)[0]} is no part of a decision")
-    if not isinstance(entry["pass"], int):
+    if isinstance(entry["pass"], bool) or not isinstance(entry["pass"], int):
         raise TypeError(f"pass={entry['pass']!r}")
     numbers = {
         "first_pass": entry["pass"],
-        "splat_coefficient": float(entry["coefficients"]["t<=1"]),
-        "direct_coefficient": float(entry["coefficients"]["s=1"]),
-        **{name: float(entry[name]) for name in ("cost", "variance", "mean")},
+        "splat_coefficient": _number(entry["coefficients"], "t<=1"),
+        "direct_coefficient": _number(entry["coefficients"], "s=1"),
+        **{name: _number(entry, name) for name in ("cost", "variance", "mean")},
     }
     for name, value in numbers.items():
         least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
         if not least <= value <= MOST:
             raise ValueError(f"{name}={value!r}")
     return Decision(light_paths=light_paths, connections=connections, **numbers)
+
+
+def _number(entry: dict, name: str) -> float:
+    """A number of JSON: neither a boolean, which Python takes for one, nor text that holds one."""
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}={value!r} must be a number")
+    return float(value)
 
 
 @dataclass(frozen=True)
@@ -252,15 +260,14 @@ def begun(full: Plan, settings: Settings, pixels: int) -> Plan:
 
 
 def is_open(full: Plan, settings: Settings) -> bool:
-    """Whether there is something to choose: nothing is given by hand, and light subpaths are possible.
-    (Strategy images want all strategies.)"""
-    return (
-        full.light
-        and settings.skip == "auto"
-        and settings.light_paths == settings.connections == "auto"
-        and settings.decisions is None
-        and not settings.strategy_images
-    )
+    """Whether there is something to choose: nothing is given by hand, and light subpaths are possible."""
+    return full.light and not is_by_hand(settings)
+
+
+def is_by_hand(settings: Settings) -> bool:
+    """Whether parameters say what is done. (Strategy images want all strategies.)"""
+    auto = settings.skip == settings.light_paths == settings.connections == "auto"
+    return not auto or settings.decisions is not None or settings.strategy_images
 
 
 def by_scene(world, full: Plan, settings: Settings, samples: int) -> Decision | None:

@@ -84,6 +84,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     started, merged, interrupted = time.perf_counter(), Merged(), False
     with connected(options.scheduler) as client:
         job = _job(scene, integrator, options, spp)
+        no_pilot = integrator.statistics.get("no_pilot", "")  # the parts know the decisions alone
         count = options.parts or PARTS_PER_WORKER * worker_count(client)
         parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
         try:
@@ -99,7 +100,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     if merged.snapshot is None:
         return {"passes": []}, interrupted
     integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
-    return integrator.statistics, interrupted
+    return integrator.statistics | {"no_pilot": no_pilot}, interrupted
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:

@@ -104,6 +104,9 @@ hold such numbers. One before the render names BSDFs that reflect more light tha
 
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
+``statistics["decisions"]`` is what the pilot chose, ``statistics["no_pilot"]`` why none was asked, or none
+decided: an empty text where one did, and where ``decisions`` were given.
+
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
 
@@ -163,16 +166,19 @@ def _make_class():
                 self.statistics = render.statistics()
                 _warn_of_what_was_lost(self.statistics, scene)
             _log(self.statistics)
+            _warn_of_decisions_not_begun(self.settings.decisions, len(self.statistics["passes"]))
             return _result(sensor.film(), develop, evaluate)
 
         def decide(self, scene, sensor=0, seed=0, spp=0):
             """What the pilot of such a render chooses, as in ``statistics["decisions"]``: an empty list
-            without a pilot. The parameter ``decisions`` of other renders of the scene takes it as JSON."""
+            without a pilot, about which ``statistics["no_pilot"]`` says why. The parameter ``decisions`` of
+            other renders of the scene takes it as JSON."""
             check_made_for(self, scene)
             sensor = _resolve(scene, sensor)
             render = Render(scene, sensor, self.settings, seed, _samples(sensor, spp, self.settings))
             render.decide()
-            _warn_of_what_was_lost(render.statistics(), scene)
+            self.statistics = render.statistics()
+            _warn_of_what_was_lost(self.statistics, scene)
             return [decision.record() for decision in render.decisions]
 
         def assemble(self, snapshot, scene, sensor=0, develop=True, evaluate=True):
@@ -305,6 +311,8 @@ def _log(statistics: dict):
         f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
         f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
     )
+    if statistics["no_pilot"]:
+        mi.Log(mi.LogLevel.Info, f"bdpt: no pilot: {statistics['no_pilot']}")
     for made in statistics["decisions"]:
         mi.Log(mi.LogLevel.Info, f"bdpt: decided: {json.dumps(made)}")
     for left_out in statistics["skipped"]:
@@ -325,6 +333,18 @@ def _warn_of_brighteners(scene):
             mi.LogLevel.Warn,
             f"bdpt: {'; '.join(found[:NAMED])}{more}: more light returns than arrives, and where it cannot "
             "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
+        )
+
+
+def _warn_of_decisions_not_begun(decisions, passes: int):
+    """Say which of the ``decisions`` that were given are for a pass that the render of so many did not
+    have."""
+    late = [decision.first_pass for decision in decisions or () if decision.first_pass >= passes]
+    if late:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"bdpt: decisions from pass {', '.join(map(str, late))} on never began: the render had passes "
+            f"0 to {passes - 1}",
         )
 
 

@@ -31,6 +31,9 @@ UNLIMITED_SPP = 1 << 16
 PASS_SPP = 16
 """Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
 
+SETS = {"time": {"timeout"}, "until_error": {"until_error", "variance"}}
+"""The integrator's parameters that an option sets, see `loading.load`."""
+
 MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
 INTERRUPTED = 130
 """The exit status of a process that SIGINT has ended."""
@@ -111,6 +114,15 @@ def check_options(options: Namespace, output: Path) -> None:
                 f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
                 "leave out one or the other."
             )
+    properties = dict(options.properties)
+    for option, names in SETS.items():
+        for name in names & set(properties):
+            value = getattr(options, option)
+            if value is not None and not (name == "variance" and properties[name] is True):
+                raise ValueError(
+                    f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is "
+                    f"not possible: the option sets {name} itself; leave out one or the other."
+                )
     checkpoints.check(options, output)
 
 
@@ -325,6 +337,8 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: fl
         error = outcome.statistics["error"]
         missed = 0 < until_error < error
         parts.append(f"relMSE about {error:.2g}" + (f", not the {until_error:g} asked for" if missed else ""))
+    if outcome.statistics.get("no_pilot"):
+        parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
     if outcome.statistics.get("non_finite"):
         parts.append(f"{outcome.statistics['non_finite']} values were not finite and count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))

@@ -40,6 +40,9 @@ FIRST_REPEAT = 32
 # Share of a render after which none is asked any more: what is left has to pay for it.
 LATEST_REPEAT = 1 / 4
 
+# Why a pilot that was asked decides nothing.
+SAW_NOTHING = "it saw nothing, or no finite value"
+
 # What strategy images may take, in bytes, before the render is refused.
 STRATEGY_MEMORY = 2 << 30
 
@@ -94,6 +97,7 @@ class Render:
         self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
         self._left_out, self._small_first, self._error, self._earlier = [], None, None, 0.0
+        self._no_pilot = ""  # why none was asked, or decided nothing
         # Samples per pixel, and seconds of compiling and pilots, of the render that this one goes on from.
         self._resumed_at, self._resumed_idle = 0, 0.0
 
@@ -101,6 +105,8 @@ class Render:
         """Adopt what the scene alone or a pilot says, if there is a choice and the render is long enough to
         pay for a pilot; returns all candidates of the pilot, the best first."""
         settled, decision = self._settled()
+        if not self.accumulator.passes and self.settings.decisions is None:
+            self._no_pilot = settled
         if decision and not self.accumulator.passes:
             self._adopt(decision, choice.BY_SCENE)
         if settled:
@@ -124,6 +130,7 @@ class Render:
             best, number = table[0], len(self.accumulator.passes)
             decision = best.candidate.decided(number, best.cost, best.variance, self._moments.mean)
             self._adopt(decision, choice.left_out(table))
+        self._no_pilot = "" if self.decisions else SAW_NOTHING
         self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
         return table
 
@@ -133,13 +140,14 @@ class Render:
 
     def why_no_pilot(self) -> str:
         """Why there is no table of a pilot's, as a sentence."""
-        return f"no pilot: {self._settled()[0] or 'it saw nothing, or no finite value'}"
+        return f"no pilot: {self._settled()[0] or SAW_NOTHING}"
 
     def _settled(self) -> tuple[str, choice.Decision | None]:
         """Why no pilot is asked about the rest of the render, empty if one is; and the decision, if there is
         one."""
         if not choice.is_open(self._full, self.settings):
-            why = "chosen by hand" if self._full.light else "light subpaths cannot add anything"
+            by_hand = choice.is_by_hand(self.settings)
+            why = "chosen by hand" if by_hand else "light subpaths cannot add anything"
             return f"there is nothing to choose: {why}", None
         if self._pixels < choice.FEW_PIXELS:
             return f"it says nothing about films of fewer than {choice.FEW_PIXELS} pixels", None
@@ -362,6 +370,7 @@ class Render:
         progress = {
             "whole": True,
             "decisions": [decision.record() for decision in self.decisions],
+            "no_pilot": self._no_pilot,
             "left_out": list(self._left_out),
             "moments": moments,
             "pilots": [self._pilots, self._next_pilot],
@@ -401,7 +410,7 @@ class Render:
             parts = {name: arrays[f"moments.{name}"] for name in ("base", "light", "draw")}
             self._moments = pilot.Moments(**parts, **progress["moments"])
         self._pilots, self._next_pilot = progress["pilots"]
-        self._small_first = progress["small_first"]
+        self._small_first, self._no_pilot = progress["small_first"], progress["no_pilot"]
         self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))
         self._counts = dict(progress["counts"])
         self.compiled, self.cached = progress["compiled"], progress["cached"]
@@ -431,6 +440,7 @@ class Render:
             "connections": connections,
             "skipped": list(self.plan.skipped),
             "decisions": [d.record() for d in self.decisions],
+            "no_pilot": self._no_pilot,
             "passes": list(self.accumulator.passes),
             "non_finite": self._counts["non_finite"],
             "non_finite_in_pilot": self.lost_by_pilot(),

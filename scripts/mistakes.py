@@ -1,0 +1,70 @@
+"""What a script answers to a user's mistake: one line, and the exit status 2 (as argparse's), no traceback.
+
+Taken for mistakes is what names something that the user gave:
+
+* ``argparse.ArgumentTypeError``: words of the command line that are read after the rest of it.
+* ``OSError``: a file or a folder that is missing, or cannot be written.
+* ``ValueError``, ``TypeError`` and ``NotImplementedError``, but only if a ``raise`` of this project raised
+  them: its checks say in words what is wrong with which name, path or parameter. The same types out of NumPy,
+  or out of an expression of a script, are bugs.
+* ``RuntimeError`` of Mitsuba's parser: about a scene's file, an unknown plugin, or its parameters; where it
+  holds the traceback of a plugin in Python, only if ``bdpt`` refused a parameter in words.
+
+All else is a bug, whose traceback must be seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba_bdpt
+from mitsuba_bdpt.files import check_writable
+from mitsuba_bdpt.render import message
+
+STATUS = 2
+SOURCES = Path(__file__).resolve().parent, Path(mitsuba_bdpt.__file__).resolve().parent
+
+IN_WORDS = re.compile(r"(ValueError|TypeError|NotImplementedError): bdpt: ")
+
+
+def answered(main: Callable[[], int | None]) -> int | None:
+    """The exit status of ``main``; that of a mistake if there was one, which is printed."""
+    try:
+        return main()
+    except Exception as error:
+        if not is_mistake(error):
+            raise
+        print(f"error: {' '.join(message(error).split())}", file=sys.stderr)
+        return STATUS
+
+
+def is_mistake(error: Exception) -> bool:
+    """Whether the user is to mend it, see above."""
+    if isinstance(error, OSError | argparse.ArgumentTypeError):
+        return True
+    if isinstance(error, NotImplementedError | ValueError | TypeError):  # the first is a RuntimeError too
+        return _is_raised_here(error)
+    if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
+        return False
+    _, traceback_, rest = str(error).partition("Traceback (most recent call last):")
+    return not traceback_ or bool(IN_WORDS.match(rest.strip().splitlines()[-1]))
+
+
+def _is_raised_here(error: Exception) -> bool:
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    source = Path(last.filename).resolve()
+    return any(source.is_relative_to(folder) for folder in SOURCES) and last.line.startswith("raise")
+
+
+def check_output(path: Path, suffix: str) -> None:
+    """Refuse, before anything is rendered, an output of another ``suffix`` or one that cannot be written;
+    its folder is made."""
+    if path.suffix.lower() != suffix:
+        raise ValueError(f"output={str(path)!r} must end in {suffix}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)

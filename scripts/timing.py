@@ -1,0 +1,21 @@
+"""The one stopwatch of the scripts: seconds of a whole render."""
+
+from __future__ import annotations
+
+import time
+
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import numpy as np
+
+import mitsuba as mi  # isort: skip
+import drjit as dr  # isort: skip
+
+
+def timed(scene, integrator, spp: int, seed: int) -> tuple[np.ndarray, float]:
+    """Image (height, width, 3) and wall seconds of a render, of nothing that was queued before it."""
+    dr.sync_thread()
+    started = time.perf_counter()
+    image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
+    dr.eval(image)
+    dr.sync_thread()
+    return np.array(image, dtype=np.float64)[..., :3], time.perf_counter() - started
