@@ -9,17 +9,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from metrics import Sample, sidak, tile_means, welch
+from metrics import Sample
 
 import mitsuba as mi  # isort: skip
 
+from .agreement import family, greens
 from .case import Case, Outcome
 
 SECTION = "Geometry"
-SIZE, TILES = 16, 4
-
-# Level of all t-tests of a case together, after Sidak's correction. Seeds are fixed.
-LEVEL = 1e-3
+SIZE = 16
 
 SIDES = {"default": {}, "skip=none": {"skip": "none"}}
 
@@ -76,29 +74,8 @@ def _scene(**parts):
 
 
 def _tiles(scene, parameters, spp, seeds):
-    """Tile means, (seeds, tiles), and samples without finite value."""
-    integrator = mi.load_dict({"type": "bdpt"} | parameters)
-    found, broken = [], 0
-    for seed in seeds:
-        image = np.array(integrator.render(scene, spp=spp, seed=seed))
-        found.append(tile_means(image, TILES)[:, 1])
-        broken += integrator.statistics["non_finite"] if hasattr(integrator, "statistics") else 0
-    return np.stack(found), broken
-
-
-def _judge(pairs, most_error) -> Outcome:
-    """t-tests of ``pairs`` of `Sample`s, and whether the means' errors are below ``most_error``."""
-    p, gap, error = [], 0.0, 0.0
-    for a, b in pairs:
-        found = welch(a, b)
-        p += found.p.tolist()
-        scale = max(float(np.abs(b.mean).mean()), 1e-300)
-        gap = max(gap, abs(float((a.mean - b.mean).mean())) / scale)
-        error = max(error, float(found.error.mean()) / scale)
-    family = sidak(p)
-    text = f"p = {family:.2g} over {len(p)} comparisons, means {100 * gap:.2g} % apart, "
-    text += f"standard error {100 * error:.2g} %"
-    return Outcome(family >= LEVEL and error <= most_error, text)
+    """As `greens`, by default of this package's integrator."""
+    return greens(scene, {"type": "bdpt"} | parameters, seeds, spp)
 
 
 def _whole(values):
@@ -115,7 +92,7 @@ def _against(makes, parameters, spp=256, most_error=0.02) -> Outcome:
             b = seen or Sample.of(_tiles(other, side | parameters, spp, range(10, 16))[0])
             pairs.append((Sample.of(a), b))
             broken += bad
-    outcome = _judge(pairs, most_error)
+    outcome = family(pairs, most_error)
     return Outcome(outcome.ok and not broken, f"{outcome.happened}, {broken} samples not finite")
 
 
@@ -127,7 +104,7 @@ def _known(makes, parameters, spp=256, most_error=0.01) -> Outcome:
             a, bad = _tiles(scene, side | parameters, spp, range(8))
             pairs.append((_whole(a), Sample.known([expected])))
             broken += bad
-    outcome = _judge(pairs, most_error)
+    outcome = family(pairs, most_error)
     return Outcome(outcome.ok and not broken, f"{outcome.happened}, {broken} samples not finite")
 
 

@@ -8,20 +8,18 @@ from functools import partial
 
 import numpy as np
 import reference
-from metrics import Sample, sidak, tile_means, welch
+from metrics import Sample
 
 import mitsuba as mi  # isort: skip
 
+from .agreement import deviation, family, greens
 from .case import Case, Outcome
 
 SECTION = "Scale and place"
-DEPTH, SIZE, TILES = 6, 32, 4
+DEPTH, SIZE = 6, 32
 
 # What every comparison is made with: the defaults (with so many samples that a pilot decides) and everything.
 SIDES = {"default": ({}, 128), "skip=none": ({"skip": "none"}, 16)}
-
-# Level of all t-tests of a case together, after Sidak's correction. Seeds are fixed.
-LEVEL = 1e-3
 
 
 # -- placing a scene of scenes/ ---------------------------------------------------------------
@@ -237,44 +235,35 @@ def _exact(subject: Subject, places: dict) -> Outcome:
     return Outcome(bool(ok), "; ".join([text, *words] if words else [text, "decisions the same"]))
 
 
-def _tiles(scene, parameters, spp, seeds):
-    """Tile means of the second colour, (seeds, tiles)."""
-    integrator = mi.load_dict({"max_depth": DEPTH} | parameters)
-    images = [mi.render(scene, integrator=integrator, spp=spp, seed=seed) for seed in seeds]
-    return np.stack([tile_means(np.array(image), TILES)[:, 1] for image in images])
+def _tiles(scene, parameters, spp, seeds) -> Sample:
+    """As `greens`, of the first bounces."""
+    return Sample.of(greens(scene, {"max_depth": DEPTH} | parameters, seeds, spp)[0])
 
 
 def _alike(subject: Subject, places: dict) -> Outcome:
     """Tile means of renders with other seeds agree."""
-    p, gap, error = [], 0.0, 0.0
+    pairs = []
     for parameters, spp in SIDES.values():
         parameters = {"type": "bdpt"} | parameters
         spp *= subject.samples
         plain = _tiles(subject.load(), parameters, spp, range(5))
         for number, place in enumerate(places.values(), 1):
-            other = _tiles(subject.load(place), parameters, spp, range(10 * number, 10 * number + 5))
-            found = welch(Sample.of(plain), Sample.of(other))
-            p += found.p.tolist()
-            gap = max(gap, abs(float(other.mean() / plain.mean()) - 1))
-            error = max(error, float(found.error.mean() / plain.mean()))
-    family = sidak(p)
-    text = f"p = {family:.2g} over {len(p)} comparisons, means {100 * gap:.2g} % apart at most, "
-    text += f"standard error of a tile {100 * error:.2g} %"
-    return Outcome(family >= LEVEL and error < 0.1, text)
+            pairs.append(
+                (_tiles(subject.load(place), parameters, spp, range(10 * number, 10 * number + 5)), plain)
+            )
+    return family(pairs, 0.1)
 
 
 AWAY = Place(shift=(7000.0, -5000.0, 5000.0))  # 1e4 units
 
 
 def _deviation(subject: Subject, parameters, spp) -> float:
-    """Root mean square of what the tiles of the moved scene are off, over the image's mean, less noise."""
+    """How far the tiles of the moved scene are off."""
     plain, moved = (
-        Sample.of(_tiles(subject.load(place), parameters, spp * subject.samples, seeds))
+        _tiles(subject.load(place), parameters, spp * subject.samples, seeds)
         for place, seeds in ((Place(), range(5)), (AWAY, range(10, 15)))
     )
-    difference = welch(plain, moved)
-    square = (difference.value**2).mean() - (difference.error**2).mean()
-    return float(np.sqrt(max(square, 0)) / plain.mean.mean())
+    return deviation(plain, moved)
 
 
 def _moved(subject: Subject) -> Outcome:
