@@ -7,7 +7,7 @@ same seed, same random numbers, so that the images are the same up to the order 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import drjit as dr
@@ -152,9 +152,13 @@ def poison_lamp():
     return PoisonLamp
 
 
-@cache
 def register():
-    """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter)."""
+    """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter) for the variant in use."""
+    _register(mi.variant())
+
+
+@cache
+def _register(variant: str):
     mi.register_bsdf("poison", poison())
     mi.register_emitter("poison_lamp", poison_lamp())
 
@@ -163,10 +167,16 @@ def texture(bad, base=0.6):
     """4 x 4 texels of which three are ``bad``, a number or one per colour; no texel spreads into others."""
     data = np.full((4, 4, 3), base, dtype=np.float32)
     data[0, 1] = data[2, 2] = data[3, 0] = bad
-    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
+    # Raw colours are no spectra.
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": not mi.is_spectral, "filter_type": "nearest"}
 
 
 BAD_TEXELS, TEXELS = 3, 16
+
+
+def brightness(value):
+    """Of a lamp. (A spectral variant scales a number by daylight, and refuses such a spectrum that is 0.)"""
+    return {"type": "uniform", "value": value} if mi.is_spectral else value
 
 
 def to_world():
@@ -335,7 +345,7 @@ def mitsubas_lamps():
     """The same of Mitsuba's emitters."""
 
     def point(value):
-        return room(other={"type": "point", "intensity": value})
+        return room(other={"type": "point", "intensity": brightness(value)})
 
     def glowing(value):
         at = mi.ScalarTransform4f().translate([-0.4, 0.5, -0.3]).rotate([1, 0, 0], 60).scale(0.2)
@@ -345,7 +355,7 @@ def mitsubas_lamps():
         return room(other=other, lamp={"type": "point", "position": [0.3, 0.7, 0], "intensity": 0.5})
 
     def sky(value):
-        return room(wall=None, sky={"type": "constant", "radiance": value})
+        return room(wall=None, sky={"type": "constant", "radiance": brightness(value)})
 
     def sun(value):
         return room(wall=None, sun={"type": "directional", "direction": [0, -1, -1], "irradiance": value})
@@ -410,7 +420,11 @@ def glowing_plate(value):
 def lit(value):
     """A closed white sphere with nothing in it but a point light."""
     wall = {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
-    return room(wall=wall, plate=None, lamp={"type": "point", "position": [0.2, 0, 0.1], "intensity": value})
+    return room(
+        wall=wall,
+        plate=None,
+        lamp={"type": "point", "position": [0.2, 0, 0.1], "intensity": brightness(value)},
+    )
 
 
 @dataclass(frozen=True)
@@ -573,6 +587,47 @@ def _pilot() -> Outcome:
     )
 
 
+def spectrally_painted(value):
+    """`reflecting` under a spectral variant: the coefficients of its texels set after loading, since Mitsuba
+    fits a spectrum to NaN as well; where ``value`` is 0, to those of black."""
+    scene = reflecting(0.5)
+    parameters = mi.traverse(scene)
+    (name,) = [name for name, _ in parameters if name.endswith("reflectance.data")]
+    data = np.array(parameters[name])
+    painted_texels = np.array(texture(0.0)["bitmap"])[..., 0] == 0
+    data[painted_texels] = value if value != 0 else (0, 0, -INF)
+    parameters[name] = mi.TensorXf(data)
+    parameters.update()
+    return scene
+
+
+def _spectral() -> Outcome:
+    """Under a spectral variant, where a poisoned value has as many wavelengths as a path."""
+    before = mi.variant()
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        lamps = {said: (make, bad) for said, make, bad in (*own_lamps(), *mitsubas_lamps())}
+        outcomes = {}
+        for said in SPECTRAL_LAMPS:
+            make, bad = lamps[said]
+            outcomes[said] = compared(make, bad, EVERYTHING | {"hide_emitters": True})
+        outcomes["half a plate's BSDF of value NaN"] = compared(_poisoned("eval"), NAN, EVERYTHING)
+        texels = replace(COUNTED["reflectance"], make=spectrally_painted)
+        for counted in (texels, COUNTED["emission"]):
+            outcomes[f"{counted.tried}, {counted.count}"] = counted.run()
+        return together(outcomes)
+    finally:
+        mi.set_variant(before)
+
+
+SPECTRAL_LAMPS = (
+    "a user's environment: half its radiance NaN",
+    "a user's environment: half its densities infinite",
+    "point light of intensity NaN",
+    "sky of radiance NaN",
+)
+
+
 def _interrupted() -> Outcome:
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 2, "spp_per_pass": 4})
 
@@ -590,28 +645,36 @@ def _interrupted() -> Outcome:
     return Outcome(found > 0 and len(warnings) == 1, f"{found} counted, {len(warnings)} warning")
 
 
-def _lost_whole(lamp: dict, parameter: str) -> Outcome:
-    scene = room(wall=None, lamp=None, other=lamp)
+def _lost_whole(lamp: Callable, parameter: str) -> Outcome:
+    """Whether nothing is left of the only light, ``lamp(NAN)``, and ``parameter`` is named; with a number in
+    its place there is light, and nothing to say."""
     texts, ok = [], True
-    for parameters in (EVERYTHING, DEFAULTS):
-        image, statistics, warnings = rendered(scene, parameters, 64)
+    scene, sound = (room(wall=None, lamp=None, other=lamp(value)) for value in (NAN, 1.0))
+    for parameters, spp in WAYS.values():
+        image, statistics, warnings = rendered(scene, parameters, spp)
         found = statistics["non_finite"]
-        ok = ok and np.isfinite(image).all() and found > 0 and len(warnings) == 1 and parameter in warnings[0]
-        texts.append(f"mean {image.mean():.2g}, {found} counted")
+        ok = ok and (image == 0).all() and found > 0 and len(warnings) == 1 and parameter in warnings[0]
+        light, of_sound, quiet = rendered(sound, parameters, spp)
+        ok = ok and light.mean() > LIT and of_sound["non_finite"] == 0 and not quiet
+        texts.append(f"mean {image.mean():.2g}, without NaN {light.mean():.2g}; {found} counted")
     path = np.array(mi.load_dict({"type": "path", "max_depth": 4}).render(scene, spp=64))
     return Outcome(bool(ok), f"{'; '.join(texts)}; `path`: mean {np.nanmean(path):.2g}, says nothing")
+
+
+# Mean of an image that is lit.
+LIT = 0.01
 
 
 def distribution_cases():
     """Textures from which Mitsuba makes a distribution, which is NaN everywhere if one number is."""
 
-    def sky():
+    def sky(value):
         data = np.full((8, 16, 3), 1.0, dtype=np.float32)
-        data[0, 0] = NAN
+        data[0, 0] = value
         return {"type": "envmap", "bitmap": mi.Bitmap(data)}
 
-    def projector():
-        return {"type": "projector", "irradiance": texture(NAN), "fov": 50, "to_world": down()}
+    def projector(value):
+        return {"type": "projector", "irradiance": texture(value), "fov": 50, "to_world": down()}
 
     def lamp(value):
         at = mi.ScalarTransform4f().translate([-0.2, 0.6, -0.3]).rotate([1, 0, 0], 60).scale(0.3)
@@ -624,15 +687,15 @@ def distribution_cases():
         )
 
     def of_area(parameters):
-        spp, seeds = 256, range(8)
+        spp, seeds = PILOTED, range(8)
         ours = tiles(lamp(NAN), {"type": "bdpt", **parameters}, seeds, spp)
         return against(ours, tiles(lamp(0.0), {"type": "bdpt", **parameters}, seeds, spp), 0.02, "twin")
 
     def lost():
         return together(
             {
-                "`envmap`": _lost_whole(sky(), "other.data"),
-                "`projector`": _lost_whole(projector(), "irradiance.data"),
+                "`envmap`": _lost_whole(sky, "other.data"),
+                "`projector`": _lost_whole(projector, "irradiance.data"),
             }
         )
 
@@ -641,7 +704,8 @@ def distribution_cases():
             "distribution-nan",
             SECTION,
             "texels of an `envmap`, or of a `projector`, NaN",
-            "all light that takes Mitsuba's distribution is lost, and said so: finite, counted, named",
+            "all light that takes Mitsuba's distribution is lost, and said so: black, counted, named; with a "
+            "number in their place there is light, and nothing to say",
             lost,
         ),
         Case(
@@ -650,7 +714,7 @@ def distribution_cases():
             "texels of an area light NaN; all strategies, and defaults",
             "only these texels are lost: the image of its twin, in which they are 0; Welch's test over tiles "
             "(level 1e-3, 8 seeds each), which sees errors of 2 %",
-            lambda: together({SAID[how]: of_area(parameters) for how, parameters in WAYS.items()}),
+            lambda: together({SAID[how]: of_area(parameters) for how, (parameters, _) in WAYS.items()}),
         ),
     ]
 
@@ -683,9 +747,9 @@ def mesh(data, bad):
 
 def _mesh(data, bad) -> Outcome:
     scene = room(plate=mesh(data, bad))
-    spp, seeds = 128, range(8)
-    ours = tiles(scene, {"type": "bdpt", "max_depth": 4}, seeds, spp)
-    theirs = tiles(scene, {"type": "path", "max_depth": 4}, seeds, 4 * spp)
+    seeds = range(8)
+    ours = tiles(scene, {"type": "bdpt", "max_depth": 4}, seeds, PILOTED)
+    theirs = tiles(scene, {"type": "path", "max_depth": 4}, seeds, PILOTED)
     outcome = against(ours, theirs, 0.02)
     _, statistics, warnings = rendered(scene, DEFAULTS, 16)
     found, expected = statistics["non_finite"], data == "vertex_normals"
@@ -723,6 +787,13 @@ CASES = (
         "a pilot meets a BSDF of value NaN",
         "counted apart (`non_finite_in_pilot`), in the warning and in `explain`; the decision is its twin's",
         _pilot,
+    ),
+    Case(
+        "spectral-nan",
+        SECTION,
+        "`llvm_ad_spectral`: lamps, a texture and a BSDF that are NaN, an infinite density; all strategies",
+        TWIN + "; the numbers that follow from the scene, exactly",
+        _spectral,
     ),
     Case(
         "interrupted-nan",
