@@ -41,7 +41,6 @@ from pathlib import Path
 import probes
 import reference
 from metrics import TILES
-from reference import benchmark_depth  # noqa: F401 (stress_cases take it from here)
 
 MATCHES = ("seconds", "spp")
 

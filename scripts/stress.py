@@ -5,8 +5,8 @@
     python scripts/stress.py --list      # names of all
 
 Each case runs in a process of its own, so that a crash or a hang is an outcome too. The table is written
-between the lines `<!-- stress -->` and `<!-- end -->` of docs/stress.md. Exit status 1 if a case did not go
-as expected.
+between the lines `<!-- report: stress -->` and `<!-- end -->` of docs/stress.md. Exit status 1 if a case did
+not go as expected.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import reference
 from mitsuba_bdpt.__main__ import number
-from mitsuba_bdpt.files import replacing
-from report import table
+from report import replace_part, table, write_text
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
 
@@ -32,8 +31,6 @@ PAGE = reference.ROOT / "docs" / "stress.md"
 
 # Seconds after which a case counts as hanging: several times what the longest takes on two busy cores.
 LIMIT = 600
-
-BEGIN, END = "<!-- stress -->\n", "<!-- end -->"
 
 
 def here(name: str) -> Outcome:
@@ -72,18 +69,13 @@ def page(record: list[dict]) -> str:
             if row["section"] == section
         ]
         texts.append(f"### {section}\n\n" + table(["tried", "expected", "what happened", "case"], rows))
-    return "\n\n".join(texts) + "\n\n"
+    return "\n\n".join(texts)
 
 
 def write(record: list[dict]) -> None:
     """The record as data, and as tables in the page."""
-    with replacing(RECORD) as temporary:
-        temporary.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
-    text = PAGE.read_text()
-    before, rest = text.split(BEGIN)
-    after = rest[rest.index(END) :]
-    with replacing(PAGE) as temporary:
-        temporary.write_text(before + BEGIN + "\n" + page(record) + after)
+    write_text(RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    write_text(PAGE, replace_part(PAGE.read_text(), "stress", page(record)))
 
 
 def tried(case: Case) -> dict:

@@ -54,3 +54,18 @@ def test_what_reflects_more_than_it_receives_is_named(bsdf, said):
     assert np.isfinite(image).all()
     assert len(warnings) == bool(said)
     assert all(said in text for text in warnings)
+
+
+def test_coefficients_of_spectra_are_no_reflectances():
+    """Rationale: a spectral variant keeps three coefficients for each colour of a texture, above 1 for one of
+    more than 0.85. Expected: nothing is said of it; a number above 1 is still named."""
+    before = mi.variant()
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        bright = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.95, np.float32))}
+        loud = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 1.5, np.float32)), "raw": True}
+        bsdfs = [mi.load_dict({"type": "diffuse", "reflectance": texture}) for texture in (bright, loud)]
+        assert suspects.brighteners(bsdfs[:1]) == []
+        assert "reflectance up to 1.5" in suspects.brighteners(bsdfs[1:])[0]
+    finally:
+        mi.set_variant(before)

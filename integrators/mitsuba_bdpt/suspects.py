@@ -46,8 +46,8 @@ def _largest(texture) -> float:
     except RuntimeError:  # not implemented, for bitmaps among others
         pass
     data = own_parameters(texture).get("data")
-    if data is None:
-        return 0.0
+    if data is None or (mi.is_spectral and data.shape[-1] == 3):
+        return 0.0  # of colours these are coefficients of spectra, which are 1 at most
     step = max(-(-dr.width(data) // _QUICKLY_READ), 1)
     return float(np.nanmax(np.array(data.array[::step], dtype=np.float32), initial=0))
 

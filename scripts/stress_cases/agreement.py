@@ -1,4 +1,8 @@
-"""Whether renders agree with others, or with a known value, by tests on the means of tiles over seeds."""
+"""Whether renders agree with others, or with a known value, by tests on the means of tiles over seeds.
+
+`judged` asks that a difference of a given size would be seen in the image's mean, `family` that the tiles'
+standard error is small over many pairs of scenes.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +13,37 @@ import mitsuba as mi  # isort: skip
 
 from .case import Outcome
 
-# Chance that a right program fails one case, had the seeds not been fixed.
+# Chance that a right program fails one case, had the seeds not been fixed: the level of all t-tests of a
+# case together, after Sidak's correction.
 LEVEL = 1e-3
+
+TILES = 4  # along each side of the image
+
+
+def images(scene, integrator: dict, seeds, spp: int):
+    """One image per seed, and how many of its samples had no finite value (0 where it is not counted)."""
+    made = mi.load_dict(integrator)
+    for seed in seeds:
+        image = np.array(made.render(scene, seed=seed, spp=spp), dtype=np.float64)
+        yield image, getattr(made, "statistics", {}).get("non_finite", 0)
 
 
 def tiles(scene, integrator: dict, seeds, spp: int) -> np.ndarray:
-    """Means of 4 x 4 tiles and of the image in the last column, one row per seed."""
-    made = mi.load_dict(integrator)
+    """Means of 4 x 4 tiles and of the image in the last column, over the colours, one row per seed."""
     rows = []
-    for seed in seeds:
-        image = np.array(made.render(scene, seed=seed, spp=spp), dtype=np.float64)[..., :3]
-        rows.append([*tile_means(image, 4).mean(1), image.mean()])
+    for image, _ in images(scene, integrator, seeds, spp):
+        image = image[..., :3]
+        rows.append([*tile_means(image, TILES).mean(1), image.mean()])
     return np.array(rows)
+
+
+def greens(scene, integrator: dict, seeds, spp: int) -> tuple[np.ndarray, int]:
+    """Means of 4 x 4 tiles of the second colour, one row per seed, and samples without finite value."""
+    rows, broken = [], 0
+    for image, bad in images(scene, integrator, seeds, spp):
+        rows.append(tile_means(image, TILES)[:, 1])
+        broken += bad
+    return np.stack(rows), broken
 
 
 def judged(ours, theirs: Sample, reach: float, what: str) -> Outcome:
@@ -47,6 +70,29 @@ def against(ours, theirs, reach: float, what: str = "`path`") -> Outcome:
 def against_known(ours, expected, reach: float) -> Outcome:
     """`judged` against a value that is known for all tiles, or values as of `tiles`."""
     return judged(ours, Sample.known(np.broadcast_to(expected, ours.shape[1])), reach, "known")
+
+
+def family(pairs, most_error: float) -> Outcome:
+    """t-tests of ``pairs`` of `Sample`s together, and whether the mean standard error of each pair's
+    differences is at most ``most_error`` of its mean, else the tests show nothing."""
+    p, gap, error = [], 0.0, 0.0
+    for a, b in pairs:
+        found = welch(a, b)
+        p += found.p.tolist()
+        scale = max(float(np.abs(b.mean).mean()), 1e-300)
+        gap = max(gap, abs(float((a.mean - b.mean).mean())) / scale)
+        error = max(error, float(found.error.mean()) / scale)
+    of_all = sidak(p)
+    text = f"p = {of_all:.2g} over {len(p)} comparisons, means {100 * gap:.2g} % apart at most, "
+    text += f"standard error {100 * error:.2g} %"
+    return Outcome(of_all >= LEVEL and error <= most_error, text)
+
+
+def deviation(a: Sample, b: Sample) -> float:
+    """Root mean square of what the tiles of ``b`` are off, over the mean of ``a``, less noise."""
+    difference = welch(a, b)
+    square = (difference.value**2).mean() - (difference.error**2).mean()
+    return float(np.sqrt(max(square, 0)) / a.mean.mean())
 
 
 def together(outcomes: dict[str, Outcome]) -> Outcome:

@@ -5,7 +5,7 @@ What tests/test_oracle.py and the stress cases share; the truth is in `oracle`.
 
 from __future__ import annotations
 
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from types import SimpleNamespace
 
 import drjit as dr
@@ -69,39 +69,83 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
 
 def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
     """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use."""
-    k, h, f = paths.k, mis.Heuristic(name), mi.Float
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
-    kappa = Coefficients(*(dr.opaque(f, x) if x else 0 for x in astuple(kappa)))
-    ratio = paths.first.astype(np.float64) * paths.second / paths.direct
-    ratio /= np.where(
-        paths.kind == AREA,
-        paths.cos_light[:, 0],
-        np.where(paths.kind == POSITION, paths.dist2[:, 0], 1),
-    )
-    with np.errstate(over="ignore"):
-        ratio = f(ratio.astype(np.float32))
-    column = {
-        field: [f(getattr(paths, field)[:, i].astype(np.float32)) for i in range(width)]
-        for field, width in (
-            ("dist2", k),
-            ("cos_light", k),
-            ("cos_camera", k),
-            ("to_camera", k + 1),
-            ("to_light", k + 1),
-        )
-    }
-    d2, cl, cc = column["dist2"], column["cos_light"], column["cos_camera"]
-    to_camera, to_light = column["to_camera"], column["to_light"]
-    delta = [mi.Bool(paths.delta[:, i]) for i in range(k + 1)]
-    first, second, direct, sensor = (
-        f(x.astype(np.float32)) for x in (paths.first, paths.second, paths.direct, paths.sensor_pdf)
-    )
-    area, position = mi.Bool(paths.kind == AREA), mi.Bool(paths.kind == POSITION)
-    infinite, unhittable = mi.Bool(paths.infinite), mi.Bool(paths.delta_emitter)
-    lens_pdf = f(paths.lens_pdf.astype(np.float32))
-    arrival = dr.select(mi.Bool(paths.lens), kappa.arrival, f(0))
+    kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
+    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name))
+    weights = {0: chain.hit(), 1: chain.endpoints() if paths.k == 1 else chain.next_event()}
+    if paths.k > 1:
+        weights |= {s: chain.inner(s) for s in range(2, paths.k)} | {paths.k: chain.splat()}
+    weights[paths.k + 1] = chain.arrive()
+    return columns([weights[s] for s in range(paths.k + 2)], len(paths.kind))
 
-    def fold(partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, is_delta):
+
+@dataclass
+class Columns:
+    """`Paths` as Dr.Jit arrays: a list of one for each edge or vertex where `Paths` has columns; masks of the
+    kinds of emitters in place of ``kind``, and ``ratio``, see `emitters.Direct.emission_ratio`."""
+
+    k: int
+    dist2: list
+    cos_light: list
+    cos_camera: list
+    to_camera: list
+    to_light: list
+    delta: list
+    first: object
+    second: object
+    direct: object
+    lens: object
+    lens_pdf: object
+    sensor_pdf: object
+    area: object
+    position: object
+    infinite: object
+    unhittable: object
+    ratio: object
+
+    @staticmethod
+    def of(paths: Paths) -> Columns:
+        """Those of ``paths``."""
+
+        def number(x):
+            with np.errstate(over="ignore"):
+                return mi.Float(x.astype(np.float32))
+
+        ratio = paths.first.astype(np.float64) * paths.second / paths.direct
+        ratio /= np.where(
+            paths.kind == AREA,
+            paths.cos_light[:, 0],
+            np.where(paths.kind == POSITION, paths.dist2[:, 0], 1),
+        )
+        edges = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
+        single = ("first", "second", "direct", "lens_pdf", "sensor_pdf")
+        return Columns(
+            k=paths.k,
+            **{name: [number(x) for x in getattr(paths, name).T] for name in edges},
+            **{name: number(getattr(paths, name)) for name in single},
+            delta=[mi.Bool(x) for x in paths.delta.T],
+            lens=mi.Bool(paths.lens),
+            area=mi.Bool(paths.kind == AREA),
+            position=mi.Bool(paths.kind == POSITION),
+            infinite=mi.Bool(paths.infinite),
+            unhittable=mi.Bool(paths.delta_emitter),
+            ratio=number(ratio),
+        )
+
+
+class Recursion:
+    """The partial sums along both subpaths of each path, and the weight of each strategy from them, in the
+    order of calls of ``subpath.py`` and ``connect.py``."""
+
+    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic):
+        self.path, self.kappa, self.h = path, kappa, heuristic
+        self.arrival = dr.select(path.lens, kappa.arrival, mi.Float(0))
+        self.light, self._last = self._along_light()
+        self.camera = self._along_camera()
+
+    # -- subpaths -----------------------------------------------------------------------------
+
+    def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, is_delta):
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
             pdf_fwd_w=dr.select(is_delta, 0, pdf_fwd_w),
@@ -109,88 +153,117 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
             cos_out=cos_out,
             delta=is_delta,
         )
-        return mis.scatter(h, partial, coefficient, step)
+        return mis.scatter(self.h, partial, coefficient, step)
 
-    # Light subpath (kernel._light_subpath, subpath._arrive and _leave): light[e] at y_e = x_e.
-    inverse = dr.rcp(first * second)
-    partial = mis.Partial(h.start(inverse), dr.select(unhittable, 0, h.start(cl[0] * inverse)))
-    complete = dr.select(area, direct * cl[0], dr.select(position, direct * d2[0], direct))
-    light = [None]
-    for e in range(1, k + 1):
-        before = partial
-        if e == k:
-            break
-        if e == 1:
-            partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
-        partial = mis.arrive(h, partial, 1 if e == 1 else d2[e - 1], cc[e - 1])
-        light.append(partial)
-        partial = fold(partial, 1.0 if e == 1 else kappa.inner, to_camera[e], to_light[e], cl[e], delta[e])
-    # Camera subpath: camera[e] at z_e = x_{k-e}.
-    partial = mis.Partial(h.start(dr.rcp(sensor)), h.scale(h.start(cc[k - 1] / (lens_pdf * sensor)), arrival))
-    camera = [None]
-    for e in range(1, k + 1):
-        x = k - e
-        arrived = mis.arrive(h, partial, d2[x], cl[x])
-        partial = dr.select(infinite, partial, arrived) if e == k else arrived
-        camera.append(partial)
-        if e < k:
-            partial = fold(
-                partial,
-                kappa.splat if e == 1 else kappa.inner,
-                to_light[x],
-                to_camera[x],
-                cc[x - 1],
-                delta[x],
-            )
+    def _along_light(self):
+        """Light subpath (kernel._light_subpath, subpath._arrive and _leave): the partial sums at y_e = x_e,
+        and those with which the last edge sets out."""
+        x, h = self.path, self.h
+        inverse = dr.rcp(x.first * x.second)
+        start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))
+        partial = mis.Partial(h.start(inverse), start)
+        at_point = dr.select(x.position, x.direct * x.dist2[0], x.direct)
+        complete = dr.select(x.area, x.direct * x.cos_light[0], at_point)
+        found = [None]
+        for e in range(1, x.k):
+            if e == 1:
+                partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
+            partial = mis.arrive(h, partial, 1 if e == 1 else x.dist2[e - 1], x.cos_camera[e - 1])
+            found.append(partial)
+            densities = x.to_camera[e], x.to_light[e]
+            partial = self._fold(partial, self._of_light(e), *densities, x.cos_light[e], x.delta[e])
+        return found, partial
 
-    def of_light(e):
-        return 1.0 if e == 1 else kappa.inner
+    def _along_camera(self):
+        """Camera subpath: the partial sums at z_e = x_{k-e}."""
+        x, h, k = self.path, self.h, self.path.k
+        from_lens = h.start(x.cos_camera[k - 1] / (x.lens_pdf * x.sensor_pdf))
+        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), h.scale(from_lens, self.arrival))
+        found = [None]
+        for e in range(1, k + 1):
+            i = k - e
+            arrived = mis.arrive(h, partial, x.dist2[i], x.cos_light[i])
+            partial = dr.select(x.infinite, partial, arrived) if e == k else arrived
+            found.append(partial)
+            if e < k:
+                densities = x.to_light[i], x.to_camera[i]
+                partial = self._fold(partial, self._of_camera(e), *densities, x.cos_camera[i - 1], x.delta[i])
+        return found
 
-    def of_camera(e):
-        return kappa.splat if e == 1 else kappa.inner
+    def _of_light(self, e):
+        return 1.0 if e == 1 else self.kappa.inner
 
-    result = [f(0)] * (k + 2)
-    if not mis.is_absent(kappa.arrival):  # t = 0 (connect.arrive)
+    def _of_camera(self, e):
+        return self.kappa.splat if e == 1 else self.kappa.inner
+
+    # -- strategies ---------------------------------------------------------------------------
+
+    def arrive(self):
+        """t = 0 (connect.arrive)."""
+        x, h, k, kappa, before = self.path, self.h, self.path.k, self.kappa, self._last
+        if mis.is_absent(kappa.arrival):
+            return mi.Float(0)
         if k == 1:
-            before = mis.Partial(h.scale(before.d_vcm, first), before.d_vc)
-        arrived = mis.arrive(h, before, d2[k - 1], cc[k - 1])
+            before = mis.Partial(h.scale(before.d_vcm, x.first), before.d_vc)
+        arrived = mis.arrive(h, before, x.dist2[k - 1], x.cos_camera[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
-        light_side = mis.alternatives(h, arrived, newest, sensor, lens_pdf)
-        result[k + 1] = h.weight(kappa.arrival, light_side, f(0))
-    # s = 0 (connect.hit_emitter)
-    connected = dr.select(area, direct * cl[0] / d2[0], direct)
-    newest = kappa.endpoints * first if k == 1 else connected
-    camera_side = h.combine(h.scale(camera[k].d_vcm, newest), h.scale(camera[k].d_vc, first * second))
-    result[0] = h.weight(1, f(0), camera_side)
-    if k == 1:  # connect.join_endpoints
-        geometry = dr.select(infinite, 1, cl[0] / d2[0])
-        light_side = h.start(dr.select(unhittable, 0, sensor * geometry / first))
-        if not mis.is_absent(kappa.endpoints):
-            camera_side = h.scale(h.start(second * cc[0] / (d2[0] * lens_pdf)), arrival)
-            result[1] = h.weight(kappa.endpoints, light_side, camera_side)
-        return columns(result, len(paths.kind))
-    # s = 1 (connect.next_event)
-    light_side = h.start(dr.select(unhittable, 0, to_light[1] / direct))
-    camera_side = mis.alternatives(h, camera[k - 1], of_camera(k - 1), to_camera[1], ratio * cc[0])
-    result[1] = h.weight(1, light_side, camera_side)
-    for s in range(2, k):  # connect.inner
+        light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
+        return h.weight(kappa.arrival, light_side, mi.Float(0))
+
+    def hit(self):
+        """s = 0 (connect.hit_emitter)."""
+        x, h, last = self.path, self.h, self.camera[-1]
+        connected = dr.select(x.area, x.direct * x.cos_light[0] / x.dist2[0], x.direct)
+        newest = self.kappa.endpoints * x.first if x.k == 1 else connected
+        camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
+        return h.weight(1, mi.Float(0), camera_side)
+
+    def endpoints(self):
+        """(1,1) (connect.join_endpoints)."""
+        x, h, kappa = self.path, self.h, self.kappa
+        if mis.is_absent(kappa.endpoints):
+            return mi.Float(0)
+        geometry = dr.select(x.infinite, 1, x.cos_light[0] / x.dist2[0])
+        light_side = h.start(dr.select(x.unhittable, 0, x.sensor_pdf * geometry / x.first))
+        camera_side = h.start(x.second * x.cos_camera[0] / (x.dist2[0] * x.lens_pdf))
+        return h.weight(kappa.endpoints, light_side, h.scale(camera_side, self.arrival))
+
+    def next_event(self):
+        """s = 1 (connect.next_event)."""
+        x, h, k = self.path, self.h, self.path.k
+        light_side = h.start(dr.select(x.unhittable, 0, x.to_light[1] / x.direct))
+        density = x.ratio * x.cos_camera[0]
+        of_camera = self._of_camera(k - 1)
+        camera_side = mis.alternatives(h, self.camera[k - 1], of_camera, x.to_camera[1], density)
+        return h.weight(1, light_side, camera_side)
+
+    def inner(self, s):
+        """s and t >= 2 (connect.inner)."""
+        x, h, k, kappa = self.path, self.h, self.path.k, self.kappa
         if mis.is_absent(kappa.inner):
-            break
+            return mi.Float(0)
+        from_camera = x.to_light[s] * x.cos_light[s - 1] / x.dist2[s - 1]
         light_side = mis.alternatives(
-            h, light[s - 1], of_light(s - 1), to_light[s - 1], to_light[s] * cl[s - 1] / d2[s - 1]
+            h, self.light[s - 1], self._of_light(s - 1), x.to_light[s - 1], from_camera
         )
+        from_light = x.to_camera[s - 1] * x.cos_camera[s - 1] / x.dist2[s - 1]
         camera_side = mis.alternatives(
-            h, camera[k - s], of_camera(k - s), to_camera[s], to_camera[s - 1] * cc[s - 1] / d2[s - 1]
+            h, self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
         )
-        result[s] = h.weight(kappa.inner, light_side, camera_side)
-    if not mis.is_absent(kappa.splat):  # t = 1 (connect.splat)
+        return h.weight(kappa.inner, light_side, camera_side)
+
+    def splat(self):
+        """t = 1 (connect.splat)."""
+        x, h, k, kappa = self.path, self.h, self.path.k, self.kappa
+        if mis.is_absent(kappa.splat):
+            return mi.Float(0)
+        from_camera = x.sensor_pdf * x.cos_light[k - 1] / x.dist2[k - 1]
         light_side = mis.alternatives(
-            h, light[k - 1], of_light(k - 1), to_light[k - 1], sensor * cl[k - 1] / d2[k - 1]
+            h, self.light[k - 1], self._of_light(k - 1), x.to_light[k - 1], from_camera
         )
-        to_sensor = to_camera[k - 1] * cc[k - 1] / (d2[k - 1] * lens_pdf)
-        camera_side = h.scale(h.start(to_sensor), arrival)
-        result[k] = h.weight(kappa.splat, light_side, camera_side)
-    return columns(result, len(paths.kind))
+        to_sensor = x.to_camera[k - 1] * x.cos_camera[k - 1] / (x.dist2[k - 1] * x.lens_pdf)
+        camera_side = h.scale(h.start(to_sensor), self.arrival)
+        return h.weight(kappa.splat, light_side, camera_side)
 
 
 def columns(values, n) -> np.ndarray:

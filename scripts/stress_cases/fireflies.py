@@ -7,7 +7,7 @@ from functools import partial
 import fireflies
 import numpy as np
 import reference
-from preset import benchmark_depth
+from reference import benchmark_depth
 
 import mitsuba as mi  # isort: skip
 

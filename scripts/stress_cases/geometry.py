@@ -8,18 +8,17 @@ import time
 from functools import partial
 from pathlib import Path
 
+import drjit as dr
 import numpy as np
-from metrics import Sample, sidak, tile_means, welch
+from metrics import Sample
 
 import mitsuba as mi  # isort: skip
 
+from .agreement import family, greens
 from .case import Case, Outcome
 
 SECTION = "Geometry"
-SIZE, TILES = 16, 4
-
-# Level of all t-tests of a case together, after Sidak's correction. Seeds are fixed.
-LEVEL = 1e-3
+SIZE = 16
 
 SIDES = {"default": {}, "skip=none": {"skip": "none"}}
 
@@ -76,29 +75,8 @@ def _scene(**parts):
 
 
 def _tiles(scene, parameters, spp, seeds):
-    """Tile means, (seeds, tiles), and samples without finite value."""
-    integrator = mi.load_dict({"type": "bdpt"} | parameters)
-    found, broken = [], 0
-    for seed in seeds:
-        image = np.array(integrator.render(scene, spp=spp, seed=seed))
-        found.append(tile_means(image, TILES)[:, 1])
-        broken += integrator.statistics["non_finite"] if hasattr(integrator, "statistics") else 0
-    return np.stack(found), broken
-
-
-def _judge(pairs, most_error) -> Outcome:
-    """t-tests of ``pairs`` of `Sample`s, and whether the means' errors are below ``most_error``."""
-    p, gap, error = [], 0.0, 0.0
-    for a, b in pairs:
-        found = welch(a, b)
-        p += found.p.tolist()
-        scale = max(float(np.abs(b.mean).mean()), 1e-300)
-        gap = max(gap, abs(float((a.mean - b.mean).mean())) / scale)
-        error = max(error, float(found.error.mean()) / scale)
-    family = sidak(p)
-    text = f"p = {family:.2g} over {len(p)} comparisons, means {100 * gap:.2g} % apart, "
-    text += f"standard error {100 * error:.2g} %"
-    return Outcome(family >= LEVEL and error <= most_error, text)
+    """As `greens`, by default of this package's integrator."""
+    return greens(scene, {"type": "bdpt"} | parameters, seeds, spp)
 
 
 def _whole(values):
@@ -115,7 +93,7 @@ def _against(makes, parameters, spp=256, most_error=0.02) -> Outcome:
             b = seen or Sample.of(_tiles(other, side | parameters, spp, range(10, 16))[0])
             pairs.append((Sample.of(a), b))
             broken += bad
-    outcome = _judge(pairs, most_error)
+    outcome = family(pairs, most_error)
     return Outcome(outcome.ok and not broken, f"{outcome.happened}, {broken} samples not finite")
 
 
@@ -127,7 +105,7 @@ def _known(makes, parameters, spp=256, most_error=0.01) -> Outcome:
             a, bad = _tiles(scene, side | parameters, spp, range(8))
             pairs.append((_whole(a), Sample.known([expected])))
             broken += bad
-    outcome = _judge(pairs, most_error)
+    outcome = family(pairs, most_error)
     return Outcome(outcome.ok and not broken, f"{outcome.happened}, {broken} samples not finite")
 
 
@@ -207,6 +185,13 @@ def _coincident() -> Outcome:
     return _against([(three, one, {})], {"max_depth": 5})
 
 
+# Of the light that a lamp in a ceiling must keep and may have. Which of the two a ray that meets both hits is
+# undefined, so that all of s = 0 may be lost; strategies that start on the lamp lose nothing. The lamp fills
+# 0.36 / 9 sr, and s = 0 samples a direction in it with a density of 1 / pi at most: a share of 1.3 % of the
+# weights. The rest is noise.
+KEPT, MOST_KEPT = 0.98, 1.005
+
+
 def _lamp_in_the_ceiling() -> Outcome:
     """A lamp in the plane of a ceiling: which of the two a ray meets is undefined."""
     common = {"sensor": _camera((2, -3, 2), (0, 0, 0.3)), "floor": _floor()}
@@ -216,11 +201,11 @@ def _lamp_in_the_ceiling() -> Outcome:
     for name, more in (("lamp", {}), ("both", {"ceiling": ceiling})):
         scene = _scene(**common, lamp=_lamp(), **more)
         for side, parameters in (*SIDES.items(), ("path", PATH)):
-            values, broken = _tiles(scene, parameters | {"max_depth": 4}, 256, range(4))
+            values, broken = _tiles(scene, parameters | {"max_depth": 4}, 512, range(4))
             means[name, side] = float(values.mean()) if not broken else np.nan
     shares = {side: means["both", side] / means["lamp", side] for side in (*SIDES, "path")}
     text = ", ".join(f"{side} {100 * share:.4g} %" for side, share in shares.items())
-    ok = all(0 <= shares[side] <= 1.01 for side in SIDES)
+    ok = all(KEPT <= shares[side] <= MOST_KEPT for side in SIDES)
     return Outcome(ok, f"of the light without the ceiling: {text}")
 
 
@@ -292,6 +277,20 @@ def _ball_mesh(n, folder, **parts):
     return _mesh(points, faces, folder, "ball", **parts)
 
 
+# Seconds of CPU time: one that looks at each triangle in Python takes minutes. The time on the clock depends
+# on what else the machine does, a second case among others.
+LONGEST = 20
+
+
+def _first_render(kind, scene) -> float:
+    """CPU seconds of all threads, compilation included."""
+    started = time.process_time()
+    image = mi.load_dict({"type": kind, "max_depth": 5}).render(scene, spp=16)
+    dr.eval(image)
+    dr.sync_thread()
+    return time.process_time() - started
+
+
 def _million(emits: bool) -> Outcome:
     """A ball of a million triangles beside the sphere that it stands for."""
     parts = {"bsdf": _grey(0.5)} | ({"emitter": _area(3)} if emits else {})
@@ -302,18 +301,15 @@ def _million(emits: bool) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         mesh = _ball_mesh(707, folder, **parts)
         fine, exact = _scene(**common, ball=mesh), _scene(**common, ball={"type": "sphere"} | parts)
-    started = time.perf_counter()
-    mi.load_dict({"type": "bdpt", "max_depth": 5}).render(fine, spp=16)
-    seconds = time.perf_counter() - started
+    seconds = _first_render("bdpt", fine)
     more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    started = time.perf_counter()
-    mi.load_dict({"type": "path", "max_depth": 5}).render(fine, spp=16)
-    theirs = time.perf_counter() - started
+    theirs = _first_render("path", fine)
     outcome = _against([(fine, exact, {})], {"max_depth": 5})
     text = (
-        f"{outcome.happened}; first render {seconds:.1f} s (`path` {theirs:.1f} s), {more:.0f} MiB for it all"
+        f"{outcome.happened}; first render {seconds:.1f} s of CPU time (`path` {theirs:.1f} s), "
+        f"{more:.0f} MiB for it all"
     )
-    return Outcome(outcome.ok and seconds < 20 and more < 1024, text)
+    return Outcome(outcome.ok and seconds < LONGEST and more < 1024, text)
 
 
 # -- light at its limits ----------------------------------------------------------------------
@@ -438,8 +434,9 @@ CASES = (
     _case(
         "lamp-in-the-ceiling",
         "a lamp in the plane of a black ceiling",
-        "which of them a ray meets is undefined: values finite, no more light than without the ceiling "
-        "(1 % for noise)",
+        "which of them a ray meets is undefined: values finite, and 98 to 100.5 % of the light without the "
+        "ceiling: rays that meet the lamp by chance have 1.3 % of the weights at most, strategies that start "
+        "on it the rest",
         _lamp_in_the_ceiling,
     ),
     _case(
@@ -459,7 +456,8 @@ CASES = (
         _case(
             f"million-triangles{'-emit' if emits else ''}",
             f"a ball of a million triangles{' that emits' if emits else ''}",
-            f"the image of a sphere: {_WELCH}; first render below 20 s, mesh and renders below 1 GiB",
+            f"the image of a sphere: {_WELCH}; first render below {LONGEST} s of CPU time (whatever else "
+            "runs), mesh and renders below 1 GiB",
             partial(_million, emits),
         )
         for emits in (False, True)

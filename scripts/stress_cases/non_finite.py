@@ -6,10 +6,13 @@ same seed, same random numbers, so that the images are the same up to the order 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cache
 
 import drjit as dr
 import numpy as np
+from mitsuba_bdpt import choice
 
 import mitsuba as mi  # isort: skip
 
@@ -26,7 +29,11 @@ NAN, INF = float("nan"), float("inf")
 SAID = {"everything": "all strategies", "default": "default parameters"}
 EVERYTHING = {"skip": "none", "max_depth": 4}
 DEFAULTS = {"max_depth": 4}
-WAYS = {"everything": EVERYTHING, "default": DEFAULTS}
+
+# Each way to render with its samples per pixel: by default so many that a pilot is asked.
+SIZE = 16
+PILOTED = choice.LEAST_SAMPLES // SIZE**2
+WAYS = {"everything": (EVERYTHING, 16), "default": (DEFAULTS, PILOTED)}
 
 
 class Warned:
@@ -54,12 +61,22 @@ class Warned:
 # -- things that are poisoned -----------------------------------------------------------------
 
 
-@cache
-def register():
-    """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter)."""
+class Scales:
+    """The numbers that a poisoned plugin multiplies with, by what they multiply; 1 where none is given."""
+
+    def __init__(self, props, *names):
+        self._factors = {name: dr.opaque(mi.Float, props.get(name, 1.0)) for name in names}
+
+    def of(self, name, where):
+        """The factor of ``name`` at the places in ``where``, else 1."""
+        return dr.select(where, self._factors[name], 1)
+
+
+def poison():
+    """The class of the BSDF ``poison``. (Mitsuba's classes exist once a variant is chosen.)"""
 
     class Poison(mi.BSDF):
-        """Diffuse; where u > 0.5, the ``scales`` multiply the sampled weight, the direction, the value, the
+        """Diffuse; where u > 0.5, the scales multiply the sampled weight, the direction, the value, the
         density."""
 
         def __init__(self, props):
@@ -67,11 +84,10 @@ def register():
             self.inner = mi.load_dict({"type": "diffuse", "reflectance": 0.6})
             self.m_flags = self.inner.flags()
             self.m_components = [self.m_flags]
-            names = ("weight", "direction", "eval", "pdf")
-            self.scales = {name: dr.opaque(mi.Float, props.get(name, 1.0)) for name in names}
+            self.scales = Scales(props, "weight", "direction", "eval", "pdf")
 
         def scale(self, name, si):
-            return dr.select(si.uv.x > 0.5, self.scales[name], 1)
+            return self.scales.of(name, si.uv.x > 0.5)
 
         def sample(self, ctx, si, u1, u2, active=True):
             bs, weight = self.inner.sample(ctx, si, u1, u2, active)
@@ -91,17 +107,23 @@ def register():
         def to_string(self):
             return "Poison[]"
 
+    return Poison
+
+
+def poison_lamp():
+    """The class of the emitter ``poison_lamp``."""
+
     class PoisonLamp(mi.Emitter):
         """Surroundings of radiance 1; in the half x > 0 of all directions, the scales multiply radiance and
-        density."""
+        density. The weight of a sampled direction is what a sound density would make it."""
 
         def __init__(self, props):
             super().__init__(props)
             self.m_flags = int(mi.EmitterFlags.Infinite)
-            self.scales = {name: dr.opaque(mi.Float, props.get(name, 1.0)) for name in ("eval", "pdf")}
+            self.scales = Scales(props, "eval", "pdf")
 
         def scale(self, name, d):
-            return dr.select(d.x > 0, self.scales[name], 1)
+            return self.scales.of(name, d.x > 0)
 
         def sample_direction(self, it, sample, active=True):
             d = mi.warp.square_to_uniform_sphere(sample)
@@ -127,18 +149,34 @@ def register():
         def to_string(self):
             return "PoisonLamp[]"
 
-    mi.register_bsdf("poison", Poison)
-    mi.register_emitter("poison_lamp", PoisonLamp)
+    return PoisonLamp
+
+
+def register():
+    """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter) for the variant in use."""
+    _register(mi.variant())
+
+
+@cache
+def _register(variant: str):
+    mi.register_bsdf("poison", poison())
+    mi.register_emitter("poison_lamp", poison_lamp())
 
 
 def texture(bad, base=0.6):
     """4 x 4 texels of which three are ``bad``, a number or one per colour; no texel spreads into others."""
     data = np.full((4, 4, 3), base, dtype=np.float32)
     data[0, 1] = data[2, 2] = data[3, 0] = bad
-    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest"}
+    # Raw colours are no spectra.
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": not mi.is_spectral, "filter_type": "nearest"}
 
 
 BAD_TEXELS, TEXELS = 3, 16
+
+
+def brightness(value):
+    """Of a lamp. (A spectral variant scales a number by daylight, and refuses such a spectrum that is 0.)"""
+    return {"type": "uniform", "value": value} if mi.is_spectral else value
 
 
 def to_world():
@@ -154,8 +192,8 @@ def down():
 def camera(**keys):
     film = {
         "type": "hdrfilm",
-        "width": 16,
-        "height": 16,
+        "width": SIZE,
+        "height": SIZE,
         "pixel_format": "rgb",
         "component_format": "float32",
     }
@@ -208,9 +246,14 @@ def rendered(scene, parameters, spp, seed=1):
     return image, bdpt.statistics, warnings
 
 
+def decided(statistics) -> list[dict]:
+    """The decisions, without what they cost: rays are traced for NaN and infinity, but not for 0."""
+    return [{name: x for name, x in d.items() if name != "cost"} for d in statistics["decisions"]]
+
+
 def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
     """Whether ``make(bad)`` renders as ``make(0.0)`` does, counts ``count`` values (some, if None) and says
-    so once, and the twin none."""
+    so once, and the twin none; with `PILOTED` samples also whether a pilot was asked."""
     image, statistics, warnings = rendered(make(bad), parameters, spp)
     twin, of_twin, quiet = rendered(make(0.0), parameters, spp)
     found = statistics["non_finite"]
@@ -219,15 +262,27 @@ def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
     counted = found == count if count is not None else found > 0
     ok = bool(np.isfinite(image).all()) and off <= ROUNDING and counted
     ok &= len(warnings) == 1 and f"{found} values" in warnings[0]
-    ok &= of_twin["non_finite"] == 0 and not quiet and statistics["decisions"] == of_twin["decisions"]
+    ok &= of_twin["non_finite"] == 0 and not quiet and decided(statistics) == decided(of_twin)
     exactly = f", exactly {count} expected" if count is not None else ""
-    return Outcome(bool(ok), f"{found} counted{exactly}, off by {off:.1g}, {len(warnings)} warning")
+    piloted, asked = spp >= PILOTED, bool(statistics["decisions"]) and statistics["seconds"]["pilot"] > 0
+    text = f"{found} counted{exactly}, off by {off:.1g}, {len(warnings)} warning"
+    text += ", decided by a pilot" if asked else ""
+    return Outcome(bool(ok and asked == piloted), text)
+
+
+def both_ways(make, bad, said, more=None) -> dict[str, Outcome]:
+    """`compared` by all `WAYS`, with ``more`` parameters; what was tried is ``said``."""
+    return {
+        f"{said}, {SAID[how]}": compared(make, bad, parameters | (more or {}), spp=spp)
+        for how, (parameters, spp) in WAYS.items()
+    }
 
 
 TWIN = (
     "the image of its twin, in which that is 0, to 1e-5 of its maximum (same random numbers; only the order "
     "of sums differs); counted; one warning"
 )
+PILOT_TOO = TWIN + "; by default with so many samples that a pilot decides, as it does for the twin"
 
 
 def bsdf_cases():
@@ -249,20 +304,14 @@ def bsdf_cases():
         return made
 
     def run(name):
-        return together(
-            {
-                f"{bad}, {SAID[how]}": compared(make(name), bad, parameters)
-                for bad in (NAN, INF)
-                for how, parameters in WAYS.items()
-            }
-        )
+        return together(both_ways(make(name), NAN, "nan") | both_ways(make(name), INF, "inf"))
 
     return [
         Case(
             f"bsdf-{name}",
             SECTION,
             f"a user's BSDF: on half a plate its {said[name]} NaN or infinite; all strategies, and defaults",
-            TWIN,
+            PILOT_TOO,
             lambda name=name: run(name),
             name == "pdf",
         )
@@ -270,74 +319,79 @@ def bsdf_cases():
     ]
 
 
-def lamp_cases():
-    """Poisoned emitters; the plate of the room keeps a lamp that is sound."""
+def own_lamps():
+    """What is said of a user's environment, how it is made with a number, and a bad number. (Rendered under
+    ``hide_emitters``, for a sky seen directly is asked for no density.)"""
 
-    def user(name):  # under hide_emitters, for a sky seen directly is asked for no density
-        zero = {"eval": ["eval"], "pdf": ["eval"]}
-
-        def make(value):
+    def make(name):
+        def made(value):
             register()
-            names = [name] if value != 0 else zero[name]
+            # Where the density is 0, so is what is sampled there: the twin's other half is black.
+            names = [name] if value != 0 else ["eval"]
             return room(wall=None, sky={"type": "poison_lamp"} | dict.fromkeys(names, value))
 
-        return make
+        return made
+
+    return (
+        ("a user's environment: half its radiance NaN", make("eval"), NAN),
+        ("a user's environment: half its radiance infinite", make("eval"), INF),
+        ("a user's environment: half its densities NaN", make("pdf"), NAN),
+        # With an infinite density beside a finite weight, next-event estimation would be believed alone.
+        ("a user's environment: half its densities infinite", make("pdf"), INF),
+    )
+
+
+def mitsubas_lamps():
+    """The same of Mitsuba's emitters."""
 
     def point(value):
-        return room(other={"type": "point", "intensity": value})
+        return room(other={"type": "point", "intensity": brightness(value)})
 
     def glowing(value):
         at = mi.ScalarTransform4f().translate([-0.4, 0.5, -0.3]).rotate([1, 0, 0], 60).scale(0.2)
         other = {"type": "rectangle", "to_world": at, "emitter": {"type": "area", "radiance": value}}
         # Mitsuba orders shapes by their addresses: with two lamps on shapes, random numbers would choose
         # another one in the twin.
-        return {"other": other, "lamp": {"type": "point", "position": [0.3, 0.7, 0], "intensity": 0.5}}
+        return room(other=other, lamp={"type": "point", "position": [0.3, 0.7, 0], "intensity": 0.5})
+
+    def sky(value):
+        return room(wall=None, sky={"type": "constant", "radiance": brightness(value)})
+
+    def sun(value):
+        return room(wall=None, sun={"type": "directional", "direction": [0, -1, -1], "irradiance": value})
 
     def spot(value):
         lamp = {"type": "spot", "intensity": 5.0, "cutoff_angle": 40, "to_world": down()}
         return room(other=lamp | {"texture": texture(value)})
 
-    made = {
-        "own-eval-nan": ("a user's environment: half its radiance NaN", user("eval"), NAN),
-        "own-eval-inf": ("a user's environment: half its radiance infinite", user("eval"), INF),
-        "own-pdf-nan": ("a user's environment: half its densities NaN", user("pdf"), NAN),
-        "point-nan": ("point light of intensity NaN", point, NAN),
-        "point-inf": ("point light of infinite intensity", point, INF),
-        "area-nan": ("area light of radiance NaN", lambda v: room(**glowing(v)), NAN),
-        "constant-nan": (
-            "sky of radiance NaN",
-            lambda v: room(wall=None, sky={"type": "constant", "radiance": v}),
-            NAN,
-        ),
-        "directional-nan": (
-            "directional light of irradiance NaN",
-            lambda v: room(wall=None, sun={"type": "directional", "direction": [0, -1, -1], "irradiance": v}),
-            NAN,
-        ),
-        "spot-texture-nan": ("spot light through a texture with NaN", spot, NAN),
-    }
+    return (
+        ("point light of intensity NaN", point, NAN),
+        ("point light of infinite intensity", point, INF),
+        ("area light of radiance NaN", glowing, NAN),
+        ("sky of radiance NaN", sky, NAN),
+        ("directional light of irradiance NaN", sun, NAN),
+        ("spot light through a texture with NaN", spot, NAN),
+    )
 
-    def run(names):
-        hidden = {"hide_emitters": True}
-        return together(
-            {
-                f"{made[name][0]}, {SAID[how]}": compared(*made[name][1:], parameters | hidden)
-                for name in names
-                for how, parameters in WAYS.items()
-            }
-        )
 
-    own = [name for name in made if name.startswith("own-")]
-    mitsubas = [name for name in made if name not in own]
+def lamp_cases():
+    """Poisoned emitters; the plate of the room keeps a lamp that is sound."""
+
+    def run(lamps):
+        outcomes = {}
+        for said, make, bad in lamps():
+            outcomes |= both_ways(make, bad, said, {"hide_emitters": True})
+        return together(outcomes)
+
     tried = "radiance or density NaN or infinite in half of all directions; all strategies, and defaults"
     return [
-        Case("lamp-own", SECTION, f"a user's environment: {tried}", TWIN, lambda: run(own), True),
+        Case("lamp-own", SECTION, f"a user's environment: {tried}", PILOT_TOO, lambda: run(own_lamps), True),
         Case(
             "lamp-mitsuba",
             SECTION,
             "Mitsuba's lamps with radiances that are NaN or infinite; all strategies, and defaults",
-            TWIN,
-            lambda: run(mitsubas),
+            PILOT_TOO,
+            lambda: run(mitsubas_lamps),
         ),
     ]
 
@@ -349,75 +403,114 @@ def painted(bad):
     return {"type": "diffuse", "reflectance": texture(bad)}
 
 
+def reflecting(value):
+    return filled(painted(value))
+
+
+def red(value):
+    return filled(painted([value, 0, 0]))
+
+
+def glowing_plate(value):
+    return filled(
+        None, plate={"type": "rectangle", "emitter": {"type": "area", "radiance": texture(value)}}, lamp=None
+    )
+
+
+def lit(value):
+    """A closed white sphere with nothing in it but a point light."""
+    wall = {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+    return room(
+        wall=wall,
+        plate=None,
+        lamp={"type": "point", "position": [0.2, 0, 0.1], "intensity": brightness(value)},
+    )
+
+
+@dataclass(frozen=True)
+class Counted:
+    """``tried``: what is not finite in the scene of ``make`` under ``parameters``; ``count`` in words, and
+    the ``number`` of values of each of ``SPP`` samples, over the poisoned pixels or ``everywhere``."""
+
+    tried: str
+    count: str
+    make: Callable
+    parameters: dict
+    number: int
+    everywhere: bool = False
+
+    def run(self) -> Outcome:
+        pixels = SIZE**2 if self.everywhere else SIZE**2 * BAD_TEXELS // TEXELS
+        check = finite_and_counted if self.everywhere else compared
+        return check(self.make, NAN, self.parameters, self.number * pixels * SPP, SPP)
+
+
+SPP = 16
+BY_CAMERA = {"light_paths": 0, "max_depth": 2}
+TWO = "two values of each camera sample on them"
+
+COUNTED = {
+    "reflectance": Counted(
+        "texels of a reflectance NaN, light and camera at the front",
+        f"{TWO}: s = 1, and the subpath that would go on",
+        reflecting,
+        BY_CAMERA,
+        2,
+    ),
+    "reflectance-red": Counted(
+        "texels of a reflectance that are NaN in red and 0 in green and blue",
+        f"{TWO}: a colour that is NaN in part is not black",
+        red,
+        BY_CAMERA,
+        2,
+    ),
+    "radiance": Counted(
+        "texels of an area light's radiance NaN, seen directly",
+        "one value of each camera sample on them",
+        glowing_plate,
+        {"light_paths": 0, "max_depth": 1},
+        1,
+    ),
+    "feature": Counted(
+        "texels of a reflectance NaN, shown by `aovs` (albedo), nothing else rendered",
+        "one value of each camera sample on them",
+        reflecting,
+        {"aovs": "a:albedo", "max_depth": 0},
+        1,
+    ),
+    "emission": Counted(
+        "point light of intensity NaN in a closed sphere, all strategies, depth 3",
+        "three values of each sample: its light subpath, s = 1 at two vertices",
+        lit,
+        {"skip": "none", "max_depth": 3},
+        3,
+        everywhere=True,
+    ),
+    "passes": Counted(
+        "texels of a reflectance NaN, in passes of 3 samples",
+        f"{TWO}, one warning for all passes",
+        reflecting,
+        BY_CAMERA | {"spp_per_pass": 3},
+        2,
+    ),
+    "variance": Counted(
+        "texels of a reflectance NaN, layers of the variance",
+        TWO,
+        reflecting,
+        BY_CAMERA | {"variance": True},
+        2,
+    ),
+}
+
+
 def counted_cases():
     """Cases in which the number of values that are not finite follows from the scene."""
-    pixels, spp = 16 * 16, 16
-    bad = pixels * BAD_TEXELS // TEXELS * spp
-    by_camera = {"light_paths": 0, "max_depth": 2}
-    shining = {"type": "area"}
-    inside = {"wall": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}}
-
-    def reflecting(value):
-        return filled(painted(value))
-
-    def red(value):
-        return filled(painted([value, 0, 0]))
-
-    def glowing(value):
-        plate = {"type": "rectangle", "emitter": shining | {"radiance": texture(value)}}
-        return filled(None, plate=plate, lamp=None)
-
-    def lit(value):
-        lamp = {"type": "point", "position": [0.2, 0, 0.1], "intensity": value}
-        return room(plate=None, lamp=lamp, **inside)
-
-    made = {
-        "reflectance": (
-            "texels of a reflectance NaN, light and camera at the front",
-            "two values of each camera sample on them: s = 1, and the subpath that would go on",
-            (reflecting, by_camera, 2 * bad),
-        ),
-        "reflectance-red": (
-            "texels of a reflectance that are NaN in red and 0 in green and blue",
-            "two values of each camera sample on them: a colour that is NaN in part is not black",
-            (red, by_camera, 2 * bad),
-        ),
-        "radiance": (
-            "texels of an area light's radiance NaN, seen directly",
-            "one value of each camera sample on them",
-            (glowing, {"light_paths": 0, "max_depth": 1}, bad),
-        ),
-        "feature": (
-            "texels of a reflectance NaN, shown by `aovs` (albedo), nothing else rendered",
-            "one value of each camera sample on them",
-            (reflecting, {"aovs": "a:albedo", "max_depth": 0}, bad),
-        ),
-        "emission": (
-            "point light of intensity NaN in a closed sphere, all strategies, depth 3",
-            "three values of each sample: its light subpath, s = 1 at two vertices",
-            (lit, {"skip": "none", "max_depth": 3}, 3 * pixels * spp),
-        ),
-        "passes": (
-            "texels of a reflectance NaN, in passes of 3 samples",
-            "two values of each camera sample on them, one warning for all passes",
-            (reflecting, by_camera | {"spp_per_pass": 3}, 2 * bad),
-        ),
-        "variance": (
-            "texels of a reflectance NaN, layers of the variance",
-            "two values of each camera sample on them",
-            (reflecting, by_camera | {"variance": True}, 2 * bad),
-        ),
-    }
 
     def run(names):
-        outcomes = {}
-        for name in names:
-            tried, count, (make, parameters, number) = made[name]
-            check = compared if name != "emission" else finite_and_counted
-            outcomes[f"{tried}, {count}"] = check(make, NAN, parameters, number, spp)
-        return together(outcomes)
+        found = {name: COUNTED[name] for name in names}
+        return together({f"{c.tried}, {c.count}": c.run() for c in found.values()})
 
-    def case(name, tried, names, quick):
+    def case(name, tried, names, quick=False):
         expected = "the number that follows from the scene, exactly; " + TWIN
         return Case(f"exact-{name}", SECTION, tried, expected, lambda: run(names), quick)
 
@@ -432,9 +525,8 @@ def counted_cases():
             "lamps",
             "texels of a lamp seen directly, or a point light's intensity, NaN",
             ("radiance", "emission"),
-            False,
         ),
-        case("feature", "texels of an albedo NaN, shown by `aovs`", ("feature",), False),
+        case("feature", "texels of an albedo NaN, shown by `aovs`", ("feature",)),
         Case(
             "strategy-images-nan",
             SECTION,
@@ -495,6 +587,47 @@ def _pilot() -> Outcome:
     )
 
 
+def spectrally_painted(value):
+    """`reflecting` under a spectral variant: the coefficients of its texels set after loading, since Mitsuba
+    fits a spectrum to NaN as well; where ``value`` is 0, to those of black."""
+    scene = reflecting(0.5)
+    parameters = mi.traverse(scene)
+    (name,) = [name for name, _ in parameters if name.endswith("reflectance.data")]
+    data = np.array(parameters[name])
+    painted_texels = np.array(texture(0.0)["bitmap"])[..., 0] == 0
+    data[painted_texels] = value if value != 0 else (0, 0, -INF)
+    parameters[name] = mi.TensorXf(data)
+    parameters.update()
+    return scene
+
+
+def _spectral() -> Outcome:
+    """Under a spectral variant, where a poisoned value has as many wavelengths as a path."""
+    before = mi.variant()
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        lamps = {said: (make, bad) for said, make, bad in (*own_lamps(), *mitsubas_lamps())}
+        outcomes = {}
+        for said in SPECTRAL_LAMPS:
+            make, bad = lamps[said]
+            outcomes[said] = compared(make, bad, EVERYTHING | {"hide_emitters": True})
+        outcomes["half a plate's BSDF of value NaN"] = compared(_poisoned("eval"), NAN, EVERYTHING)
+        texels = replace(COUNTED["reflectance"], make=spectrally_painted)
+        for counted in (texels, COUNTED["emission"]):
+            outcomes[f"{counted.tried}, {counted.count}"] = counted.run()
+        return together(outcomes)
+    finally:
+        mi.set_variant(before)
+
+
+SPECTRAL_LAMPS = (
+    "a user's environment: half its radiance NaN",
+    "a user's environment: half its densities infinite",
+    "point light of intensity NaN",
+    "sky of radiance NaN",
+)
+
+
 def _interrupted() -> Outcome:
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 2, "spp_per_pass": 4})
 
@@ -512,28 +645,36 @@ def _interrupted() -> Outcome:
     return Outcome(found > 0 and len(warnings) == 1, f"{found} counted, {len(warnings)} warning")
 
 
-def _lost_whole(lamp: dict, parameter: str) -> Outcome:
-    scene = room(wall=None, lamp=None, other=lamp)
+def _lost_whole(lamp: Callable, parameter: str) -> Outcome:
+    """Whether nothing is left of the only light, ``lamp(NAN)``, and ``parameter`` is named; with a number in
+    its place there is light, and nothing to say."""
     texts, ok = [], True
-    for parameters in (EVERYTHING, DEFAULTS):
-        image, statistics, warnings = rendered(scene, parameters, 64)
+    scene, sound = (room(wall=None, lamp=None, other=lamp(value)) for value in (NAN, 1.0))
+    for parameters, spp in WAYS.values():
+        image, statistics, warnings = rendered(scene, parameters, spp)
         found = statistics["non_finite"]
-        ok = ok and np.isfinite(image).all() and found > 0 and len(warnings) == 1 and parameter in warnings[0]
-        texts.append(f"mean {image.mean():.2g}, {found} counted")
+        ok = ok and (image == 0).all() and found > 0 and len(warnings) == 1 and parameter in warnings[0]
+        light, of_sound, quiet = rendered(sound, parameters, spp)
+        ok = ok and light.mean() > LIT and of_sound["non_finite"] == 0 and not quiet
+        texts.append(f"mean {image.mean():.2g}, without NaN {light.mean():.2g}; {found} counted")
     path = np.array(mi.load_dict({"type": "path", "max_depth": 4}).render(scene, spp=64))
     return Outcome(bool(ok), f"{'; '.join(texts)}; `path`: mean {np.nanmean(path):.2g}, says nothing")
+
+
+# Mean of an image that is lit.
+LIT = 0.01
 
 
 def distribution_cases():
     """Textures from which Mitsuba makes a distribution, which is NaN everywhere if one number is."""
 
-    def sky():
+    def sky(value):
         data = np.full((8, 16, 3), 1.0, dtype=np.float32)
-        data[0, 0] = NAN
+        data[0, 0] = value
         return {"type": "envmap", "bitmap": mi.Bitmap(data)}
 
-    def projector():
-        return {"type": "projector", "irradiance": texture(NAN), "fov": 50, "to_world": down()}
+    def projector(value):
+        return {"type": "projector", "irradiance": texture(value), "fov": 50, "to_world": down()}
 
     def lamp(value):
         at = mi.ScalarTransform4f().translate([-0.2, 0.6, -0.3]).rotate([1, 0, 0], 60).scale(0.3)
@@ -546,15 +687,15 @@ def distribution_cases():
         )
 
     def of_area(parameters):
-        spp, seeds = 256, range(8)
+        spp, seeds = PILOTED, range(8)
         ours = tiles(lamp(NAN), {"type": "bdpt", **parameters}, seeds, spp)
         return against(ours, tiles(lamp(0.0), {"type": "bdpt", **parameters}, seeds, spp), 0.02, "twin")
 
     def lost():
         return together(
             {
-                "`envmap`": _lost_whole(sky(), "other.data"),
-                "`projector`": _lost_whole(projector(), "irradiance.data"),
+                "`envmap`": _lost_whole(sky, "other.data"),
+                "`projector`": _lost_whole(projector, "irradiance.data"),
             }
         )
 
@@ -563,7 +704,8 @@ def distribution_cases():
             "distribution-nan",
             SECTION,
             "texels of an `envmap`, or of a `projector`, NaN",
-            "all light that takes Mitsuba's distribution is lost, and said so: finite, counted, named",
+            "all light that takes Mitsuba's distribution is lost, and said so: black, counted, named; with a "
+            "number in their place there is light, and nothing to say",
             lost,
         ),
         Case(
@@ -572,7 +714,7 @@ def distribution_cases():
             "texels of an area light NaN; all strategies, and defaults",
             "only these texels are lost: the image of its twin, in which they are 0; Welch's test over tiles "
             "(level 1e-3, 8 seeds each), which sees errors of 2 %",
-            lambda: together({SAID[how]: of_area(parameters) for how, parameters in WAYS.items()}),
+            lambda: together({SAID[how]: of_area(parameters) for how, (parameters, _) in WAYS.items()}),
         ),
     ]
 
@@ -605,14 +747,52 @@ def mesh(data, bad):
 
 def _mesh(data, bad) -> Outcome:
     scene = room(plate=mesh(data, bad))
-    spp, seeds = 128, range(8)
-    ours = tiles(scene, {"type": "bdpt", "max_depth": 4}, seeds, spp)
-    theirs = tiles(scene, {"type": "path", "max_depth": 4}, seeds, 4 * spp)
+    seeds = range(8)
+    ours = tiles(scene, {"type": "bdpt", "max_depth": 4}, seeds, PILOTED)
+    theirs = tiles(scene, {"type": "path", "max_depth": 4}, seeds, PILOTED)
     outcome = against(ours, theirs, 0.02)
     _, statistics, warnings = rendered(scene, DEFAULTS, 16)
     found, expected = statistics["non_finite"], data == "vertex_normals"
     ok = outcome.ok and (found > 0) == expected == bool(warnings)
     return Outcome(ok, f"{outcome.happened}; {found} counted")
+
+
+def textured_lamp(faces, emits=True, bad=None):
+    """Triangles of a square, with the texture coordinates of its last corner ``bad``."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float32)
+    place = mi.ScalarTransform4f().translate([-0.2, 0.6, -0.3]).rotate([1, 0, 0], 60).scale(0.3)
+    texcoords = (corners[:, :2] + 1) / 2
+    if bad is not None:
+        texcoords[3] = bad
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": 0.5})
+    if emits:
+        texels = np.random.default_rng(1).random((4, 4, 3)).astype(np.float32)
+        radiance = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+        props["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
+    made = mi.Mesh("square", 4, len(faces), has_vertex_texcoords=True, props=props)
+    parameters = mi.traverse(made)
+    parameters["vertex_positions"] = np.ravel([list(place @ mi.ScalarPoint3f(*c)) for c in corners])
+    parameters["vertex_texcoords"] = texcoords.ravel()
+    parameters["faces"] = np.array(faces, dtype=np.uint32).ravel()
+    parameters.update()
+    return made
+
+
+def _lamp_texcoords(bad) -> Outcome:
+    sound, spoiled = [0, 1, 2], [0, 2, 3]
+    scene = room(lamp=None, other=textured_lamp([sound, spoiled], bad=bad))
+    dark = room(lamp=None, other=textured_lamp([sound]), more=textured_lamp([spoiled], emits=False))
+    theirs = tiles(dark, {"type": "path", "max_depth": 4}, range(8), 4 * PILOTED)
+    outcomes = {}
+    for how, (parameters, spp) in WAYS.items():
+        ours = tiles(scene, {"type": "bdpt", **parameters}, range(8), max(spp, 256))
+        outcome = against(ours, theirs, 0.02)
+        _, statistics, warnings = rendered(scene, parameters, 16)
+        found = statistics["non_finite"]
+        ok = outcome.ok and found > 0 and len(warnings) == 1 and "other.vertex_texcoords" in warnings[0]
+        outcomes[SAID[how]] = Outcome(ok, f"{outcome.happened}; {found} counted")
+    return together(outcomes)
 
 
 def mesh_cases():
@@ -622,16 +802,27 @@ def mesh_cases():
         "vertex_normals": "their triangles reflect nothing, as under `path`; subpaths that end there count",
         "vertex_texcoords": "Mitsuba looks up some texel, as under `path`; nothing to count",
     }
+    lamp = Case(
+        "mesh-lamp-texcoords",
+        SECTION,
+        "`vertex_texcoords` of one of the four vertices of a textured lamp NaN; all strategies, and defaults",
+        "that triangle is dark, counted and named (`path` is NaN all over); Welch's test over tiles against "
+        "`path` with a dark triangle there (level 1e-3, 8 seeds each), which sees errors of 2 %",
+        lambda: _lamp_texcoords(NAN),
+    )
     return [
-        Case(
-            f"mesh-{data.replace('_', '-')}",
-            SECTION,
-            f"`{data}` of one of four vertices NaN or infinite, set after loading",
-            f"{expected}; Welch's test over tiles against `path` (level 1e-3, 8 seeds each), which sees "
-            "errors of 2 %",
-            lambda data=data: together({str(bad): _mesh(data, bad) for bad in (NAN, INF)}),
-        )
-        for data, expected in what.items()
+        lamp,
+        *(
+            Case(
+                f"mesh-{data.replace('_', '-')}",
+                SECTION,
+                f"`{data}` of one of four vertices NaN or infinite, set after loading",
+                f"{expected}; Welch's test over tiles against `path` (level 1e-3, 8 seeds each), which sees "
+                "errors of 2 %",
+                lambda data=data: together({str(bad): _mesh(data, bad) for bad in (NAN, INF)}),
+            )
+            for data, expected in what.items()
+        ),
     ]
 
 
@@ -645,6 +836,13 @@ CASES = (
         "a pilot meets a BSDF of value NaN",
         "counted apart (`non_finite_in_pilot`), in the warning and in `explain`; the decision is its twin's",
         _pilot,
+    ),
+    Case(
+        "spectral-nan",
+        SECTION,
+        "`llvm_ad_spectral`: lamps, a texture and a BSDF that are NaN, an infinite density; all strategies",
+        TWIN + "; the numbers that follow from the scene, exactly",
+        _spectral,
     ),
     Case(
         "interrupted-nan",

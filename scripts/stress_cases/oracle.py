@@ -101,28 +101,17 @@ class Coefficients:
         return self.splat if t == 1 else self.inner
 
 
-def log_densities(paths: Paths) -> np.ndarray:
-    """log p_s for s = 0 ... k + 1, shape (n, k + 2); -inf where the strategy cannot make the path."""
+def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Logarithms of the densities of each vertex: when sampled from the light and from the camera, shapes
+    (n, k + 1), and of x_0 by next-event estimation, (n,); area measure, at infinity solid angle."""
     k, n = paths.k, len(paths.kind)
-    log = {
-        name: np.log(np.asarray(getattr(paths, name), dtype=np.float64))
-        for name in (
-            "dist2",
-            "cos_light",
-            "cos_camera",
-            "to_camera",
-            "to_light",
-            "first",
-            "second",
-            "direct",
-            "lens_pdf",
-            "sensor_pdf",
-        )
-    }
+    names = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
+    names += ("first", "second", "direct", "lens_pdf", "sensor_pdf")
+    log = {name: np.log(np.asarray(getattr(paths, name), dtype=np.float64)) for name in names}
     is_area = paths.kind == AREA
 
-    # Densities of x_i when sampled from x_{i-1}, area measure. A delta event has the same
-    # (discrete) probability both ways, so that any number serves; here 1.
+    # Densities of x_i when sampled from x_{i-1}. A delta event has the same (discrete) probability both ways,
+    # so that any number serves; here 1.
     light = np.zeros((n, k + 1))
     light[:, 0] = log["first"]
     # The emission density of x_1: over directions, or already over an area perpendicular to the edge.
@@ -146,7 +135,13 @@ def log_densities(paths: Paths) -> np.ndarray:
 
     # Next-event estimation makes x_0 with a density of its own.
     direct = log["direct"] + np.where(is_area, log["cos_light"][:, 0] - log["dist2"][:, 0], 0)
+    return light, camera, direct
 
+
+def log_densities(paths: Paths) -> np.ndarray:
+    """log p_s for s = 0 ... k + 1, shape (n, k + 2); -inf where the strategy cannot make the path."""
+    k, n = paths.k, len(paths.kind)
+    light, camera, direct = log_steps(paths)
     p = np.empty((n, k + 2))
     for s in range(k + 2):
         t = k + 1 - s

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -234,6 +233,30 @@ def _edited(parameters: dict) -> Outcome:
     return Outcome(not wrong, "; ".join(wrong) or f"at most {worst:.1%} of values differ in rounding")
 
 
+@contextlib.contextmanager
+def _sigint_after(seconds: float):
+    """SIGINT to this process when it has used so many ``seconds`` of CPU time, if it is still in here: on the
+    clock a render takes longer where something else runs, and the moment would be another one."""
+    armed = [True]
+
+    def interrupt(*_):
+        if armed:
+            signal.raise_signal(signal.SIGINT)
+
+    previous = {
+        signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler),
+        signal.SIGPROF: signal.signal(signal.SIGPROF, interrupt),
+    }
+    try:
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+        yield
+    finally:
+        armed.clear()
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
 def _interrupted(times: int) -> Outcome:
     """SIGINT at some moment of a render, then the same again."""
     # Short passes: recording them takes as long as tracing them, and may be interrupted as well.
@@ -241,27 +264,21 @@ def _interrupted(times: int) -> Outcome:
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 2})
     keywords = {"seed": 5, "spp": 32}
     whole = _image(bdpt, scene, **keywords)
-    started = time.perf_counter()
+    started = time.process_time()
     _image(bdpt, scene, **keywords)
-    seconds = time.perf_counter() - started
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    seconds = time.process_time() - started
     hit, kept, worst, wrong = 0, set(), 0.0, []
     for number in range(times):
-        timer = threading.Timer(seconds * (number + 0.5) / times, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
         try:
-            bdpt.render(scene, **keywords)
-            timer.join()
-            time.sleep(0.01)  # the signal may have come after the render
+            with _sigint_after(seconds * (number + 0.5) / times):
+                bdpt.render(scene, **keywords)
         except KeyboardInterrupt:
             hit += 1
             kept.add(sum(bdpt.statistics["passes"]))
             film = np.array(scene.sensors()[0].film().develop())
             if bdpt.statistics["passes"] and not 0.5 < film.mean() / whole.mean() < 2:
                 wrong.append(f"film of {bdpt.statistics['passes']}: mean {film.mean():.3g}")
-        timer.join()
         worst = max(worst, _off(_image(bdpt, scene, **keywords), whole))
-    signal.signal(signal.SIGINT, previous)
     text = f"{hit} of {times} met it, after {min(kept, default=0)} to {max(kept, default=0)} of 32 samples; "
     text += "; ".join(wrong) + f"then off by {worst:.1g} of the mean at most"
     return Outcome(not wrong and hit >= times // 2 and worst < ROUNDING, text)
@@ -418,7 +435,7 @@ CASES = (
     ),
     _case(
         "interrupted",
-        "SIGINT at 12 moments of a render, each time the render again",
+        "SIGINT at 12 moments of a render, by its CPU time, each time the render again",
         "`KeyboardInterrupt`, in the film the passes that were done (mean within a factor of 2: of one "
         "sample per "
         f"pixel); then {SAME}",
