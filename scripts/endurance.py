@@ -40,7 +40,7 @@ RECORD = reference.ROOT / "docs" / "endurance.json"
 TARGET = 10**10
 
 # One render ends after so many camera samples or so many seconds: starting costs little, settings change.
-RENDER_SAMPLES, RENDER_SECONDS = 1 << 28, 20.0
+RENDER_SAMPLES, RENDER_SECONDS = 1 << 28, 40.0
 
 # Widths in turn; a prime number, and one more and one less than a power of two, for what divides evenly.
 SIZES = (256, 127, 640, 65, 512, 31)
