@@ -252,11 +252,10 @@ def lanes(samples: int) -> int:
     return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
 
 
-def begun(full: Plan, settings: Settings, pixels: int) -> Plan:
-    """``full`` with a light subpath for each camera subpath on films of few pixels, if nothing is given by
-    hand."""
-    auto = settings.skip == "auto" and settings.light_paths == settings.connections == "auto"
-    return replace(full, served=1) if auto and pixels < FEW_PIXELS else full
+def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
+    """What a render begins with: ``full``, with a light subpath for each camera subpath on films of few
+    pixels, unless parameters say how many."""
+    return replace(full, served=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
 
 
 def is_open(full: Plan, settings: Settings) -> bool:
@@ -266,8 +265,11 @@ def is_open(full: Plan, settings: Settings) -> bool:
 
 def is_by_hand(settings: Settings) -> bool:
     """Whether parameters say what is done. (Strategy images want all strategies.)"""
-    auto = settings.skip == settings.light_paths == settings.connections == "auto"
-    return not auto or settings.decisions is not None or settings.strategy_images
+    return not _is_auto(settings) or settings.decisions is not None or settings.strategy_images
+
+
+def _is_auto(settings: Settings) -> bool:
+    return settings.skip == settings.light_paths == settings.connections == "auto"
 
 
 def by_scene(world, full: Plan, settings: Settings, samples: int) -> Decision | None:

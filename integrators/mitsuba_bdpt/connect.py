@@ -11,7 +11,7 @@ loops around, and each statement binds a new array to a name.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -46,9 +46,13 @@ class Contribution:
 def finite(c: Contribution, counters) -> Contribution:
     """``c``, inactive where it adds no finite value, which is counted: such a contribution counts as zero."""
     lost = c.active & ~bsdf.is_finite(c.value * c.weight)
-    counters["non_finite"] += _one(lost)
-    c.active &= ~lost
-    return c
+    count(counters, "non_finite", lost)
+    return replace(c, active=c.active & ~lost)
+
+
+def count(counters, name: str, mask):
+    """Add 1 to a counter of `kernel.COUNTERS` in lanes where ``mask`` holds."""
+    counters[name] += _one(mask)
 
 
 @dataclass
@@ -182,7 +186,7 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point = rays.segment(z.anchor, e.anchor, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    counters["shadow_s1"] += _one(active)
+    count(counters, "shadow_s1", active)
     active &= ~rays.occluded(kernel.scene, ray, active)
     return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct")
 
@@ -224,7 +228,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
     away = rays.spawn(join.anchor, -join.d, emission.si)
     away.maxt = join.reach  # camera rays see the surroundings behind the far plane
     ray = dr.select(emission.infinite, away, ray)
-    counters["shadow_t1"] += _one(active)
+    count(counters, "shadow_t1", active)
     active &= ~rays.occluded(kernel.scene, ray, active)
     return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active, shares, "light"), join.position
 
@@ -263,7 +267,7 @@ def splat(kernel, y: Vertex, stream, counters):
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light")
     active, survival = _roulette(kernel, c.weighted(), u, active, counters)
-    counters["shadow_t1"] += _one(active)
+    count(counters, "shadow_t1", active)
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
         pi, _ = rays.intersect_past_emitters(scene, kernel.quadrics, ray, active, coherent=False)
@@ -413,7 +417,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     value = (chosen / _size(chosen)) * total
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)
-    counters["shadow_inner"] += _one(active)
+    count(counters, "shadow_inner", active)
     active &= ~rays.occluded(kernel.scene, rays.segment_to(z.anchor, end, z.si), active)
     return dr.select(active, value / survival, 0)
 
@@ -442,7 +446,7 @@ def _roulette(kernel, value, u, active, counters):
     survival = dr.clip(size * kernel.inverse_threshold, LEAST_SURVIVAL, 1)
     survival = dr.select(dr.isfinite(size), survival, 1)
     survived = u < survival
-    counters["rouletted"] += _one(active & ~survived)
+    count(counters, "rouletted", active & ~survived)
     return active & survived, survival
 
 

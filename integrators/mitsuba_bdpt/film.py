@@ -129,8 +129,8 @@ class Replicates:
 
         The variance that one half shows is divided by r^2 + 0.01 mean(image)^2 with r from the other half:
         beside a mean that has the same firefly no value could count for more than 1. The noise of r alone
-        would add 1 + V (3 r^2 - e) / (r^2 + e)^2 in the mean (second order), with V the variance of r
-        and e = 0.01 mean(image)^2; it is divided by that.
+        would add 1 + V max(3 r^2 - e, 0) / (r^2 + e)^2 in the mean (second order; where it would take away,
+        nothing is added), with V the variance of r and e = 0.01 mean(image)^2; it is divided by that.
         """
         first, second = self.halves
         if min(first.count, second.count) < 2:

@@ -328,12 +328,17 @@ def _log(statistics: dict):
 def _warn_of_brighteners(scene):
     found = brighteners(bsdfs(scene))
     if found:
-        more = f", and {len(found) - NAMED} more" if len(found) > NAMED else ""
         mi.Log(
             mi.LogLevel.Warn,
-            f"bdpt: {'; '.join(found[:NAMED])}{more}: more light returns than arrives, and where it cannot "
+            f"bdpt: {_some(found)}: more light returns than arrives, and where it cannot "
             "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
         )
+
+
+def _some(found: list[str]) -> str:
+    """The first `NAMED` of them, and how many more there are."""
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    return ", ".join(found[:NAMED]) + more
 
 
 def _warn_of_decisions_not_begun(decisions, passes: int):
@@ -350,16 +355,15 @@ def _warn_of_decisions_not_begun(decisions, passes: int):
 
 def _warn_of_what_was_lost(statistics: dict, scene):
     """Say how many values were not finite, and in what parameters of the scene to look for the cause."""
-    count, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
-    if not (count or in_pilot):
+    lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
+    if not (lost or in_pilot):
         return
-    parts = [f"{count} values were not finite and count as zero"]
+    parts = [f"{lost} values were not finite and count as zero"]
     if in_pilot:
         parts.append(f"so did {in_pilot} of the pilot, which decided from the rest")
     named = not_finite(scene)
-    where = ", ".join(named[:NAMED]) + (f" and {len(named) - NAMED} more" if len(named) > NAMED else "")
     parts.append(
-        f"NaN or infinity is in {where}"
+        f"NaN or infinity is in {_some(named)}"
         if named
         else "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
     )

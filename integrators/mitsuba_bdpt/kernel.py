@@ -24,8 +24,9 @@ STORE_SIZES = (64, MAX_STORED)
 
 
 # What lanes count (``UInt32``): rays by kind, inner connections by what became of them (``rouletted``: splats
-# too), values that count as zero because they are not finite: contributions, subpaths that end for want of a
-# finite throughput, features.
+# too), values that count as zero because they are not finite: contributions (those of s = 1 and t <= 1 if
+# they are visible, inner ones before it is known), subpaths that end for want of a finite throughput,
+# features.
 COUNTERS = (
     "camera",
     "light",
@@ -149,7 +150,7 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
 
 def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
     """Trace some camera samples of a batch again, as `trace` does: those of these ``slot``s (``UInt32``) with
-    the light subpath of the lane that each is in."""
+    the light subpath of the lane that each is in. (For whoever looks at single samples; no render does.)"""
     total, lanes = _size(kernel, batch)
     kernel = kernel.bound(points, lanes / total)
     common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), slot % lanes)
@@ -268,7 +269,7 @@ def _light_subpath(kernel, sink, stream, shared, path):
         sink.splat(kernel, connect.finite(c, counters), position, shared, counters)
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = active & ~bsdf.is_finite(e.weight)
-    counters["non_finite"] += dr.select(broken, mi.UInt32(1), mi.UInt32(0))
+    connect.count(counters, "non_finite", broken)
     active &= ~broken
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
@@ -303,7 +304,7 @@ def _light_subpath(kernel, sink, stream, shared, path):
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters = _added(counters, counted)
     counters["light"] += dr.select(active, walk.traced(), 0)
-    counters["non_finite"] += dr.select(walk.broken, mi.UInt32(1), mi.UInt32(0))
+    connect.count(counters, "non_finite", walk.broken)
     return path, counters
 
 
@@ -367,7 +368,7 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
     (total, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters = _added(counters, counted)
     counters["camera"] += dr.select(active, walk.traced(), 0)
-    counters["non_finite"] += dr.select(walk.broken, mi.UInt32(1), mi.UInt32(0))
+    connect.count(counters, "non_finite", walk.broken)
     sink.end(kernel, lane, sample, total, walk.seen, counters)
     return counters
 

@@ -316,8 +316,9 @@ def _add(target, columns: int, values, row, active):
 
 
 def _mean_colour(c):
-    """Mean of the colours of a contribution, which adds up unlike the largest."""
-    return dr.mean(dr.abs(mi.unpolarized_spectrum(c.value))) * c.weight
+    """Mean of the colours of a contribution, in double precision, which adds up unlike the largest."""
+    colours = [mi.Float64(dr.abs(colour)) for colour in mi.unpolarized_spectrum(c.value)]
+    return sum(colours) / len(colours) * mi.Float64(c.weight)
 
 
 def _none(n: int) -> list:

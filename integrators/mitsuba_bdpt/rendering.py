@@ -80,7 +80,7 @@ class Render:
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.world = World(scene, sensor)
         self._pixels = int(self.world.camera.region.size.prod())
-        self._full = self.plan = choice.begun(plan(self.world, settings), settings, self._pixels)
+        self._full = self.plan = choice.first_plan(plan(self.world, settings), settings, self._pixels)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)

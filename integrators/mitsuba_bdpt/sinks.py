@@ -50,7 +50,7 @@ class Image:
         contribution, not what the film makes of it) count as zero."""
         value = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
         finite = dr.all(dr.isfinite(value))
-        counters["non_finite"] += dr.select(c.active & ~finite, mi.UInt32(1), mi.UInt32(0))
+        connect.count(counters, "non_finite", c.active & ~finite)
         self._film.put_light(position, value, c.active & finite)
         if kernel.strategy_images:
             self._put_strategy(c, position, shared)
@@ -68,7 +68,7 @@ class Image:
         alpha = _alpha(kernel, seen)
         film.put_camera(start.counted, dr.select(shown, colours, 0), alpha, features, sample.covered)
         for mask in (finite, shown):
-            counters["non_finite"] += dr.select(sample.covered & ~mask, mi.UInt32(1), mi.UInt32(0))
+            connect.count(counters, "non_finite", sample.covered & ~mask)
 
     def _put_strategy(self, c, position, shared):
         weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
