@@ -844,6 +844,10 @@ REFUSED_PARTS = {
         lambda _: {"lamp": {"type": "projector", "to_world": STRETCHED}},
         "to_world of projector 'lamp' distorts angles .*1, 2, 1.*set fov instead",
     ),
+    "narrow spot": (
+        lambda _: {"lamp": {"type": "spot", "cutoff_angle": 0.013}},
+        "spot 'lamp' has cutoff_angle=0.013, a cone without width .*make it 0.02 degrees or more",
+    ),
     "sunsky": (
         lambda _: {"lamp": {"type": "sunsky", "to_world": STRETCHED}},
         "to_world of sunsky 'lamp' is not a rotation .*leave out scaling",

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import rays
+from mitsuba_bdpt import rays, spheres
 from welch import assert_agree, compare_images, tile_means
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -394,15 +394,63 @@ def test_scale_does_not_change_the_image(name):
 def test_lamps_on_spheres_however_small(radius, parameters):
     """Rationale: Mitsuba finds the outline of a small sphere far away with an error of many roundings, so a
     visibility ray that ends close to a point near the outline meets the lamp before (the loss was 0.4 % for a
-    radius of 0.05); and its density of the cone towards the sphere cancels: `path` is 0.1 % too bright at a
-    radius of 0.05, 1.6 % at 0.01, and black from 1e-3 on. Expected: the closed form pi L (R / d)^2 cos on a
-    floor 6.5 below the lamp, 8.1 away, with path tracing alone and with all strategies.
+    radius of 0.05); and its density of the cone towards the sphere cancels: `path` is off by 0.1 % at a
+    radius of 0.05, by 1.6 % at 0.01, and black from 1e-3 on. Expected: the closed form pi L (R / d)^2 cos on
+    a floor 6.5 below the lamp, 8.1 away, with path tracing alone and with all strategies.
     Tolerance: 0.05 %; the mean of 2^22 samples has a standard error below 0.01 %, the density of a cone is
     right within 0.012 %, and the floor seen is so small that its middle stands for it within 0.01 %.
     """
+    scene = small_lamp({"type": "sphere", "center": SMALL_LAMP, "radius": radius})
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2} | parameters)
+    mean = np.mean([np.array(mi.render(scene, integrator=integrator, spp=1 << 12, seed=s)) for s in range(4)])
+    d2 = 4**2 + 6.5**2 + 2.7**2
+    expected = 0.5 * 6.5 / d2**1.5  # at the middle of a view of 0.1 x 0.1
+    assert abs(mean / expected - 1) < 5e-4, f"{mean / expected - 1:.2e} off"
+
+
+@pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=["path tracing", "all"])
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+@pytest.mark.parametrize(("radius", "gap"), [(1e-2, 0.03), (5e-3, 0.02), (1e-3, 0.02), (1e-6, 0.07)])
+def test_small_lamps_do_not_shine_through_what_stands_close(kind, radius, gap, parameters):
+    """Rationale: rays towards small spheres and cylinders have to end up to 1 % of their length early, where
+    Mitsuba may meet the lamp too soon; a plate within that stretch would not be seen (with such ends 1 % of
+    the light of a radius of 0.01 came through, and all of 1e-3). Expected: nothing behind a black plate;
+    without it, the light of the same lamp, ten times as large and as strong, to 3 % (a cylinder's radiance
+    over so small a view; the mean of 2^15 samples has a standard error below 1 %).
+    """
+    x, y, z = SMALL_LAMP
+
+    def lamp(r):
+        if kind == "sphere":
+            return {"type": "sphere", "center": SMALL_LAMP, "radius": r}
+        return {"type": "cylinder", "p0": [x, y, z - 0.1], "p1": [x, y, z + 0.1], "radius": r}
+
+    plate = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([x, y - gap, z]).rotate([1, 0, 0], -90).scale(0.5),
+        "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.0}},
+    }
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2} | parameters)
+
+    def mean(scene):
+        image = np.array(integrator.render(scene, spp=128, seed=1))
+        assert not integrator.statistics["non_finite"]
+        return image.mean()
+
+    exponent = 2 if kind == "sphere" else 1
+    assert mean(small_lamp(lamp(radius), exponent, plate=plate)) == 0
+    large = mean(small_lamp(lamp(10 * radius), exponent))
+    assert abs(mean(small_lamp(lamp(radius), exponent)) / large - 1) < 0.03
+
+
+SMALL_LAMP = [0, 6.5, 2.7]
+
+
+def small_lamp(lamp, exponent=2, **more):
+    """A floor seen from near by in a lamp's light, of radiance 1 / radius^exponent."""
     T = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    scene = mi.load_dict(
+    return mi.load_dict(
         {
             "type": "scene",
             "sensor": {
@@ -416,16 +464,49 @@ def test_lamps_on_spheres_however_small(radius, parameters):
                 "to_world": T().translate([4, 0, 0]).rotate([1, 0, 0], -90),
                 "bsdf": {"type": "diffuse", "reflectance": 0.5},
             },
-            "lamp": {
-                "type": "sphere",
-                "center": [0, 6.5, 2.7],
-                "radius": radius,
-                "emitter": {"type": "area", "radiance": 1 / radius**2},
-            },
+            "lamp": lamp | {"emitter": {"type": "area", "radiance": 1 / lamp["radius"] ** exponent}},
         }
+        | more
     )
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2} | parameters)
-    mean = np.mean([np.array(mi.render(scene, integrator=integrator, spp=1 << 12, seed=s)) for s in range(4)])
-    d2 = 4**2 + 6.5**2 + 2.7**2
-    expected = 0.5 * 6.5 / d2**1.5  # at the middle of a view of 0.1 x 0.1
-    assert abs(mean / expected - 1) < 5e-4, f"{mean / expected - 1:.2e} off"
+
+
+@pytest.mark.parametrize("radius, place", [(1.0, [0, 0, 0]), (1e-6, [100, 50, 20]), (1e-5, [1e3, 5e2, 2e2])])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_spheres_are_known_however_small(radius, place, flipped):
+    """Rationale: a point of a sphere far smaller than the steps of its coordinates is rounded to its center,
+    and says nothing about which way its normals point. Expected: center, radius (to 1e-6), side, and whether
+    it is turned, of spheres by center and radius, scaled, turned and mirrored."""
+    at = mi.ScalarTransform4f().translate(place)
+    kinds = {
+        "plain": {"center": place, "radius": radius},
+        "scaled": {"to_world": at.scale(radius)},
+        "turned": {"to_world": at.rotate([0.6, 0, 0.8], 100).scale(radius)},
+        "mirrored": {"to_world": at.scale([-radius, radius, radius])},
+    }
+    for name, keys in kinds.items():
+        shape = mi.load_dict({"type": "sphere", "flip_normals": flipped} | keys)
+        sphere = spheres.Sphere.of(shape)
+        # What Mitsuba says of a ball of that kind where nothing is rounded.
+        d = mi.Vector3f(1, 0, 0)
+        large = mi.load_dict({"type": "sphere", "flip_normals": flipped} | _enlarged(keys, radius, place))
+        si = large.ray_intersect(mi.Ray3f(mi.Point3f(0), d))
+        assert sphere.outward == (1 if dr.slice(dr.dot(si.n, d)) > 0 else -1), name
+        assert np.allclose(sphere.center, place) and abs(sphere.radius / radius - 1) < 1e-6, name
+        assert sphere.turned == (name in ("turned", "mirrored")), name
+
+
+def _enlarged(keys, radius, place):
+    if "center" in keys:
+        return {"center": [0, 0, 0], "radius": 1.0}
+    back = mi.ScalarTransform4f().translate([-x for x in place])
+    matrix = np.array((back @ keys["to_world"]).matrix, dtype=np.float64)
+    matrix[:3, :3] /= radius
+    matrix[:3, 3] = 0
+    return {"to_world": mi.ScalarTransform4f(matrix)}
+
+
+@pytest.mark.parametrize("extent", [np.nan, np.inf])
+def test_spheres_are_small_in_scenes_without_bounds(extent):
+    """Rationale: one vertex at infinity leaves a scene without a size; lamps on spheres were then taken for
+    large, and up to 58 % too bright. Expected: small."""
+    assert spheres.is_small(spheres.Sphere([0, 0, 0], 1e-3, 1.0, False), extent)

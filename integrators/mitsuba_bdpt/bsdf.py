@@ -252,7 +252,7 @@ def _step(si, bs, mitsuba_weight, weight, pdf_fwd_w, pdf_rev_w) -> Step:
     delta, cos_out = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), geometric_cos(si, bs.wo)
     # A direction that is NaN hits nothing, and nobody would know.
     finite = dr.isfinite(dr.select(delta, cos_out, cos_out + pdf_fwd_w + pdf_rev_w))
-    finite &= is_finite(mitsuba_weight)
+    finite &= is_finite(mitsuba_weight) & dr.isfinite(bs.eta)  # roulette asks for eta
     return Step(
         wo=bs.wo,
         weight=dr.select(finite | is_zero(mitsuba_weight), weight, dr.nan),

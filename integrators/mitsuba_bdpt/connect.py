@@ -150,7 +150,16 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vc, older),
     )
     weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
-    return Contribution(z.throughput * radiance, weight, mi.UInt32(0), t, active, shares, "hit")
+    value = _known(z.throughput * radiance, connect, first, second)
+    return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
+
+
+def _known(value, *densities):
+    """``value``, NaN where one of the ``densities`` of other strategies is not finite: no weight follows."""
+    finite = mi.Bool(True)
+    for density in densities:
+        finite &= dr.isfinite(density)
+    return dr.select(finite, value, dr.nan)
 
 
 def choose_emitter(kernel, z: Vertex, stream):
@@ -166,7 +175,7 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.joinable
     k = z.edges + 1
-    value = z.throughput * f.value * e.weight
+    value = _known(z.throughput * f.value * e.weight, e.emission_ratio)
     active = active & ~bsdf.is_zero(value)
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
@@ -181,13 +190,13 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
     weight, shares = h.weigh(kernel.kappa.direct, light_side, camera_side)
-    active &= _counts(kernel, weight)
+    active &= _counts(kernel, value, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
-    to_point = rays.segment(z.anchor, e.anchor, z.si)
+    to_point, own = rays.sight(kernel.quadrics, z.anchor, e.anchor, e.shape, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     count(counters, "shadow_s1", active)
-    active &= ~rays.occluded(kernel.scene, ray, active)
+    active &= ~rays.occluded(kernel.scene, ray, active, own)
     return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct")
 
 
@@ -221,7 +230,7 @@ def join_endpoints(kernel, emission, stream, counters, active):
         towards = dr.select(covered, towards, 0)
         camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
-    active &= _counts(kernel, weight)
+    active &= _counts(kernel, value, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
     # From the sensor into the distance, for light from infinity.
@@ -262,7 +271,7 @@ def splat(kernel, y: Vertex, stream, counters):
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.splat, light_side, camera_side)
-    active &= _counts(kernel, weight)
+    active &= _counts(kernel, value, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light")
@@ -301,7 +310,7 @@ def arrive(kernel, emission, y: Vertex, walk):
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
-    active &= _counts(kernel, weight)
+    active &= _counts(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
@@ -343,7 +352,7 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
         f_y.pdf_fwd_w * cos_z * inverse,
     )
     weight, shares = h.weigh(kernel.kappa.inner, light_side, camera_side)
-    active &= _counts(kernel, weight)
+    active &= _counts(kernel, value, weight)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
 
 
@@ -359,8 +368,8 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
         counted = {"non_finite": lost}
         c = finite(inner(kernel, z, y), counted)
         nonzero = nonzero + _one(c.active)
-        ray = rays.segment(z.anchor, y.anchor, z.si)
-        visible = c.active & ~rays.occluded(kernel.scene, ray, c.active)
+        ray, own = rays.sight(kernel.quadrics, z.anchor, y.anchor, y.si.shape, z.si)
+        visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
         return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
 
     candidates = candidate_count(kernel, z, path)
@@ -398,12 +407,13 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         u = dr.select(total > 0, rest, u)
         chosen = dr.select(take, value, chosen)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
-        end = dr.select(take, rays.end_point(z.anchor, y.anchor), end)
+        end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
         return slot + 1, chosen, total, end, u, nonzero + _one(c.active), counted["non_finite"]
 
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
-    none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.Point3f(z.si.p)
+    small = kernel.quadrics.small
+    none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.UInt32(0) if small else mi.Point3f(z.si.p)
     _, chosen, total, end, u, nonzero, lost = dr.while_loop(
         (*none, u, mi.UInt32(0), mi.UInt32(0)),
         lambda slot, *_: slot < candidates,
@@ -418,7 +428,13 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     active = total > 0
     active, survival = _roulette(kernel, value, u, active, counters)
     count(counters, "shadow_inner", active)
-    active &= ~rays.occluded(kernel.scene, rays.segment_to(z.anchor, end, z.si), active)
+    own = None
+    if small:
+        y = read_light_vertex(kernel, path, end)
+        ray, own = rays.sight(kernel.quadrics, z.anchor, y.anchor, y.si.shape, z.si)
+    else:
+        ray = rays.segment_to(z.anchor, end, z.si)
+    active &= ~rays.occluded(kernel.scene, ray, active, own)
     return dr.select(active, value / survival, 0)
 
 
@@ -450,9 +466,10 @@ def _roulette(kernel, value, u, active, counters):
     return active & survived, survival
 
 
-def _counts(kernel, weight):
-    """Mask: a strategy of this weight is worth a ray. Technique images show unweighted ones too."""
-    return mi.Bool(True) if kernel.strategy_images else ~(weight == 0)
+def _counts(kernel, value, weight):
+    """Mask: a strategy of this ``value`` and weight is worth a ray, or has to be counted by `finite` (of what
+    is not finite the weight may be 0). Technique images show unweighted ones too."""
+    return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 
 def _size(value):

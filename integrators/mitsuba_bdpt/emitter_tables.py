@@ -62,7 +62,13 @@ def placement(emitter, kind, extent) -> Placement:
             dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
             for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
         )
-        cos_cutoff = dr.slice(dr.cos(dr.deg2rad(mi.Float(params["cutoff_angle"]))))
+        cutoff_angle = mi.Float(params["cutoff_angle"])
+        cos_cutoff = dr.slice(dr.cos(dr.deg2rad(cutoff_angle)))
+        if cos_cutoff >= 1:
+            raise ValueError(
+                f"bdpt: spot '{emitter.id()}' has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
+                "width in single precision; make it 0.02 degrees or more"
+            )
         return Placement(
             x=x,
             y=y,

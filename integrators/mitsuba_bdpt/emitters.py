@@ -90,7 +90,8 @@ class Direct:
 
     ``weight`` radiance / ``pdf_w``; ``pdf_w`` solid angle at the camera vertex with the selection, or
     the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
-    the visibility ray (unused where ``infinite``); ``emission_ratio`` is
+    the visibility ray (unused where ``infinite``), on ``shape`` (None if the scene has none so small that
+    the ray asks for it, see `rays.SMALL`); ``emission_ratio`` is
     pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
     geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
     """
@@ -99,6 +100,7 @@ class Direct:
     pdf_w: object
     d: object
     anchor: rays.Anchor
+    shape: object
     infinite: object
     delta: object
     emission_ratio: object
@@ -563,11 +565,13 @@ class Emitters:
         ratio = dr.select(infinite, self._density_across(si.p, ds.d), ratio)
         if UNKNOWN in self.kinds:
             ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
-        curvature = mi.Float(0)
+        curvature, shape = mi.Float(0), None
         if self.on_shapes:
             curvature = self.quadrics.ends(emitter.get_shape(), active)
+        if self.quadrics.small:
+            shape = emitter.get_shape() if self.on_shapes else dr.zeros(mi.ShapePtr)
         anchor = rays.sampled_anchor(ds.p, n, si.p, curvature)
-        return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio)
+        return Direct(weight, pdf, ds.d, anchor, shape, infinite, delta, ratio)
 
     # -- hits by camera subpaths ------------------------------------------------------------
 

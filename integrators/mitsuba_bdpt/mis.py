@@ -119,7 +119,8 @@ class Heuristic:
         """
         if self.name == "maximum":
             # Of equal ones, that with the fewest light vertices counts. Rounding must not decide:
-            # each strategy computes the ratio by itself.
+            # each strategy computes the ratio by itself. (Of three, each within 1e-4 of the next, none
+            # may count.)
             near = coefficient * (1 + 1e-4)
             best = (near >= camera_side) & (coefficient > light_side * (1 + 1e-4))
             return dr.select(best, 1.0, 0.0)

@@ -4,7 +4,9 @@ Mitsuba offsets ray origins by 8.9e-5 (1 + max|p|), which swallows small scenes 
 gaps in large ones. Here the offset along the geometric normal follows from the rounding error of
 the hit itself: ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t)`` with maximum norms, where ``o`` and ``t``
 belong to the ray that found ``p``. It scales with the scene. Visibility rays end short of their
-target by the target's own offset, not by a fraction of the distance.
+target by the target's own offset, not by a fraction of the distance. Towards spheres and cylinders they
+have to end earlier; where these are so small that this would pass by what stands before them, the ray asks
+which shape it meets first (`sight`).
 """
 
 from __future__ import annotations
@@ -28,6 +30,10 @@ QUADRIC_ULPS = 8
 # Seen from afar, one point of a sphere in a hundred is closer to its outline than this cosine. A ray may
 # still meet the sphere before such a point: measured, 1e-5 of the light of a radius of 0.05 at distance 7.
 LEAST_COSINE = 0.1
+
+# Diameters of a scene, in radii of its smallest sphere or cylinder, from which on rays ask what they meet:
+# those that end early would do so by more than two radii (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
+SMALL = 650
 
 
 @dataclass
@@ -56,13 +62,17 @@ def rounding_offset(p, o, t):
 
 
 class Quadrics:
-    """Curvature of the scene's spheres and cylinders, by shape pointer."""
+    """Curvature of the scene's spheres and cylinders, by shape pointer. ``small``: one of them is so small
+    that rays ask what they meet, see `SMALL`."""
 
     def __init__(self, scene):
         shapes = scene.shapes()
         rows = [_curvatures(s) for s in shapes]
         self._size = 0
         self.any = any(any(row) for row in rows)
+        extent = 2 * scene.bbox().bounding_sphere().radius if self.any else 0
+        # Not `>`: the extent may be NaN.
+        self.small = any(row[0] and not row[0] * extent <= SMALL for row in rows)
         if self.any:
             ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
             self._size = max(ids) + 1
@@ -131,11 +141,16 @@ def end_point(a: Anchor, b: Anchor):
     if b.curvature.state == dr.VarState.Literal and b.curvature[0] == 0:
         return end
     back = a.p - end
+    return end + back * dr.minimum(_early(back, b), 0.01)
+
+
+def _early(back, b: Anchor):
+    """The share of a ray's length, against the direction ``back``, in which it may meet the sphere or
+    cylinder of its end ``b`` already."""
     dist = dr.norm(back)
     # The error of t grows towards the outline, as 1 / cos.
     cos = dr.maximum(dr.abs(dr.dot(b.n, back)) / dist, LEAST_COSINE)
-    early = dr.minimum((QUADRIC_ULPS * 2.0**-24) * dist * b.curvature / cos, 0.01)
-    return end + back * early
+    return (QUADRIC_ULPS * 2.0**-24) * dist * b.curvature / cos
 
 
 def segment_to(a: Anchor, end, like) -> mi.Ray3f:
@@ -151,9 +166,31 @@ def segment(a: Anchor, b: Anchor, like) -> mi.Ray3f:
     return segment_to(a, end_point(a, b), like)
 
 
-def occluded(scene, ray, active):
-    """Whether any surface, null surfaces included (as in ``path``), blocks ``ray``."""
-    return scene.ray_test(ray, active=active)
+@dataclass
+class Own:
+    """The ``shape`` that a visibility ray ends at, and the distance ``t`` from which on it may meet it."""
+
+    shape: object
+    t: object
+
+
+def sight(quadrics: Quadrics, a: Anchor, b: Anchor, shape, like):
+    """Ray from ``a`` to ``b`` on ``shape``, and an `Own` for `occluded`: None unless ``quadrics`` are
+    small."""
+    if not quadrics.small:
+        return segment(a, b, like), None
+    end = b.towards(a.p - b.p)
+    ray = segment_to(a, end, like)
+    return ray, Own(shape, ray.maxt * (1 - _early(a.p - end, b)))
+
+
+def occluded(scene, ray, active, own: Own | None = None):
+    """Whether any surface, null surfaces included (as in ``path``), blocks ``ray``; ``own`` is what it ends
+    at, where it can be met too early."""
+    if own is None:
+        return scene.ray_test(ray, active=active)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    return pi.is_valid() & ~((pi.shape == own.shape) & (pi.t >= own.t))
 
 
 def intersect_past_emitters(scene, quadrics, ray, active, coherent):

@@ -13,8 +13,9 @@ class Spread:
 
     With n_b samples per pixel in image x_b, N = ``spp`` in all, and B images, ``squares`` are
     sum_b n_b (x_b - mean)^2, and the variance of the weighted mean is estimated by squares / (N (B - 1)).
-    That is exact for images of one size; of several, if variance falls as 1 / n (where points let it fall as
-    n^-1.2, and each eight images have as many samples as all before, it is 14 % too large).
+    That is exact for images of one size; of several, if variance falls as 1 / n. (Where points let it fall as
+    n^-1.2, and each eight images have as many samples as all before, it is too large: by 7 % at 256 samples
+    per pixel, 23 % at 1024, 69 % at 16384.)
     """
 
     count: int = 0

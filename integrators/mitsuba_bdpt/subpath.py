@@ -150,10 +150,12 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
     hit = walk.active & si.is_valid()
     cos = dr.abs(dr.dot(si.n, walk.d))
     dist2 = dr.squared_norm(si.p - walk.previous)
-    partial = walk.partial
+    partial, throughput = walk.partial, walk.throughput
     if side.complete is not None:
         first = hit & (walk.edges == 1)
         density = dr.select(first, side.complete(si, first), 1)
+        # No weight follows from such a density.
+        throughput = dr.select(dr.isfinite(density), throughput, dr.nan)
         partial = mis.Partial(h.scale(partial.d_vcm, density), partial.d_vc)
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
     if side.parallel:
@@ -167,7 +169,7 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
         bsdf=si.bsdf(),
         cos=cos,
         anchor=rays.surface_anchor(si, ray, kernel.quadrics),
-        throughput=walk.throughput,
+        throughput=throughput,
         partial=partial,
         edges=walk.edges,
         previous=walk.previous,
@@ -212,7 +214,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk
     coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
-    throughput = walk.throughput * step.weight
+    throughput = vertex.throughput * step.weight
     eta = walk.eta * step.eta if kernel.refracts else 1
     brightest = bsdf.brightest(throughput)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
