@@ -20,7 +20,7 @@ import sys
 from collections import Counter
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
-from report import table
+from tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr
@@ -28,6 +28,7 @@ import metrics
 import reference
 from mistakes import answered
 from mitsuba_bdpt import choice, pilot, rendering
+from mitsuba_bdpt.__main__ import number
 from reference import RESOLUTION, benchmark_depth
 from timing import timed
 
@@ -58,8 +59,8 @@ def predicted(scene, settings) -> pilot.Moments:
     """What several pilots of the scene find."""
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     found = None
-    for number in range(ROUNDS):
-        seed = dr.opaque(mi.UInt32, number)
+    for i in range(ROUNDS):
+        seed = dr.opaque(mi.UInt32, i)
         new = pilot.measure(render.world, render.plan, settings, seed, LANES)
         found = new if found is None else found.joined(new)
     return found
@@ -131,9 +132,8 @@ def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
-    parser.add_argument(
-        "--seeds", type=int, default=0, help="compare what the pilots of so many renders choose"
-    )
+    text = "compare what the pilots of so many renders choose"
+    parser.add_argument("--seeds", type=number(int, 1), help=text)
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     depths = {name: benchmark_depth(name) for name in options.scene}

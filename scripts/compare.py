@@ -6,7 +6,7 @@
 At 128^2, the depth of the benchmark: medians over pairs of renders of different seeds, after one that
 compiles; of the efficiency the quartiles too. Errors are relMSE, trimmed of the worst 0.1 % and raw; the
 last column is what the reference's own error adds to the trimmed one, of that side where it is more (ratios
-are off by as much).
+are off by as much). Where an image has no error at all there are no ratios of errors, and that is said.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import reference
-from equal_time import integrator
+from analysis import Refused
 from metrics import TRIM, rel_mse
 from mistakes import answered
 from mitsuba_bdpt.__main__ import number
 from reference import RESOLUTION, benchmark_depth
-from report import table
+from tables import table
 from timing import timed
 
 import mitsuba as mi  # isort: skip
@@ -54,18 +54,30 @@ class Side:
         for word in words:
             if word.startswith("sampler="):
                 sampler = word.removeprefix("sampler=")
-        made = integrator(" ".join(w for w in words if not w.startswith("sampler=")), benchmark_depth(name))
+        own = " ".join(word for word in words if not word.startswith("sampler="))
+        made = reference.integrator_of(own, benchmark_depth(name))
         return Side(made, reference.load_scene(name, resolution=RESOLUTION, sampler=sampler))
 
     def measured(self, target: reference.Reference, spp: int, seed: int) -> tuple[float, ...]:
-        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render."""
+        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render; raises
+        `Refused` if it has no error."""
         image, seconds = timed(self.scene, self.made, spp, seed)
         trimmed = rel_mse(image, target.image, TRIM)
+        if trimmed == 0:
+            raise Refused("every value (trimmed) is exactly that of the reference")
         return seconds, trimmed, rel_mse(image, target.image), target.share_of(image, TRIM) / trimmed
 
 
 def line(name: str, sides: list[str], spp: int, pairs: int) -> list[str]:
     """A scene's line of the table."""
+    try:
+        return [f"`{name}`", str(spp), *ratios(name, sides, spp, pairs)]
+    except Refused as why:
+        return [f"`{name}`", str(spp), str(why), *["–"] * (len(HEADS) - 3)]
+
+
+def ratios(name: str, sides: list[str], spp: int, pairs: int) -> list[str]:
+    """The figures of a scene's line; raises `Refused` for an image without an error."""
     target = reference.load_reference(name, RESOLUTION, benchmark_depth(name))
     made, found = [Side.of(words, name) for words in sides], []
     for seed in range(pairs + 1):
@@ -80,8 +92,6 @@ def line(name: str, sides: list[str], spp: int, pairs: int) -> list[str]:
     cells = [*np.median([time, error, raw], axis=1), np.median(1 / (time * raw))]
     text = [f"{x:.3g}" for x in cells]
     return [
-        f"`{name}`",
-        str(spp),
         *text[:3],
         f"{middle:.3g} ({low:.3g}–{high:.3g})",
         text[3],

@@ -20,7 +20,8 @@ from pathlib import Path
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from mistakes import answered
-from report import replace_part, table, write_text
+from report import replace_part, write_text
+from tables import table
 
 import mitsuba as mi  # isort: skip
 

@@ -6,8 +6,12 @@
 
 The scene that had the least time comes next, with another seed, another size and another heuristic each
 time, and skip=auto and skip=none in turn. Every render is added to the record at once; Ctrl-C ends the one
-that runs after its pass, a second Ctrl-C at once, and then it is not in the record. Exit status 1 if the
-record has a value that is not finite, or a render that failed.
+that runs after its pass, a second Ctrl-C at once, and then it is not in the record. A scene of which several
+renders have failed is left out until the plugin's source is another. A run that adds to docs/endurance.json
+ends by writing the table between the lines `<!-- report: endurance -->` and `<!-- end -->` of docs/stress.md.
+
+Exit status 130 if the run was interrupted; else 1 if the record has a value that is not finite or a render
+that failed, of whatever version; 2 for a mistake, 0 if all is well.
 """
 
 from __future__ import annotations
@@ -27,14 +31,17 @@ import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import reference
 from mistakes import answered
-from mitsuba_bdpt.files import replacing
+from mitsuba_bdpt import __main__ as command
 from mitsuba_bdpt.mis import HEURISTICS
-from report import table
+from mitsuba_bdpt.render import INTERRUPTED
+from report import replace_part, write_text
+from tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
 RECORD = reference.ROOT / "docs" / "endurance.json"
+PAGE = reference.ROOT / "docs" / "stress.md"
 
 # Camera samples of all scenes together.
 TARGET = 10**10
@@ -46,6 +53,12 @@ RENDER_SAMPLES, RENDER_SECONDS = 1 << 28, 40.0
 SIZES = (256, 127, 640, 65, 512, 31)
 
 SKIPS = ("auto", "none")
+
+# Renders of a scene that may fail before it is left out.
+MOST_FAILURES = 3
+
+# Counts of a record that must be 0. (`failed` is a list of texts.)
+WRONG = ("non_finite", "non_finite_in_pilot", "pixels_not_finite", "failed")
 
 
 def settings(number: int) -> tuple[dict, int]:
@@ -63,24 +76,19 @@ def read(path: Path) -> dict:
     return json.loads(path.read_text()) if path.exists() else {"scenes": {}}
 
 
-def write(path: Path, record: dict) -> None:
-    """Write at once: a process that is killed leaves the whole file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n")
-
-
 def empty() -> dict:
     """What is known of a scene before its first render."""
     return {
         "samples": 0,
         "non_finite": 0,
+        "non_finite_in_pilot": 0,
         "pixels_not_finite": 0,
         "seconds": 0.0,
         "renders": 0,
         "kernels_compiled": 0,
         "peak_memory": 0,
         "failed": [],
+        "failed_by_source": {},
         "samples_by": {},
     }
 
@@ -150,7 +158,8 @@ def rendered(name: str, number: int, samples: int, timeout: float, interruption:
             f"render {number}, {parameters}, width {width}: {' '.join(str(error).split())[:300]}"
         ]
     found["seconds"] = time.perf_counter() - started
-    found["non_finite"] = statistics.get("non_finite", 0)
+    for key in ("non_finite", "non_finite_in_pilot"):
+        found[key] = statistics.get(key, 0)
     found["kernels_compiled"] = statistics.get("kernels", {}).get("compiled", 0)
     found["peak_memory"] = peak()
     key = f"skip={parameters['skip']} heuristic={parameters['heuristic']} width={width}"
@@ -159,11 +168,15 @@ def rendered(name: str, number: int, samples: int, timeout: float, interruption:
 
 
 def added(entry: dict, found: dict) -> dict:
-    """Both together: the sum of all but the peak."""
-    by = {key: entry["samples_by"].get(key, 0) + n for key, n in found["samples_by"].items()}
-    total = {key: entry[key] + found[key] for key in entry if key != "samples_by"}
+    """Both together: the sum of all but the peak. (Older records lack some of the keys.)"""
+    entry, total = empty() | entry, {}
+    for key, value in entry.items():
+        if isinstance(value, dict):
+            total[key] = value | {name: value.get(name, 0) + n for name, n in found[key].items()}
+        else:
+            total[key] = value + found[key]
     total["peak_memory"] = max(entry["peak_memory"], found["peak_memory"])
-    return total | {"samples_by": entry["samples_by"] | by, "seconds": round(total["seconds"], 3)}
+    return total | {"seconds": round(total["seconds"], 3)}
 
 
 def samples_of(record: dict) -> int:
@@ -171,33 +184,46 @@ def samples_of(record: dict) -> int:
     return sum(entry["samples"] for entry in record["scenes"].values())
 
 
-def add(path: Path, name: str, found: dict) -> dict:
-    """Add what a render found to the record on disk; returns it."""
+def add(path: Path, name: str, found: dict, source: str) -> dict:
+    """Add what a render of this version of the ``source`` found to the record on disk; returns it."""
     record = read(path)
+    if found["failed"]:
+        found = found | {"failed_by_source": {source: len(found["failed"])}}
     record["scenes"][name] = added(record["scenes"].get(name, empty()), found)
-    source = reference.source_digest()
     sources = record.setdefault("samples_by_source", {})
     sources[source] = sources.get(source, 0) + found["samples"]
     record["scenes"] = dict(sorted(record["scenes"].items()))
-    write(path, record)
+    reference.write_json(path, record)
     return record
+
+
+def left_out(record: dict, source: str) -> list[str]:
+    """Scenes that have failed too often with this version of the ``source`` to be tried again; with another
+    one they are."""
+    return [
+        name
+        for name, entry in record["scenes"].items()
+        if entry.get("failed_by_source", {}).get(source, 0) >= MOST_FAILURES
+    ]
 
 
 def run(path: Path, names: list[str], target: int, seconds: float, samples: int, interruption) -> None:
     """Renders of ``samples`` each until the record has ``target``, the time is over, or an interruption."""
-    end, record = time.monotonic() + seconds, read(path)
+    end, record, said = time.monotonic() + seconds, read(path), set()
+    source = reference.source_digest()  # of what is imported, whatever is edited meanwhile
     while samples_of(record) < target and (left := end - time.monotonic()) > 0 and not interruption.asked:
         # A scene that fails at once must not be the next one for ever.
-        entries = {name: record["scenes"].get(name, empty()) for name in names}
-        name = min(names, key=lambda name: (entries[name]["seconds"], entries[name]["renders"]))
-        if len(entries[name]["failed"]) > 2:
-            names = [other for other in names if other != name]
-            if not names:
-                return
-            continue
+        out = left_out(record, source)
+        for name in [name for name in names if name in out and name not in said]:
+            said.add(name)
+            print(f"{name}: left out after {MOST_FAILURES} failures: {record['scenes'][name]['failed'][-1]}")
+        entries = {name: record["scenes"].get(name, empty()) for name in names if name not in out}
+        if not entries:
+            return
+        name = min(entries, key=lambda name: (entries[name]["seconds"], entries[name]["renders"]))
         timeout = min(left, RENDER_SECONDS)
         found = rendered(name, entries[name]["renders"], samples, timeout, interruption)
-        record = add(path, name, found)
+        record = add(path, name, found, source)
         rate = found["samples"] / max(found["seconds"], 1e-9)
         print(
             f"{name}: {found['samples']:.3g} samples, {rate:.2g} per second, {samples_of(record):.4g} in all"
@@ -205,13 +231,45 @@ def run(path: Path, names: list[str], target: int, seconds: float, samples: int,
         sys.stdout.flush()
 
 
+def in_words(count: int) -> str:
+    """A large number, to three digits."""
+    for size, word in ((10**12, "trillion"), (10**9, "billion"), (10**6, "million")):
+        if count >= 0.9995 * size:
+            return f"{count / size:.3g} {word}"
+    return f"{count:,}"
+
+
 def text(record: dict) -> str:
-    """The record as a table."""
+    """The record in words and as a table."""
+    entries = record["scenes"].values()
+    total = {key: sum(entry[key] for entry in entries) for key in ("renders", "seconds")}
+    lost = {key: _count(entries, key) for key in WRONG}
+    words = (
+        f"{in_words(samples_of(record))} camera samples in {total['renders']} renders of {len(entries)} "
+        f"scenes, {total['seconds'] / 3600:.1f} hours: {lost['non_finite']} values and "
+        f"{lost['pixels_not_finite']} pixels not finite, {lost['non_finite_in_pilot']} values of pilots, "
+        f"{lost['failed']} renders failed."
+    )
+    out = left_out(record, reference.source_digest())
+    if out:
+        words += f" Left out after {MOST_FAILURES} failures with this version of the source: "
+        words += ", ".join(f"`{name}`" for name in out) + "."
+    return f"{words}\n\n{_table(record)}"
+
+
+def _count(entries, key: str) -> int:
+    """Of all ``entries``; older records lack some of the keys."""
+    values = [entry.get(key, 0) for entry in entries]
+    return sum(len(value) if isinstance(value, list) else value for value in values)
+
+
+def _table(record: dict) -> str:
     rows = [
         [
             f"`{name}`",
             f"{entry['samples']:.3g}",
             f"{entry['non_finite']}",
+            f"{entry.get('non_finite_in_pilot', 0)}",
             f"{entry['pixels_not_finite']}",
             f"{len(entry['failed'])}",
             f"{entry['seconds']:.0f}",
@@ -221,14 +279,13 @@ def text(record: dict) -> str:
         ]
         for name, entry in record["scenes"].items()
     ]
-    heads = ["scene", "samples", "not finite", "pixels not finite", "failed", "seconds", "renders"]
-    return table([*heads, "worst memory", "kernels compiled"], rows)
+    heads = ["scene", "samples", "not finite", "in pilots", "pixels not finite", "failed", "seconds"]
+    return table([*heads, "renders", "worst memory", "kernels compiled"], rows)
 
 
 def is_clean(record: dict) -> bool:
     """Whether every value was finite and no render failed."""
-    wrong = ("non_finite", "pixels_not_finite", "failed")
-    return not any(entry[key] for entry in record["scenes"].values() for key in wrong)
+    return not any(_count(record["scenes"].values(), key) for key in WRONG)
 
 
 def main(arguments=None) -> int:
@@ -238,10 +295,13 @@ def main(arguments=None) -> int:
     )
     known = reference.scene_names()
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; default: all")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="default: until there are --samples")
-    parser.add_argument("--samples", type=float, default=TARGET, help="of all; default: %(default).0e")
+    text_ = "default: until there are --samples"
+    parser.add_argument("--seconds", type=command.number(float, 0), default=math.inf, help=text_)
+    text_ = "of all; default: %(default).0e"
+    parser.add_argument("--samples", type=command.number(float, 1), default=TARGET, help=text_)
     text_ = "camera samples of one render; default: %(default)s"
-    parser.add_argument("--render-samples", type=int, default=RENDER_SAMPLES, metavar="N", help=text_)
+    whole = command.number(int, 1)
+    parser.add_argument("--render-samples", type=whole, default=RENDER_SAMPLES, metavar="N", help=text_)
     parser.add_argument("--record", type=Path, default=RECORD, help="default: docs/endurance.json")
     parser.add_argument("--show", action="store_true", help="print the record only")
     args = parser.parse_args(arguments)
@@ -254,9 +314,10 @@ def main(arguments=None) -> int:
         with interruption.listening():
             run(args.record, names, int(args.samples), args.seconds, args.render_samples, interruption)
     record = read(args.record)
-    print(text(record))
-    print(f"{samples_of(record):.4g} samples in all" + (", interrupted" if interruption.asked else ""))
-    return 130 if interruption.asked else not is_clean(record)
+    print(text(record) + "interrupted" * interruption.asked)
+    if not args.show and args.record.resolve() == RECORD.resolve():
+        write_text(PAGE, replace_part(PAGE.read_text(), "endurance", text(record)))
+    return INTERRUPTED if interruption.asked else not is_clean(record)
 
 
 if __name__ == "__main__":

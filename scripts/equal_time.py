@@ -23,7 +23,7 @@ import numpy as np
 import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from mistakes import answered, check_output
-from mitsuba_bdpt.__main__ import number, property_
+from mitsuba_bdpt.__main__ import number
 from mitsuba_bdpt.files import replacing
 from mitsuba_bdpt.loading import choose_sensor
 from reference import RESOLUTION, benchmark_depth
@@ -56,12 +56,6 @@ class Shot:
     def caption(self) -> str:
         """Beneath the image."""
         return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.rel_mse:.2g} (trimmed)"
-
-
-def integrator(words: str, depth: int):
-    """The plugin ``TYPE KEY=VALUE …``."""
-    kind, *properties = words.split()
-    return mi.load_dict({"type": kind, "max_depth": depth} | dict(property_(text) for text in properties))
 
 
 def subject(path: Path, sampler: str | None, exr: Path | None):
@@ -100,7 +94,7 @@ def seconds(scene, made, spp: int) -> float:
 
 def shots(scene, target: np.ndarray, names: list[str], depth: int, spp: int) -> list[Shot]:
     """All integrators; the last has ``spp`` samples per pixel, others as many as its seconds allow."""
-    made = [integrator(name, depth) for name in names]
+    made = [reference.integrator_of(name, depth) for name in names]
     limit, found = seconds(scene, made[-1], spp), []
     for name, one in zip(names, made, strict=True):
         count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))

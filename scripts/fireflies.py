@@ -11,7 +11,7 @@ kind of path:
 * error: the share of the squared error of all renders that these samples have; largest: how far one is off,
   in values of its pixel; samples: how many of the samples examined (``--top`` of each render).
 * path: from the lamp L to the eye E in P. Heckbert's letters, S for delta events, G for rough ones, D for
-  diffuse ones, and the materials on the way; `|` is where the strategy joins light and camera vertices.
+  diffuse ones, and the materials on the way; `¦` is where the strategy joins light and camera vertices.
 * other strategies: the densest other one, with its density over that of the strategy that made the path, by
   one sample of each; "none" if no other can make it.
 * `path`: what Mitsuba's `path` adds with the same path (s = 0 and s = 1, balance heuristic) over what was
@@ -32,6 +32,7 @@ import recording
 import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon
 from mistakes import answered
+from mitsuba_bdpt.__main__ import number
 from reference import benchmark_depth
 from stress_cases import oracle
 from tables import table
@@ -39,7 +40,7 @@ from tables import table
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-# Estimates and weights are the same up to this. (Roulette comes on top, see `_same`.)
+# Estimates and weights are the same up to this. (Roulette comes on top, see `_found_anew`.)
 AGREE = 1e-2
 
 
@@ -74,7 +75,7 @@ class Names:
         }
 
     def letters(self, path) -> str:
-        """Heckbert's letters from the lamp to the eye, `|` where the strategy joins."""
+        """Heckbert's letters from the lamp to the eye, `¦` where the strategy joins."""
         found = ["E"] + ["S" if d else "?" for d in path.delta[1:-1]] + ["L"]
         for i, letter in enumerate(found):
             if letter == "?":
@@ -221,14 +222,16 @@ def main(arguments=None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
-    parser.add_argument("--seeds", type=int, default=5, help="renders of each scene")
-    parser.add_argument("--spp", type=int, default=64)
+    whole = number(int, 1)
+    parser.add_argument("--seeds", type=whole, default=5, help="renders of each scene")
+    parser.add_argument("--spp", type=whole, default=64)
     text = "one for which there is a reference; default %(default)s"
-    parser.add_argument("--resolution", type=int, default=reference.RESOLUTION, help=text)
-    parser.add_argument("--max-depth", type=int, help="default: that of the benchmark")
-    parser.add_argument("--level", type=float, default=0.5, help="values of its pixel, see above")
-    parser.add_argument("--top", type=int, default=12, help="samples examined of each render")
-    parser.add_argument("--lines", type=int, default=6, help="kinds of paths of each scene")
+    parser.add_argument("--resolution", type=whole, default=reference.RESOLUTION, help=text)
+    parser.add_argument("--max-depth", type=whole, help="default: that of the benchmark")
+    text = "values of its pixel, see above; default %(default)s"
+    parser.add_argument("--level", type=number(float, 1e-9), default=0.5, help=text)
+    parser.add_argument("--top", type=whole, default=12, help="samples examined of each render")
+    parser.add_argument("--lines", type=whole, default=6, help="kinds of paths of each scene")
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     rows, said = [], []

@@ -23,6 +23,7 @@ import drjit as dr
 import reference
 from mistakes import answered
 from mitsuba_bdpt import passes, points, rendering, sinks
+from mitsuba_bdpt.__main__ import number
 from mitsuba_bdpt.kernel import trace
 from mitsuba_bdpt.objects import step_by_step
 
@@ -123,7 +124,7 @@ def main(arguments=None) -> int:
     """Print the ratio per scene."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=number(int, 1), default=5)
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     for name in options.scene:

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import mitsuba_bdpt
 from mitsuba_bdpt.files import check_writable
-from mitsuba_bdpt.render import message
+from mitsuba_bdpt.render import MAGIC, message, prepare_output
 
 STATUS = 2
 SOURCES = Path(__file__).resolve().parent, Path(mitsuba_bdpt.__file__).resolve().parent
@@ -62,9 +62,21 @@ def _is_raised_here(error: Exception) -> bool:
 
 
 def check_output(path: Path, suffix: str) -> None:
-    """Refuse, before anything is rendered, an output of another ``suffix`` or one that cannot be written;
-    its folder is made."""
+    """Refuse, before anything is rendered, an output of another ``suffix``, one that cannot be written, and
+    one that would overwrite an image of another format; its folder is made. With an EXR goes a PNG of its
+    name, as from the command ``render``."""
+    if suffix == ".exr":
+        prepare_output(path)
+        return
     if path.suffix.lower() != suffix:
         raise ValueError(f"output={str(path)!r} must end in {suffix}")
+    if suffix in MAGIC and path.is_file():  # of a pipe nothing must be read
+        with path.open("rb") as file:
+            start = file.read(4)
+        if start and start != MAGIC[suffix]:
+            raise ValueError(
+                f"output={str(path)!r} would overwrite a file that exists and is not {suffix[1:].upper()}. "
+                "Move it away, or name another output."
+            )
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)

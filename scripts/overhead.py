@@ -22,7 +22,7 @@ import mitsuba as mi  # isort: skip
 import reference
 from mistakes import answered
 from reference import benchmark_depth
-from report import table
+from tables import table
 from timing import timed
 
 ROUNDS, SHORT, LONG = 7, 4, 64

@@ -21,7 +21,7 @@ import numpy as np
 import reference
 from mistakes import answered
 from reference import RESOLUTION, benchmark_depth
-from report import table
+from tables import table
 
 BUDGETS, SEEDS = (16, 64), 5
 

@@ -22,6 +22,9 @@ from mitsuba_bdpt import bsdf, connect, emitters, kernel, rendering, sinks  # is
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
 
+# All of it is kept in single precision, in which whole numbers are exact up to here.
+MOST_LANES = 1 << 24
+
 
 @dataclass(frozen=True)
 class Launch:
@@ -50,10 +53,13 @@ class Outlier:
 
 
 class Collector(sinks.Image):
-    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel)."""
+    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel). Raises
+    ``ValueError`` for a launch of too many ``lanes``."""
 
     def __init__(self, film, least, lanes: int):
         super().__init__(film)
+        if lanes > MOST_LANES:
+            raise ValueError(f"{lanes} lanes in a launch, more than {MOST_LANES}: set a smaller spp_per_pass")
         self._least, self._lanes, self._width = mi.Float(least.ravel()), lanes, film.size[0]
         dr.make_opaque(self._least)
         # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
@@ -109,11 +115,14 @@ def _outlier(launch: Launch, row, lanes: int) -> Outlier:
 
 def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it: all samples larger than ``least`` (of the
-    image's shape) in one of the colours, largest first."""
+    image's shape) in one of the colours, largest first. Raises ``ValueError`` for a film of other colours."""
+    film = scene.sensors()[0].film()
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise ValueError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
     outliers = []
 
     def trace(traced, image, batch, points, of):
-        launch = Launch(copy(traced), batch, points, of, int(scene.sensors()[0].film().crop_size()[0]))
+        launch = Launch(copy(traced), batch, points, of, int(film.crop_size()[0]))
         lanes = -(-batch.pixels * batch.samples // traced.plan.served)
         collector = Collector(image._film, least, lanes)
         counts = kernel.trace(traced, collector, batch, points, of)
@@ -287,11 +296,17 @@ class Recorder:
                 total = self.add(traced, c, total, start, lane.shared)
             return total
         value, end = self._draw(traced, z, lane, stream, counters)
-        for c in found:
-            y = [self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))]
-            drawn = np.abs(end.T - y).max(axis=1) < 1e-3
-            self._note(c, dr.select(mi.Bool(drawn), value, 0))
+        drawn = np.argmin([self._distances(c, end) for c in found], axis=0) if found else None
+        for i, c in enumerate(found):
+            self._note(c, dr.select(mi.Bool(drawn == i), value, 0))
         return total + value
+
+    def _distances(self, c, end):
+        """How far the light vertex of a connection is from the ``end`` of a visibility ray, in each lane.
+        (Rays end short of the vertex drawn, by an offset that depends on the scene: it is the nearest one,
+        not one within a bound in units of the scene. One that is not seen adds nothing, drawn or not.)"""
+        y = np.array([self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))])
+        return np.where(self._numbers(c.active) > 0, np.linalg.norm(end.T - y, axis=1), np.inf)
 
     def _draw(self, traced, z, lane, stream, counters):
         """What the draw of one connection gives, and the position of the vertex drawn."""

@@ -47,6 +47,7 @@ from mistakes import answered
 
 import mitsuba as mi  # isort: skip
 from mitsuba_bdpt import render  # isort: skip
+from mitsuba_bdpt.__main__ import number, property_  # isort: skip
 from mitsuba_bdpt.checkpoints import named_files  # isort: skip
 from mitsuba_bdpt.files import replacing  # isort: skip
 from mitsuba_bdpt.loading import in_proportion  # isort: skip
@@ -168,6 +169,19 @@ def read_toml(path: Path) -> dict:
         return tomllib.loads(path.read_text())
     except ValueError as error:  # of TOML, or of text that is not UTF-8
         raise ValueError(f"{path} is not TOML: {error}") from error
+
+
+def write_json(path: Path, value) -> None:
+    """Write at once: a process that is killed leaves the whole file or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1) + "\n")
+
+
+def integrator_of(words: str, depth: int):
+    """The plugin ``TYPE KEY=VALUE …``."""
+    kind, *properties = words.split()
+    return mi.load_dict({"type": kind, "max_depth": depth} | dict(property_(text) for text in properties))
 
 
 def depth_in(preset: dict, name: str) -> int:
@@ -524,14 +538,13 @@ def main() -> int:
     )
     parser.add_argument("scenes", nargs="*", help="names in scenes/")
     parser.add_argument("--all", action="store_true", help="all scenes")
-    parser.add_argument("--spp", type=int, default=64, help="of the renders to judge; default %(default)s")
-    parser.add_argument("--seconds", type=float, default=600, help="per scene; default %(default)s")
-    parser.add_argument("--resolution", type=int, default=RESOLUTION, help="width; default %(default)s")
+    whole, text = number(int, 1), "of the renders to judge; default %(default)s"
+    parser.add_argument("--spp", type=whole, default=64, help=text)
+    text = "per scene; default %(default)s"
+    parser.add_argument("--seconds", type=number(float, 0), default=600, help=text)
+    parser.add_argument("--resolution", type=whole, default=RESOLUTION, help="width; default %(default)s")
     parser.add_argument("--max-depth", type=int, help="default: that of the benchmark")
     args = parser.parse_args()
-    for key in ("spp", "resolution"):
-        if getattr(args, key) < 1:
-            parser.error(f"--{key} {getattr(args, key)} must be at least 1")
     if args.resolution % TILES:
         parser.error(f"--resolution {args.resolution} must be divisible by {TILES}")
     if args.max_depth == 0 or (args.max_depth or 1) < -1:

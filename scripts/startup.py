@@ -15,7 +15,7 @@ import tempfile
 
 from mistakes import answered
 from probes import numbers
-from report import table
+from tables import table
 
 COUNTS = ((1, 1), (30, 1), (300, 1), (1, 10), (1, 100))
 

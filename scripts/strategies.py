@@ -28,6 +28,7 @@ import mitsuba as mi  # noqa: E402
 import reference  # noqa: E402
 from metrics import tone_map  # noqa: E402
 from mistakes import answered, check_output  # noqa: E402
+from mitsuba_bdpt.__main__ import number  # noqa: E402
 from mitsuba_bdpt.render import write_images  # noqa: E402
 
 KINDS = ("weighted", "unweighted")
@@ -103,12 +104,14 @@ def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", help="a scene file, or a name in scenes/")
     parser.add_argument("-o", "--output", type=Path, help="default: renders/pyramid_SCENE")
-    parser.add_argument("--max-depth", type=int, default=5, help="longest path in edges; default 5")
-    parser.add_argument("--spp", type=int, default=64)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resolution", type=int, help="value of $resolution in the scene file")
+    whole = number(int, 1)
+    parser.add_argument("--max-depth", type=whole, default=5, help="longest path in edges; default 5")
+    parser.add_argument("--spp", type=whole, default=64)
+    parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0)
+    parser.add_argument("--resolution", type=whole, help="value of $resolution in the scene file")
     parser.add_argument("--heuristic", default="balance")
-    parser.add_argument("--exposure", type=float, default=0.0, help="stops, of the pictures")
+    stops = number(float, -100, 100)
+    parser.add_argument("--exposure", type=stops, default=0.0, help="stops, of the pictures")
     options = parser.parse_args(arguments)
     if options.max_depth < SHORTEST:
         raise ValueError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")

@@ -17,7 +17,7 @@ import numpy as np
 from metrics import TRIM
 from mistakes import answered
 from reference import benchmark_depth
-from report import table
+from tables import table
 
 import mitsuba as mi  # isort: skip
 import reference

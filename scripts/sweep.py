@@ -219,7 +219,7 @@ class Bench:
                 pairs = [
                     [self.timed(c, largest, seed)[1] for c in (first, cell)] for seed in range(CALIBRATIONS)
                 ]
-                write_json(kept, float(np.median([ours / theirs for ours, theirs in pairs])))
+                reference.write_json(kept, float(np.median([ours / theirs for ours, theirs in pairs])))
             self._spp[cell.method] = json.loads(kept.read_text())
         wanted = cell.budget * self._spp[cell.method]
         if cell.sampler == "independent":
@@ -269,7 +269,7 @@ def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None
     """Write the image and the row of a cell, the errors against ``judge`` (see `judge_of`) added."""
     reference.write_exr(image_file(output, cell), {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
     found = row | errors(image, *judge, cell.seed == FIRST_SEED)
-    write_json(cell_file(output, cell), found)
+    reference.write_json(cell_file(output, cell), found)
 
 
 # -- on a worker of a cluster ------------------------------------------------------------------
@@ -349,13 +349,6 @@ def errors(image, ref: reference.Reference, ref_sha256: str, flip: bool) -> dict
     }
 
 
-def write_json(path: Path, value) -> None:
-    """Write at once: a process that is killed leaves the whole file or none."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1) + "\n")
-
-
 class Sweep:
     """A preset being rendered into a folder; ``failed``: what went wrong, a text each."""
 
@@ -393,7 +386,7 @@ class Sweep:
             try:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
                     kept[name] = key | {"values": probes.PROBES[name](rounds)}
-                    write_json(file, kept)
+                    reference.write_json(file, kept)
             except Exception as error:  # a probe must not cost the cells
                 self.failed.append(f"{name}: {error}")
             self.progress.advance(self._task)
@@ -494,7 +487,7 @@ def read_rows(output: Path, cells) -> list[dict]:
         if not path.exists() or row["reference_sha256"] != reference.digest(path):
             (image,), _ = reference.read_exr(image_file(output, cell), "")
             row |= errors(image, *judge_of(*where), cell.seed == FIRST_SEED)
-            write_json(file, row)
+            reference.write_json(file, row)
         found.append(row)
     return found
 

@@ -1,4 +1,5 @@
-"""The one stopwatch of the scripts: seconds of a whole render."""
+"""The one stopwatch of the scripts for renders in this process: seconds of a whole one. (What a new process
+takes is measured in that process, see `probes`.)"""
 
 from __future__ import annotations
 

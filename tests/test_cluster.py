@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from mitsuba_bdpt import cluster
+from mitsuba_bdpt import cluster, rendering
 from mitsuba_bdpt.__main__ import main
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
@@ -70,6 +70,25 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
         merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, *part)))
     expected = np.array(scene.integrator().assemble(merged.snapshot, scene))[..., :3]
     np.testing.assert_allclose(pixels, expected, rtol=2e-3, atol=1e-6)
+
+
+def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
+    """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
+    values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the
+    pilot that the client asked; with decisions by hand there are none."""
+    lost = rendering.Render.lost_by_pilot
+    monkeypatch.setattr(rendering.Render, "lost_by_pilot", lambda self: lost(self) + 7 * (self._pilots > 0))
+    assert main(arguments(workers, tmp_path / "a.exr")) == 0
+    statistics = image(tmp_path / "a.exr")[1]
+    seconds = statistics["seconds"]
+    assert statistics["non_finite_in_pilot"] == 7 and seconds["pilot"] > 0
+    parts = sum(seconds[name] for name in ("compile", "pilot", "render"))
+    assert seconds["total"] == pytest.approx(parts, rel=1e-6)
+    assert {row["level"] for row in statistics["skipped"]}.isdisjoint({"by hand"})
+    given = ["-P", f"decisions={json.dumps(statistics['decisions'])}"]
+    assert main(arguments(workers, tmp_path / "b.exr", *given)) == 0
+    statistics = image(tmp_path / "b.exr")[1]
+    assert statistics["non_finite_in_pilot"] == 0 == statistics["seconds"]["pilot"]
 
 
 def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """scripts/endurance.py: what a run adds to the record of earlier ones."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -43,7 +44,7 @@ def test_runs_add_up(tmp_path, capsys):
     assert list(tmp_path.iterdir()) == [path]
     # More than are asked for: nothing is rendered.
     assert run(path, "--samples", 1) == (second, 0)
-    assert f"{endurance.samples_of(second):.4g} samples in all" in capsys.readouterr().out
+    assert f"{endurance.samples_of(second):,} camera samples in " in capsys.readouterr().out
 
 
 def test_settings_are_varied():
@@ -108,19 +109,10 @@ def test_an_interrupted_render_counts_its_passes(monkeypatch):
 
 
 def test_what_is_wrong_is_kept(tmp_path, monkeypatch):
-    """Expected: values that are not finite, and renders that fail, are in the record and in the exit status;
-    a scene that fails three times is left out, and the run ends."""
+    """Expected: values that are not finite, of images and of pilots, and renders that fail, are in the record
+    and in the exit status."""
     path = tmp_path / "record.json"
 
-    def fail(name, **definitions):
-        raise RuntimeError("no such thing")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(reference, "load_scene", fail)
-        record, status = run(path, "--samples", 1000)
-    assert status == 1 and [len(e["failed"]) for e in record["scenes"].values()] == [3, 3]
-    assert "no such thing" in record["scenes"]["cornell_box"]["failed"][0]
-    path.unlink()
     load = reference.load_scene
 
     def poisoned(name, **definitions):
@@ -134,7 +126,82 @@ def test_what_is_wrong_is_kept(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(reference, "load_scene", poisoned)
         record, status = run(path, "--samples", 1000)
+        # Two samples for each of the 256^2 pixels of a first render: enough for a pilot.
+        other = tmp_path / "other.json"
+        arguments = ["cornell_box", "--record", str(other), "--samples", "1000"]
+        assert endurance.main([*arguments, "--render-samples", str(1 << 17)]) == 1
+    assert json.loads(other.read_text())["scenes"]["cornell_box"]["non_finite_in_pilot"] > 100
     assert status == 1 and max(entry["non_finite"] for entry in record["scenes"].values()) > 100
+
+
+def no_scene(name, **definitions):
+    raise RuntimeError("no such thing")
+
+
+def failures(record):
+    return [len(entry["failed"]) for entry in record["scenes"].values()]
+
+
+def test_a_scene_that_fails_is_left_out_until_the_source_is_mended(tmp_path, monkeypatch, capsys):
+    """Expected: after three failures a scene is left out, which each run and the table say; the run ends;
+    with another source of the plugin, or a record that does not tell the source, it is tried again."""
+    path = tmp_path / "record.json"
+    monkeypatch.setattr(reference, "load_scene", no_scene)
+    for _ in range(2):
+        record, status = run(path, "--samples", 1000)
+        assert status == 1 and failures(record) == [3, 3]
+        out = capsys.readouterr().out
+        for name in SCENES:
+            assert f"{name}: left out after 3 failures: render 2" in out
+        assert "Left out after 3 failures with this version of the source: `cornell_box`, `furn" in out
+    assert "no such thing" in record["scenes"]["cornell_box"]["failed"][0]
+    monkeypatch.setattr(reference, "source_digest", lambda: "mended")
+    record, _ = run(path, "--samples", 1000)
+    assert failures(record) == [6, 6]
+    assert record["scenes"]["cornell_box"]["failed_by_source"]["mended"] == 3
+    for entry in record["scenes"].values():
+        del entry["failed_by_source"]
+    path.write_text(json.dumps(record))
+    assert failures(run(path, "--samples", 1000)[0]) == [9, 9]
+
+
+def test_what_pilots_lose_is_judged():
+    """Expected: values of pilots that are not finite are in the record, in words and in what the exit status
+    follows; a record of an older version, which has no such count, is read as one without any."""
+    older = {key: value for key, value in endurance.empty().items() if "pilot" not in key}
+    assert endurance.is_clean({"scenes": {"a": older}})
+    assert "0 values of pilots" in endurance.text({"scenes": {"a": older}})
+    found = endurance.added(older, endurance.empty() | {"non_finite_in_pilot": 3})
+    record = {"scenes": {"a": found}}
+    assert found["non_finite_in_pilot"] == 3 and not endurance.is_clean(record)
+    assert "3 values of pilots" in endurance.text(record)
+
+
+def test_a_run_ends_with_its_table_on_the_page(tmp_path, monkeypatch):
+    """Expected: a run that adds to the project's record writes its table, with the sum in words, between the
+    markers of the page, and nothing else of it; one with another record leaves the page as it is."""
+    page, marker = tmp_path / "stress.md", "<!-- report: endurance -->\n"
+    shutil.copy(endurance.PAGE, page)
+    assert page.read_text().count(marker) == 1
+    monkeypatch.setattr(endurance, "PAGE", page)
+    monkeypatch.setattr(reference, "load_scene", no_scene)
+    before = page.read_text().split(marker)
+    run(tmp_path / "other.json", "--samples", 1000)
+    assert page.read_text().split(marker) == before
+    monkeypatch.setattr(endurance, "RECORD", tmp_path / "record.json")
+    record, _ = run(tmp_path / "record.json", "--samples", 1000)
+    after = page.read_text().split(marker)
+    assert after[0] == before[0] and after[1].endswith("<!-- end -->" + before[1].split("<!-- end -->")[1])
+    assert endurance.text(record) in after[1] and "0 camera samples in 6 renders of 2 scenes" in after[1]
+
+
+def test_large_numbers_in_words():
+    assert [endurance.in_words(n) for n in (0, 65_536, 999_700_000, 12_345_678_901)] == [
+        "0",
+        "65,536",
+        "1 billion",
+        "12.3 billion",
+    ]
 
 
 @pytest.mark.parametrize("name", ["no_such_scene"])

@@ -1,6 +1,7 @@
 """The paths behind the worst values: scripts/fireflies.py, with recording.py and reconstruct.py."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import fireflies
 import mitsuba as mi
@@ -95,11 +96,24 @@ def test_the_worst_samples_of_all_strategies_are_found_anew():
     assert len({(f.path.s, f.path.t) for f in found}) >= 3
 
 
-def test_replays_add_up_to_what_was_rendered():
-    """Expected: the strategies of a camera sample, traced again, add up to what the render put into the
-    pixel, and each splat is found again (the same arithmetic: float32)."""
+def box(scale):
+    """Mitsuba's Cornell box with all lengths times ``scale``."""
     room = mi.cornell_box()
+    for part in room.values():
+        if isinstance(part, dict) and "to_world" in part:
+            part["to_world"] = T().scale(scale) @ part["to_world"]
+    look = T().look_at([0, 0, 3.9 * scale], [0, 0, 0], [0, 1, 0])
+    room["sensor"] |= {"to_world": look, "near_clip": 0.001 * scale, "far_clip": 100 * scale}
     room["sensor"]["film"] |= {"width": 12, "height": 12}
+    return room
+
+
+@pytest.mark.parametrize("scale", [1, 1e-4])
+def test_replays_add_up_to_what_was_rendered(scale):
+    """Rationale: which connection was drawn was told by a distance in units of the scene. Expected: the
+    strategies of a camera sample, traced again, add up to what the render put into the pixel, and each splat
+    is found again (the same arithmetic: float32), in a box of two units and in one of a five thousandth."""
+    room = box(scale)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.25})
     _, outliers = recording.render(mi.load_dict(room), integrator, np.full((12, 12, 3), 0.01), 16, 3)
     splats, samples = ([o for o in outliers if bool(o.s) is splat][:10] for splat in (True, False))
@@ -107,6 +121,21 @@ def test_replays_add_up_to_what_was_rendered():
     outliers = splats + samples
     for outlier, paths in zip(outliers, recording.replay(outliers), strict=True):
         assert sum(path.value for path in paths) == pytest.approx(outlier.value, rel=1e-4)
+
+
+def test_what_cannot_be_recorded_is_refused():
+    """Expected: a film whose bands are not three colours, and a launch whose lanes single precision cannot
+    number, are refused in words."""
+    film = SimpleNamespace(alpha=False, size=(1, 1))
+    with pytest.raises(ValueError, match="lanes in a launch, more than 16777216: set a smaller spp_per_pass"):
+        recording.Collector(film, np.ones((1, 1, 3)), (1 << 24) + 1)
+    recording.Collector(film, np.ones((1, 1, 3)), 1 << 24)
+    mi.set_variant("llvm_ad_spectral")
+    band = {"type": "spectrum", "value": [(450, 0), (500, 1), (550, 0)]}
+    sensor = {"type": "perspective", "film": {"type": "specfilm", "width": 4, "height": 4, "band": band}}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "sky": {"type": "constant"}})
+    with pytest.raises(ValueError, match="of class SpecFilm is not RGB; use hdrfilm"):
+        recording.render(scene, mi.load_dict({"type": "bdpt"}), np.ones((4, 4, 3)), 1, 0)
 
 
 def test_wrong_paths_are_not_found():

@@ -91,6 +91,61 @@ def test_an_interrupted_render_leaves_a_checkpoint_and_is_not_begun_anew(monkeyp
     assert "there is no checkpoint" in capsys.readouterr().err
 
 
+NAMES = """<scene version="3.0.0">
+    <!-- <string name="filename" value="gone.ply"/> -- -->
+    <default name="kind" value="default"/>
+    <include filename="more/part.xml"/>
+    <shape type="ply"><string value="turned.ply" name="filename"/></shape>
+    <texture type="bitmap"><string name="filename" value="$kind.exr"/></texture>
+    <spectrum name="radiance" filename="light.spd"/>
+</scene>"""
+PART = """<scene version="3.0.0"><path value="meshes"/>
+    <include filename="plain.xml"/>
+    <shape type="obj"><string name="filename" value="inner.obj"/></shape>
+    <texture type="bitmap"><string name="filename" value="$kind.exr"/></texture>
+</scene>"""
+
+
+def test_what_a_scene_names_is_part_of_it():
+    """Expected: whatever a scene file names, in any order of attributes, by a parameter, in a file that it
+    includes and in one that this includes, beside the one or the other or in a <path>: an edit of it makes
+    another scene. What stands in a comment is not named."""
+    Path("more/meshes").mkdir(parents=True)
+    files = ["turned.ply", "default.exr", "light.spd", "more/meshes/inner.obj", "more/plain.xml"]
+    for name in [*files, "given.exr", "gone.ply"]:
+        Path(name).write_text("<scene/>")
+    Path("scene.xml").write_text(NAMES)
+    Path("more/part.xml").write_text(PART)
+    options = build_parser().parse_args(["render", "scene.xml"])
+    given = build_parser().parse_args(["render", "scene.xml", "-D", "kind=given"])
+
+    def changes(options, name):
+        before = checkpoints.digest(options)
+        Path(name).write_text(Path(name).read_text() + " ")
+        return checkpoints.digest(options) != before
+
+    assert [name for name in (*files, "more/part.xml", "scene.xml") if not changes(options, name)] == []
+    assert not changes(options, "gone.ply") and not changes(options, "given.exr")
+    assert changes(given, "given.exr") and not changes(given, "default.exr")
+    Path("more/plain.xml").write_text("<scene>")
+    with pytest.raises(ValueError, match="plain.xml' is not well-formed XML"):
+        checkpoints.digest(options)
+
+
+def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):
+    """Rationale: the image would be half of one scene, half of the other."""
+    Path("a.xml").write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')
+    Path("part.xml").write_text(SCENE.read_text())
+    command = [ARGUMENTS[0], "a.xml", *ARGUMENTS[2:]]
+    arguments = [*command, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
+    interrupt(monkeypatch, arguments)
+    Path("part.xml").write_text(SCENE.read_text().replace("</scene>", "<!-- other --></scene>"))
+    assert main([*arguments, "--resume"]) == 1
+    assert "is of another scene" in capsys.readouterr().err
+    Path("part.xml").write_text(SCENE.read_text())
+    assert main([*arguments, "--resume"]) == 0
+
+
 def test_an_interruption_inside_a_pass(monkeypatch):
     """Rationale: Ctrl-C comes while a pass is being traced, not between two. Expected: what is written is the
     state after the last whole pass (here also the end of a replicate), and the render that goes on from it

@@ -18,6 +18,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt import render
 from mitsuba_bdpt.__main__ import build_parser, main
+from mitsuba_bdpt.loading import in_proportion
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
 
@@ -122,6 +123,23 @@ def test_definitions_seed_spp_and_exposure(scene):
     assert np.all(np.isin(np.array(mi.Bitmap("a.png")), [187, 188]))
     settings = json.loads(header["bdptSettings"])
     assert (settings["spp"], settings["seed"], settings["defines"]) == (2, 7, {"light": "0.25"})
+
+
+def test_a_width_changes_the_height_in_proportion(scene):
+    """Expected: of a file that has defaults for both, whatever the order of their attributes and whatever
+    stands in comments (two hyphens too, as Mitsuba takes them); not where the height is given, and nothing
+    of text that is not XML, about which Mitsuba has its own words."""
+    heights = """<!-- -- <default name="resolution" value="1"/> -->
+    <default value="256" name="resolution"/>
+    <default
+        name='resolution_y' value='144'/>"""
+    scene.write_text(SCENE.replace('<default name="light" value="2"/>', heights))
+    both = {"resolution": "512", "resolution_y": 288}
+    assert in_proportion(scene, {"resolution": "512"}) == both
+    for given in ({}, {"resolution": "512", "resolution_y": "7"}, {"resolution": "wide"}):
+        assert in_proportion(scene, given) == given
+    scene.write_text(heights)
+    assert in_proportion(scene, {"resolution": "512"}) == {"resolution": "512"}
 
 
 def test_film_component_format_is_kept(scene):

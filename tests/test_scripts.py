@@ -5,6 +5,7 @@ import shlex
 import sys
 from pathlib import Path
 
+import compare
 import equal_time
 import matplotlib.image
 import mistakes
@@ -91,6 +92,73 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
     error = capsys.readouterr().err
     (line,) = [line for line in error.splitlines() if line.startswith("error: ")]
     assert message in line and "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "candidates.py x --seeds -1",
+        "endurance.py --seconds nan",
+        "endurance.py --samples inf",
+        "endurance.py --render-samples 0",
+        "fireflies.py x --seeds 0",
+        "fireflies.py x --spp 0.5",
+        "fireflies.py x --resolution 0",
+        "fireflies.py x --max-depth 0",
+        "fireflies.py x --level nan",
+        "fireflies.py x --top 0",
+        "fireflies.py x --lines -1",
+        "floor.py x --rounds 0",
+        "reference.py x --seconds nan",
+        "reference.py x --spp 0",
+        "strategies.py x --spp 0",
+        "strategies.py x --seed -1",
+        "strategies.py x --resolution -8",
+        "strategies.py x --exposure nan",
+    ],
+)
+def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command):
+    """Rationale: NaN seconds ended at once or never, no samples at all were a warning of NumPy's. Expected:
+    the usage, which option is meant and what it takes, status 2."""
+    script, *words = command.split()
+    assert by_user(monkeypatch, script, *words) == 2
+    error = capsys.readouterr().err
+    assert f"argument {words[-2]}: got {words[-1]!r}, which must be" in error
+
+
+@pytest.mark.parametrize(
+    ("command", "taken"),
+    [
+        ("equal_time.py room.xml --reference flat.exr -o a.png", "a.png"),
+        ("strategies.py room.xml -o a", "a.png"),
+        ("strategies.py room.xml -o a", "a.exr"),
+        ("strategies.py room.xml -o a", "a_weighted.png"),
+    ],
+)
+def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, command, taken):
+    """Rationale: a name given by mistake must not cost the user the file. Expected: refused in words before
+    anything is rendered."""
+    reference.write_exr(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
+    Path(taken).write_text("precious")
+    before = sorted(Path().iterdir())
+    script, *words = command.split()
+    assert by_user(monkeypatch, script, *words) == 2
+    assert "would overwrite" in capsys.readouterr().err and Path(taken).read_text() == "precious"
+    assert sorted(Path().iterdir()) == before
+
+
+def test_a_comparison_with_what_has_no_error_is_refused(monkeypatch):
+    """Rationale: 0 / 0 and 1 / 0 stood in the table. Expected: words instead of figures, in a whole line."""
+
+    class Exact:
+        image, share_of = np.ones((8, 8, 3)), None
+
+    monkeypatch.setattr(reference, "load_reference", lambda *where: Exact())
+    monkeypatch.setattr(compare.Side, "of", lambda words, name: compare.Side(None, None))
+    monkeypatch.setattr(compare, "timed", lambda *what: (Exact.image, 1.0))
+    line = compare.line("furnace_white", ["path", "bdpt"], 4, 2)
+    assert len(line) == len(compare.HEADS) and line[:2] == ["`furnace_white`", "4"]
+    assert "exactly that of the reference" in line[2]
 
 
 def test_bugs_are_not_taken_for_mistakes():

@@ -418,7 +418,7 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
     beside it.
     """
     file = folder / "kept.json"
-    sweep.write_json(file, [1, 2])
+    reference.write_json(file, [1, 2])
     before = reference.Halves(folder / "sums.npz", "key")
     before.add([np.ones((4, 4, 3))] * 2)
 
@@ -426,7 +426,7 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
         raise SystemExit
 
     monkeypatch.setattr("os.replace", killed)
-    for write in (lambda: sweep.write_json(file, [3]), lambda: before.add([np.zeros((4, 4, 3))] * 2)):
+    for write in (lambda: reference.write_json(file, [3]), lambda: before.add([np.zeros((4, 4, 3))] * 2)):
         with pytest.raises(SystemExit):
             write()
     assert not list(folder.glob(".*"))

@@ -5,14 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import sys
 import time
 from argparse import Namespace
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from .files import check_writable, replacing
+from .loading import elements
 from .snapshot import Snapshot, read
 
 
@@ -21,18 +22,50 @@ def path_of(output: Path) -> Path:
     return output.with_suffix(".checkpoint.npz")
 
 
-def named_files(scene: Path) -> list[Path]:
-    """Meshes and textures that a scene file names by constants, as far as they exist."""
-    text = scene.read_text(encoding="utf-8", errors="replace")
-    names = re.findall(r'name="filename" value="([^"$]+)"', text)
-    return [path for path in (scene.parent / name for name in names) if path.is_file()]
+def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
+    """Meshes, textures, spectra and scene files that a scene file names, and those that the latter name, as
+    far as they exist; raises ``ValueError`` if one of the scene files is not XML. ``definitions`` of
+    parameters, for names that hold some."""
+    found = []
+    _note_files(scene, dict(definitions), [Path()], found)
+    return found
+
+
+def _note_files(scene: Path, values: dict, folders: list[Path], found: list[Path]) -> None:
+    """Add to ``found`` what a scene file names, looked for as Mitsuba does: beside it, then in ``folders``.
+    ``values`` of parameters, to which its own defaults are added."""
+    folders = [scene.parent, *folders]
+
+    def resolved(name, exists):
+        return next((folder / name for folder in folders if exists(folder / name)), None)
+
+    for element in elements(scene):
+        own = {key: _substituted(text, values) for key, text in element.attrib.items()}
+        if element.tag == "default":
+            values.setdefault(own.get("name", ""), own.get("value", ""))
+        elif element.tag == "path" and (folder := resolved(own.get("value", ""), Path.is_dir)):
+            folders.insert(0, folder)
+        name = own.get("value" if own.get("name") == "filename" else "filename")
+        path = resolved(name, Path.is_file) if name else None
+        if path is None:
+            continue
+        is_new = path not in found
+        found.append(path)
+        if element.tag == "include" and is_new:
+            _note_files(path, values, folders, found)
+
+
+def _substituted(text: str, values: dict) -> str:
+    """``text`` with the values of its parameters, longer names first, as one may begin with another."""
+    for key in sorted(values, key=len, reverse=True):
+        text = text.replace(f"${key}", values[key])
+    return text
 
 
 def digest(options: Namespace) -> str:
-    """Of a scene file, the meshes and textures that it names, the definitions on the command line and the
-    sensor."""
+    """Of a scene file, the files that it names, the definitions on the command line and the sensor."""
     found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor]).encode())
-    for path in (options.scene, *named_files(options.scene)):
+    for path in (options.scene, *named_files(options.scene, options.defines)):
         found.update(hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
 
@@ -57,8 +90,8 @@ def start(options: Namespace, output: Path) -> Snapshot:
     kept = read(path)
     if kept.progress.get("scene") != digest(options):
         raise ValueError(
-            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a mesh or "
-            "texture, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
+            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
+            "it names, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
             "or delete it."
         )
     return kept

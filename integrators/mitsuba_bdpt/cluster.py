@@ -78,13 +78,13 @@ class Merged:
 
 def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]):
     """Render as the command line ``options`` say on the cluster ``options.scheduler``, into the sensor's
-    film; returns the statistics, whose seconds are those of all parts together, and whether Ctrl-C came:
-    then they are of the parts before the first one that had not come. ``on_part`` is called after each part.
-    Raises what `connected` does."""
+    film; returns the statistics, whose seconds are those of the pilot and all parts together, and whether
+    Ctrl-C came: then they are of the parts before the first one that had not come. ``on_part`` is called
+    after each part. Raises what `connected` does."""
     started, merged, interrupted = time.perf_counter(), Merged(), False
     with connected(options.scheduler) as client:
         job = _job(scene, integrator, options, spp)
-        no_pilot = integrator.statistics.get("no_pilot", "")  # the parts know the decisions alone
+        asked = integrator.statistics  # before the parts, whose own take their place
         count = options.parts or PARTS_PER_WORKER * worker_count(client)
         parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
         try:
@@ -100,7 +100,19 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     if merged.snapshot is None:
         return {"passes": []}, interrupted
     integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
-    return integrator.statistics | {"no_pilot": no_pilot}, interrupted
+    return _with_pilot(integrator.statistics, asked), interrupted
+
+
+def _with_pilot(parts: dict, asked: dict) -> dict:
+    """Statistics of the ``parts``, which know the pilot's decisions alone, with what it left when it was
+    ``asked``; nothing where decisions were given by hand."""
+    if not asked:
+        return parts
+    sums = {
+        name: {key: number + asked[name][key] for key, number in parts[name].items()}
+        for name in ("seconds", "kernels")
+    }
+    return parts | {name: asked[name] for name in ("no_pilot", "non_finite_in_pilot", "skipped")} | sums
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:

@@ -6,6 +6,7 @@ import re
 from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mitsuba as mi
 
@@ -13,19 +14,32 @@ KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """What an integrator that replaces the scene's takes over: the same paths are to be found."""
 
 
+def elements(file: Path) -> list[ElementTree.Element]:
+    """All elements of a scene file, in its order; raises ``ValueError`` if it is not XML."""
+    text = file.read_text(encoding="utf-8", errors="replace")
+    try:
+        # Mitsuba takes comments that hold two hyphens, XML does not.
+        return list(ElementTree.fromstring(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)).iter())
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ValueError(f"{str(file)!r} is not well-formed XML: {error}") from error
+
+
 def in_proportion(scene: Path, definitions: dict) -> dict:
     """``definitions`` with the height ``resolution_y`` that belongs to the ``resolution`` among them, if the
     scene file has such defaults and it is not given: the image keeps its proportions."""
     if "resolution" not in definitions or "resolution_y" in definitions:
         return definitions
-    text = scene.read_text(encoding="utf-8", errors="replace")
-    width, height = (
-        re.search(rf'<default name="{key}" value="(\d+)"', text) for key in ("resolution", "resolution_y")
-    )
-    if not (width and height):
+    try:
+        defaults = [element for element in elements(scene) if element.tag == "default"]
+    except ValueError:  # Mitsuba, which takes more for XML, has the last word
         return definitions
-    scaled = int(definitions["resolution"]) * int(height[1]) / int(width[1])
-    return definitions | {"resolution_y": max(round(scaled), 1)}
+    # Of several with one name Mitsuba takes the first.
+    known = {element.get("name"): element.get("value", "") for element in reversed(defaults)}
+    texts = str(definitions["resolution"]), known.get("resolution", ""), known.get("resolution_y", "")
+    if not all(text.strip().isdecimal() for text in texts) or not int(texts[1]):
+        return definitions
+    asked, width, height = map(int, texts)
+    return definitions | {"resolution_y": max(round(asked * height / width), 1)}
 
 
 def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
