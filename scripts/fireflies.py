@@ -177,8 +177,12 @@ def _elsewhere(firefly: Firefly) -> tuple[str, str]:
     text = "none"
     if others[best] > 0:
         text = f"s = {best}, t = {len(density) - 1 - best}: {others[best]:.2g}x"
-    by_path = density[:2].sum() * path.weight
-    return text, f"{1 / by_path:.3g}x" if by_path > 0 else "cannot make it"
+    by_path = density[:2].sum()
+    if not by_path > 0:
+        return text, "cannot make it"
+    # `path` adds f / (p_0 + p_1), the render what it says: divided by its count, its roulette and its draw.
+    estimate = firefly.rebuilt.estimate(path.s).max()
+    return text, f"{estimate / by_path / path.value.max():.3g}x"
 
 
 HEAD = [
