@@ -17,10 +17,12 @@ from .counting import counted, short
 def _film(width, height, **keys):
     """A room of radiance 1 (its walls give 0.5, reflect half), seen through a film of this size."""
     film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, **keys}
+    # Where there are no pixels the larger axis has no field of view, and Mitsuba would speak of that.
+    axis = "larger" if min(width, height) > 0 else "x"
     return mi.load_dict(
         {
             "type": "scene",
-            "sensor": {"type": "perspective", "fov": 60, "fov_axis": "larger", "film": film},
+            "sensor": {"type": "perspective", "fov": 60, "fov_axis": axis, "film": film},
             "wall": {
                 "type": "sphere",
                 "flip_normals": True,

@@ -80,8 +80,8 @@ def _words(element) -> str:
 
 
 def _names(element) -> tuple[str, ...]:
-    """By which an error may name it."""
-    return (element.tag, *(element.get(key) for key in ("name", "type") if element.get(key)))
+    """By which an error may name it: its kind, name, plugin or value."""
+    return (element.tag, *element.attrib.values())
 
 
 # Numbers most often: other mistakes mostly end in the parser.

@@ -102,14 +102,14 @@ def _kept_by_dr_jit() -> int:
     return len(dr.whos(True).splitlines())
 
 
-# Parameters, the film's size and samples per pixel of renders in a row: plain ones; and ten in turn, of which
-# the first asks a pilot.
+# Parameters, the film's size and samples per pixel of renders in a row: plain ones; and twenty in turn, of
+# which the first asks a pilot. (One with the variance has nine passes.)
 PLAIN = (({}, SIZE, 1),)
 IN_TURN = (
     ({}, 48, 64),
-    *(({"variance": True}, SIZE, 16), ({"aovs": "albedo:albedo,nn:sh_normal"}, SIZE, 1)) * 2,
-    *(({"points": "sampler"}, SIZE, 1), ({"skip": "none"}, SIZE, 1)) * 2,
-    *PLAIN,
+    ({"variance": True}, SIZE, 16),
+    *(({"aovs": "albedo:albedo,nn:sh_normal"}, SIZE, 1), ({"points": "sampler"}, SIZE, 1)) * 6,
+    *(({"skip": "none"}, SIZE, 1), *PLAIN) * 3,
 )
 
 
@@ -440,7 +440,7 @@ def _spoiled():
 SAME = "the same image, up to the rounding of sums in another order (1e-4 of the mean)"
 STAYS = (
     "after a tenth of them no kernel is compiled; in the second half no variable of Dr.Jit more and less "
-    "than 2 MiB (a film of 8 x 8 and its sums take 10 KB, 500 of them 5 MB, 50 of 48 x 48 18 MB; pages come "
+    "than 2 MiB (a film of 8 x 8 and its sums take 10 KB, 500 of them 5 MB, 25 of 48 x 48 9 MB; pages come "
     "and go in hundreds of KB)"
 )
 
@@ -455,9 +455,9 @@ CASES = (
     _case("renders-100", "100 renders of 8 x 8 in one process", STAYS, partial(_in_a_row, 100, PLAIN), True),
     _case(
         "renders-1000",
-        "1,000 renders: of ten each one of 48 x 48 that asks a pilot, others with `variance`, `aovs`, "
+        "1,000 renders: of twenty each one of 48 x 48 that asks a pilot, others with `variance`, `aovs`, "
         "`points=sampler`, `skip=none` or plain",
-        f"{STAYS}; 100 pilots",
+        f"{STAYS}; 50 pilots",
         partial(_in_a_row, 1000, IN_TURN),
     ),
     _case(
