@@ -149,9 +149,9 @@ def _render_arguments(examples: int) -> Outcome:
 
 
 OR_WORDS = (
-    "a finite image, or an error whose words name what is wrong: while loading the element, its parameter or "
-    "its value, while rendering in words of ours; where a process dies or does not end, or an image is not "
-    "finite, `path` does alike"
+    "a finite image, or an error whose words name what is wrong: while loading the element or its line, its "
+    "parameter or its value, while rendering in words of ours; where a process dies or does not end, or an "
+    "image is not finite, `path` does alike"
 )
 AS_PATH = (
     f"{OR_WORDS}. Where `path` renders it too, its mean: within ten standard errors of four seeds and 2 % "
@@ -202,8 +202,8 @@ CASES = (
     _case(
         "film-sizes",
         "films of 0, 1 x 1, 1 x 4097, 40000 x 2, ... pixels in a room of radiance 1",
-        "refused in words that name width, height or crop window, or an image of that size and radiance: "
-        "within 20 %, for roulette leaves noise in one pixel, and no row or column below half of it, as one "
+        "refused in words that name width, height, both as `0 x 8` or the crop window, or an image of that "
+        "size and radiance: within 20 %, for roulette leaves noise in one pixel, and no row or column below half of it, as one "
         "that lost a side of its pixels would be; path tracing alone",
         partial(films.seen, films.SIZES, {"light_paths": 0}),
         True,

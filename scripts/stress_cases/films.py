@@ -46,7 +46,8 @@ def seen(films: dict[str, tuple], parameters: dict) -> Outcome:
             image = np.array(bdpt.render(_film(*size, **keys), spp=16), dtype=np.float64)
         except (ValueError, RuntimeError) as error:
             counts["refused"] += 1
-            named = any(name in str(error) for name in ("width", "height", "crop", "{} x {}".format(*size)))
+            window = keys.get("crop_width", size[0]), keys.get("crop_height", size[1])
+            named = any(name in str(error) for name in ("width", "height", "crop", "{} x {}".format(*window)))
             if shape is not None or not named:
                 wrong.append(f"{words}: {short(error)}")
         else:

@@ -49,6 +49,10 @@ class Made:
     names: tuple[str, ...]
 
 
+# What Mitsuba says of an element before what is wrong with it.
+PLACE = re.compile(r"\(line \d+, col \d+\): \w+")
+
+
 def _is_named(text: str, names) -> bool:
     """Whether one of ``names`` stands in ``text`` as a word. (Of long ones the beginning will do.)"""
     parts = (re.escape(name[:40]) + ("" if len(name) > 40 else r"(?!\w)") for name in names if name)
@@ -62,7 +66,7 @@ def _is_clear(result: dict, made: Made) -> bool:
     if stage == "image":
         return not result["bad"]
     if stage == "load":
-        return "Traceback" not in text and _is_named(text, made.names)
+        return "Traceback" not in text and (bool(PLACE.search(text)) or _is_named(text, made.names))
     return stage == "render" and "bdpt: " in text
 
 
