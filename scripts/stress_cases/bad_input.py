@@ -203,8 +203,8 @@ CASES = (
         "film-sizes",
         "films of 0, 1 x 1, 1 x 4097, 40000 x 2, ... pixels in a room of radiance 1",
         "refused in words that name width, height, both as `0 x 8` or the crop window, or an image of that "
-        "size and radiance: within 20 %, for roulette leaves noise in one pixel, and no row or column below half of it, as one "
-        "that lost a side of its pixels would be; path tracing alone",
+        "size and radiance: within 20 %, for roulette leaves noise in one pixel, and no row or column below "
+        "half of it, as one that lost a side of its pixels would be; path tracing alone",
         partial(films.seen, films.SIZES, {"light_paths": 0}),
         True,
     ),
