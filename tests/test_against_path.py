@@ -122,9 +122,10 @@ def test_choices_do_not_change_the_image(name):
 def test_light_of_delta_lamps_through_glass():
     """A delta lamp in a glass shell: light tracing alone agrees with all strategies where both can.
 
-    Rationale: known failure 15; `path` is black here, so the classes check each other. At
-    max_depth 4 and with light tracing only (no inner connections) t = 1 makes every path that
-    s = 0, 1 cannot, except those through glass on both sides of one vertex.
+    Rationale: mitsuba2 #262, #491, mitsuba3 #1462, a lamp behind glass lights nothing; `path` is
+    black here, so the classes check each other. At max_depth 4 and with light tracing only (no inner
+    connections) t = 1 makes every path that s = 0, 1 cannot, except those through glass on both sides of
+    one vertex.
     Expected: n1c0 is not above n1c1, and more than 99 % of the light is there; `path` has under
     50 % of it. Statistic: means of images over 16 renders, 4.5 standard errors.
     """
@@ -220,7 +221,7 @@ def sphere_lamp():
 def test_bumped_surfaces_equal_path(nested, lamp):
     """Light subpaths on bump- and normal-mapped surfaces agree with ``path``, the reference.
 
-    Rationale: known failure 17, a light tracer brighter than the path tracer on bumped surfaces.
+    Rationale: mitsuba3 #42, #45, a light tracer brighter than the path tracer on bumped surfaces.
     `path` (camera subpaths, the BSDF as it is evaluated from the camera) is the reference; t = 1
     alone and all strategies together must equal it. Expected: for paths of up to 3 edges, the image
     with all strategies equals `path`, and for the point lamp the unweighted t = 1 image of k = 2

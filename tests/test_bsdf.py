@@ -1,7 +1,9 @@
 """Every BSDF plugin of Mitsuba: densities, and the adjoint factor.
 
-Known failure 11 (a sampled density that is not the density), 16 and 17 in their pointwise form:
-whatever a light subpath carries through a surface must be what a camera subpath carries through it.
+In their pointwise form: a sampled density that is not the density (pbrt-v4 f739c887), a normal that
+differs between sampling and density (mitsuba3 #1952), a light tracer brighter than `path` on bumps
+(mitsuba3 #42, #45); whatever a light subpath carries through a surface must be what a camera subpath carries
+through it.
 """
 
 import math
@@ -165,7 +167,7 @@ def in_numpy(n, *values):
 @pytest.mark.parametrize("name", PLUGINS)
 @pytest.mark.parametrize("mode", ["Radiance", "Importance"])
 def test_sampled_density_is_the_density(name, mode):
-    """Where sample() does not return pdf(), `needs_full_pdf` says so (known failure 11).
+    """Where sample() does not return pdf(), `needs_full_pdf` says so (pbrt-v4 f739c887).
 
     Rationale: multiple importance sampling compares densities of strategies; the density of the
     lobe that was picked is not that of the direction. Expected: equal within 1e-3 relative for
@@ -266,7 +268,7 @@ def test_every_plugin_is_covered():
 def test_step_is_evaluation_over_density(name, direct_calls):
     """A sampled step's weight and densities are those of an evaluation of the same directions.
 
-    Rationale: known failure 1, where the walk carried the adjoint factor and the connection did
+    Rationale: pbrt-v3 #73, where the walk carried the adjoint factor and the connection did
     not. Expected: for smooth lobes weight = f |cos| / pdf, with the adjoint factor |n.c| / |n.l|
     about the *geometric* normal, computed here from world directions; 1e-3 relative to the largest
     channel (float32: 3e-5). The geometric normal is 0.4 rad off the frame, so that a factor with
@@ -387,7 +389,7 @@ def test_both_sides_carry_the_same(name, tilt, direct_calls):
 
 @pytest.mark.parametrize("name", ["normalmap glass", "normalmap mirror", "bumpmap glass"])
 def test_mapped_delta_events_that_camera_subpaths_cannot_make(name, direct_calls):
-    """Light subpaths carry nothing through a mapped delta surface that `path` does not (failure 17).
+    """Light subpaths carry nothing through a mapped delta surface that `path` does not (mitsuba3 #42, #45).
 
     Rationale: Mitsuba's bump and normal maps reject sampled directions on different sides of the
     surface and of the perturbed normal, but let a path arrive from there. `path`, the reference,

@@ -59,10 +59,12 @@ def test_settings_are_varied():
 
 
 def test_an_interrupted_run_goes_on(tmp_path):
-    """Expected: Ctrl-C in the middle of a render (a real process) leaves a whole record, with the samples of
-    the passes that were done, and status 130; the next run adds to it."""
+    """Expected: Ctrl-C in the middle of the second render (a real process) leaves a whole record, with that
+    render and the samples of its passes that were done beside those of the first one, and status 130; the
+    next run adds to it."""
     path = tmp_path / "record.json"
     command = [sys.executable, str(SCRIPT), "cornell_box", "--record", str(path)]
+    first = None
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen(
             [*command, "--render-samples", str(1 << 21)],
@@ -76,6 +78,8 @@ def test_an_interrupted_run_goes_on(tmp_path):
             while process.poll() is None:
                 assert time.monotonic() < deadline, (tmp_path / "log").read_text()
                 if path.exists():
+                    first = json.loads(path.read_text())
+                    time.sleep(0.5)  # into the second render, which takes seconds
                     process.send_signal(signal.SIGINT)
                     process.wait(timeout=240)
                 time.sleep(0.05)
@@ -84,7 +88,9 @@ def test_an_interrupted_run_goes_on(tmp_path):
             process.kill()
             process.wait()
     before = json.loads(path.read_text())
-    assert endurance.is_clean(before) and endurance.samples_of(before) > 0
+    assert endurance.is_clean(before)
+    (one,), (both,) = first["scenes"].values(), before["scenes"].values()
+    assert both["renders"] == one["renders"] + 1 and both["samples"] > one["samples"] > 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "record.json"]
     after, status = run(path, "--samples", endurance.samples_of(before) + 3000)
     assert status == 0

@@ -1,7 +1,7 @@
 """Bugs that other bidirectional path tracers had in public, each as a test that fails on the bug.
 
-Numbers before the threads are those of the project's list; 11 (a sampled density that is not the
-density) is in test_bsdf, 13 in test_rays. Where two images are compared, the statistic
+The thread where each was reported stands first; docs/stress.md has the table of all, with those whose tests
+are in other files. Where two images are compared, the statistic
 is Welch's t-test of tile means over seeds with Sidak's correction (`agree`); where the answer is
 known, the t-test against it. Seeds are fixed and differ between the two sides.
 """
@@ -137,7 +137,7 @@ def inside_of_a_sphere(bsdf):
 
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap"])
 def test_no_spikes_inside_a_bumpy_sphere(kind):
-    """1 (pbrt-v3 73): the adjoint factor of shading normals was in the walk but not at the join, and
+    """pbrt-v3 #73: the adjoint factor of shading normals was in the walk but not at the join, and
     spikes were blamed on near vertices. They grow with every bounce of the light subpath. Expected: in the
     image and in each light-side strategy's weighted image, up to paths of 8 edges, no pixel above three times
     its neighbourhood's median. Tolerance: noise at 256 spp reaches 2.1; the bug reaches 9 to 12 (bump map),
@@ -155,21 +155,21 @@ def test_no_spikes_inside_a_bumpy_sphere(kind):
 
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap", "bumpmap unflipped", "normalmap unflipped"])
 def test_light_side_agrees_with_camera_side_on_bumpy_surfaces(kind):
-    """17 (mitsuba3 42, 45): the light tracer was brighter than path on bumped surfaces. The
+    """mitsuba3 #42, #45: the light tracer was brighter than path on bumped surfaces. The
     reference is the camera side: Mitsuba's `path`. Expected: the unweighted images of every light-side
     strategy with k = 2 and k = 3 equal those of s = 1 (s = 3 only where normals are not turned towards
-    the camera), and all together equal `path`. Tolerance:
-    the confidence interval, below 2 % (the bug: 16 to 57 % per pixel). Statistic: Welch, 16 seeds
-    a side.
+    the camera), and all together equal `path`. Tolerance: the confidence interval of the image, below 1 % for
+    all together, 3 % for single strategies, unweighted and so noisier (the bug: 16 to 57 % per pixel).
+    Statistic: Welch, 16 seeds a side.
     """
     scene = inside_of_a_sphere(rough(kind))
     bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
     images, others = render(scene, bdpt, range(16), 256), render(scene, bdpt, range(50, 66), 256)
     for s, t in ((2, 1), (2, 2), *([(3, 1)] if kind.endswith("unflipped") else [])):
         reference = layer(others, bdpt, f"unweighted.s1t{s + t - 1}")
-        agree(tiles(layer(images, bdpt, f"unweighted.s{s}t{t}")), tiles(reference), 0.05)
+        agree(tiles(layer(images, bdpt, f"unweighted.s{s}t{t}")), tiles(reference), 0.03)
     path = integrator("path", max_depth=3, rr_depth=50)
-    agree(tiles(images[..., :3]), tiles(render(scene, path, range(50, 66), 512)), 0.02)
+    agree(tiles(images[..., :3]), tiles(render(scene, path, range(50, 66), 512)), 0.01)
 
 
 def ball_mesh(path, subdivisions=2):
@@ -238,7 +238,7 @@ def ball_mesh(path, subdivisions=2):
 
 
 def test_shading_normals_of_a_coarse_mesh(tmp_path):
-    """2 (pbrt-v4 385, 526, 13): without the adjoint factor a surface with interpolated normals is too
+    """pbrt-v4 #385, #526, #13: without the adjoint factor a surface with interpolated normals is too
     shiny on the light side. A ball of 80 triangles with vertex normals above a floor. Expected: t = 1
     and s = 1 alone agree, and everything agrees with `path` at depth 4. Tolerance: the confidence
     interval, below 3 %. Statistic: Welch, 16 seeds a side.
@@ -284,7 +284,7 @@ def test_shading_normals_of_a_coarse_mesh(tmp_path):
 )
 @pytest.mark.parametrize("inside", [False, True], ids=["outside", "inside"])
 def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
-    """3 and 16 (pbrt-v3 229, mitsuba3 1952): a mirrored emitter mesh with vertex normals emitted on
+    """pbrt-v3 #229, mitsuba3 #1952: a mirrored emitter mesh with vertex normals emitted on
     one side when hit and on the other when sampled; its normal differed between sampling and density.
     A ball of 20 triangles lights a floor from outside and, where its normals point inwards, nothing
     outside. Expected: s = 0, s = 1 and t = 1 alone agree, with direct light (k = 2) and seen
@@ -327,7 +327,7 @@ def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
 
 
 def test_emitter_meshes_are_lit_on_one_side():
-    """3: the cases above light both sides between them; a test of darkness alone would prove nothing.
+    """The cases above light both sides between them; a test of darkness alone would prove nothing.
     Expected: a rectangle, mirrored or not, emits along its normal only, for hits, next-event
     estimation and emission alike.
     """
@@ -356,7 +356,7 @@ def test_emitter_meshes_are_lit_on_one_side():
 
 
 def test_point_light_in_a_cornell_box_has_no_hot_pixel():
-    """4 (Mitsuba 0.6 132): a point light seen directly by a pinhole made one pixel above 80,000, and
+    """Mitsuba 0.6 #132: a point light seen directly by a pinhole made one pixel above 80,000, and
     ever hotter with the resolution. Expected: the largest pixel below 1.2 times that of `path`
     (where the brightest is the ceiling over the lamp), at 16x16 and at 64x64; the median is equal
     within 5 %. A seen point light would be 1e3 times and more. Statistic: none, bounds.
@@ -383,7 +383,7 @@ def test_point_light_in_a_cornell_box_has_no_hot_pixel():
     ids=["constant", "envmap"],
 )
 def test_environment_does_not_depend_on_other_objects(environment):
-    """5 (Mitsuba 0.6 80): brightness depended on other objects in the scene. A grey disk under a sky
+    """Mitsuba 0.6 #80: brightness depended on other objects in the scene. A grey disk under a sky
     of 0.8, alone, and with a small sphere far away, out of its sight, that makes the scene 30 times
     larger. Expected: t = 1 alone, and everything, give 0.8 x 0.5 on the disk. Tolerance: the
     confidence interval, below 5 %, for t = 1 in the large scene 50 %. Statistic: t-test, 16 seeds.
@@ -424,7 +424,7 @@ def known(samples, expected, relative, allowed=ROUNDING):
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_crop_window_equals_the_region_of_the_whole(rfilter):
-    """6 (pbrt-v4 347, 456): crop windows changed the number of light paths per pixel, in the image but
+    """pbrt-v4 #347, #456: crop windows changed the number of light paths per pixel, in the image but
     not in the weights. Expected: each strategy's unweighted image and the weighted sum equal the same
     region of the whole image (inner pixels: at the crop's border the filter lacks samples; weighted
     images differ by right, for a crop has fewer light subpaths per pixel than the whole). Tolerance: the
@@ -462,7 +462,7 @@ def test_crop_window_equals_the_region_of_the_whole(rfilter):
 
 @pytest.mark.parametrize("fov", [30, 1.5], ids=["the whole spot is seen", "a fiftieth of the spot is seen"])
 def test_narrow_spot_on_a_matte_floor(fov):
-    """7 (pbrt-v4 362): on a floor lit directly by a narrow spot, light tracing (s=2, t=1) was trusted
+    """pbrt-v4 #362: on a floor lit directly by a narrow spot, light tracing (s=2, t=1) was trusted
     too much. Expected: the variance with all strategies is below that of t = 1 alone and within the
     balance bound of next-event estimation's, mu^2 per sample above it. Seen as a whole, a lit pixel gets
     some eight splats per sample, and t = 1 itself is within that bound; of a fiftieth of the spot a pixel
@@ -501,10 +501,10 @@ def test_narrow_spot_on_a_matte_floor(fov):
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_borders_of_a_uniform_furnace(rfilter):
-    """8 (LuxCore 237, 239): dark or bright border rows with splats and filters. A sphere of radiance
+    """LuxCore #237, #239: dark or bright border rows with splats and filters. A sphere of radiance
     0.5 and reflectance 0.5 in which splats carry much of the light. Expected: the ring of border
-    pixels has the radiance 0.75 of depth 2, as has the rest. Tolerance: the confidence interval,
-    below 1 %. Statistic: t-test over 16 seeds.
+    pixels has the radiance 0.75 of depth 2, as have those within. Tolerance: the confidence
+    interval, below 0.5 %, and 0.1 % of the pixels within, which are more. Statistic: t-test over 16 seeds.
     """
     scene = mi.load_dict(
         {
@@ -520,7 +520,8 @@ def test_borders_of_a_uniform_furnace(rfilter):
     )
     image = render(scene, integrator(max_depth=2, skip="none"), range(16), 256).mean(-1)
     for border in (image[:, 0], image[:, -1], image[:, :, 0], image[:, :, -1]):
-        known(border.mean(1), 0.75, 0.01)
+        known(border.mean(1), 0.75, 0.005)
+    known(image[:, 1:-1, 1:-1].mean((1, 2)), 0.75, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -534,7 +535,7 @@ def test_borders_of_a_uniform_furnace(rfilter):
     ],
 )
 def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(lamp_pane, camera_pane, emitter):
-    """9 (LuxCore 678): brightness depended on the distance for certain paths. Removable panes force
+    """LuxCore #678: brightness depended on the distance for certain paths. Removable panes force
     strategies: one around the lamp leaves t = 1 and inner connections, with a lamp of area s = 0;
     one around the camera leaves s = 1 and inner; both leave inner alone (after two reflections), or
     s = 0. In a unit sphere of reflectance 1/2, light reflected m >= 2 times has the same radiance
@@ -583,11 +584,12 @@ def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(lamp_pane
 
 @pytest.mark.parametrize("weights", [(1, 1), (0.1, 5), (30, 1)], ids=str)
 def test_emitters_with_unequal_sampling_weights(weights):
-    """10 (LuxCore 671, 687): lights were picked with one probability by next-event estimation and with
-    another by emission. A point light in the centre (half of the light) and a small sphere, in the
-    unit sphere. Expected: all strategies that see a path alone agree on it: s = 1, inner and t = 1
-    at k = 3, and together they give the known radiance. Tolerance: the confidence interval, below
-    6 % (single strategies), 1 % (all). Statistic: t-test over 16 seeds.
+    """LuxCore #671, #687: lights were picked with one probability by next-event estimation and with
+    another by emission. Two point lights of the same power in the unit sphere, one in its centre.
+    Expected: all strategies that see a path alone agree on it: s = 1, inner and t = 1 at k = 3, and together
+    they give the known radiance. Tolerance: the confidence interval, below 6 % for single strategies (a
+    light that is picked once in 51 times makes few and bright subpaths), 1 % for all. Statistic: t-test over
+    16 seeds.
     """
     scene = mi.load_dict(
         {
@@ -606,16 +608,18 @@ def test_emitters_with_unequal_sampling_weights(weights):
     bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
     images = render(scene, bdpt, range(16), 256)
     for s in (1, 2, 3):
-        known(layer(images, bdpt, f"unweighted.s{s}t{4 - s}").mean((1, 2, 3)), 0.25, 0.3)
+        known(layer(images, bdpt, f"unweighted.s{s}t{4 - s}").mean((1, 2, 3)), 0.25, 0.06)
     total = sum(layer(images, bdpt, f"weighted.s{s}t{4 - s}").mean((1, 2, 3)) for s in range(4))
-    known(total, 0.25, 0.02)
+    known(total, 0.25, 0.01)
 
 
 def test_directional_light_on_a_wide_floor():
-    """12 (pbrt-v3 69, 21f2ece): a directional light was treated as point-like. A floor much wider than
+    """pbrt-v3 #69, 21f2ece: a directional light was treated as point-like. A floor much wider than
     the view, lit at 40 degrees. Expected: rho E cos / pi in every tile, for s = 1 exactly, for t = 1
     alone and for all together; doubling the floor changes nothing. Tolerance: the confidence
-    interval, below 10 % for t = 1, 1e-3 for the rest. Statistic: t-test over 16 seeds.
+    interval, below 1e-3 for s = 1; for t = 1, whose subpaths start on a disk as wide as the scene, so that
+    few meet the view, 3 % in tiles of 8 x 8 pixels and 1 % in the image; 1e-3 for all together. Statistic:
+    t-test over 16 seeds.
     """
     expected = 0.5 * 3 * np.cos(np.deg2rad(40)) / np.pi
     for size in (3, 6):
@@ -640,13 +644,13 @@ def test_directional_light_on_a_wide_floor():
         known(layer(images, bdpt, "unweighted.s1t2").mean((1, 2, 3)), expected, 1e-3)
         splat = tiles(layer(images, bdpt, "unweighted.s2t1"), 8)
         for tile in splat.T:
-            known(tile, expected, 0.2)
-        known(splat.mean(1), expected, 0.1)
-        known(images[..., :3].mean((1, 2, 3)), expected, 0.02)
+            known(tile, expected, 0.03)
+        known(splat.mean(1), expected, 0.01)
+        known(images[..., :3].mean((1, 2, 3)), expected, 1e-3)
 
 
 def test_point_light_in_a_glass_shell_lights_the_room():
-    """15 (mitsuba2 262, mitsuba3 1462): a lamp behind glass lights nothing, for `path` cannot find
+    """mitsuba2 #262, #491, mitsuba3 #1462: a lamp behind glass lights nothing, for `path` cannot find
     it. A point light in a shell of glass in the unit sphere. All light that leaves the shell is
     reflected on; glass absorbs nothing, so with every bounce the room is as bright as without the
     shell: 1 after all bounces but for paths that meet the shell again. Expected: `path` sees

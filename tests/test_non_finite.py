@@ -1,7 +1,7 @@
 """Values of users' plugins, textures and meshes that are not finite, and reflectances above 1.
 
-Families of such values are in scripts/stress_cases/non_finite.py, with what is expected of each and the
-reason of each tolerance; the quick ones are run by tests/test_stress.py.
+Families of such values are in scripts/stress_cases/non_finite.py and non_finite_shapes.py, with what is
+expected of each and the reason of each tolerance; the quick ones are run by tests/test_stress.py.
 """
 
 import mitsuba as mi
@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import suspects
 from stress_cases import cases
-from stress_cases.non_finite import NAN, Warned, filled, painted, room
+from stress_cases.poisons import NAN, filled, painted, room
+from stress_cases.warned import Warned
 
 CASES = {case.name: case for case in cases()}
 

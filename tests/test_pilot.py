@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import choice, kernel, mis, passes, pilot, rendering, sinks
 from mitsuba_bdpt.kernel import Batch, _Places
-from stress_cases.non_finite import Warned
+from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f
 
@@ -170,7 +170,7 @@ def test_choice(make, light, monkeypatch):
 
 def test_few_pixels():
     """Rationale: two samples of one pixel say nothing, and the splats of one pixel have a mean that counts.
-    Expected: for a film of 8 x 2 pixels a pilot has as many samples as for any other; renders ask none, have
+    Expected: for a film of 2 x 2 pixels a pilot has as many samples as for any other; renders ask none, have
     a light subpath for each camera subpath, and say why."""
     target = caustic(2)
     render = of(target)
@@ -209,7 +209,7 @@ def test_open_ends_are_not_counted_on():
 
 @pytest.mark.parametrize("fov", [40, 3], ids=["the whole spot is seen", "a part of the spot is seen"])
 def test_narrow_spot_is_not_noisier_than_path(fov):
-    """Known failure 7 (pbrt-v4 362): light tracing was trusted too much on a floor lit by a narrow spot.
+    """pbrt-v4 #362: light tracing was trusted too much on a floor lit by a narrow spot.
 
     Expected: with default parameters the variance, from 16 renders of 32 samples, summed over the image, is
     not above that of `path` with independent numbers (10 % allowed: twice the standard error of the ratio).

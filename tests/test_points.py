@@ -66,10 +66,10 @@ def test_draws_of_one_sample_are_independent(side):
 
 
 def test_samples_beyond_the_range_of_32_bits():
-    """Rationale: 1920x1080 pixels at 4,096 samples are 2^33 (known failure 14: others crashed or repeated
-    themselves past 2^32). Expected: the last pixel's samples have the exact numbers in the image's sequence,
-    none of 4,096 is drawn again 2^32 samples before, and their points are as even as any pixel's: one in each
-    cell of 64 x 64."""
+    """Rationale: 1920x1080 pixels at 4,096 samples are 2^33 (mitsuba3 #1353, #1335, #432: others crashed
+    or repeated themselves past 2^32). Expected: the last pixel's samples have the exact numbers in the
+    image's sequence, none of 4,096 is drawn again 2^32 samples before, and their points are as even as any
+    pixel's: one in each cell of 64 x 64."""
     pixels, spp = 1920 * 1080, 4096
     place = kernel._Places(SimpleNamespace(camera=None), kernel.Batch(pixels - 1, 1, 0, spp), spp)
     slot = dr.arange(mi.UInt32, spp)

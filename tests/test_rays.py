@@ -1,6 +1,6 @@
 """Rays: none finds its own start, none leaks, whatever the scale and the place of the scene.
 
-Known failure 13: offsets of 8.9e-5 (1 + max|p|) swallow small scenes and leave gaps in large ones.
+mitsuba3 #1871, #1962: offsets of 8.9e-5 (1 + max|p|) swallow small scenes and leave gaps in large ones.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -193,7 +193,7 @@ def _check_bad_rays(kind, folder, n):
 def test_no_ray_finds_its_own_start(kind, tmp_path):
     """Rays leave the surface that they start on, and none leaves a closed shape through it.
 
-    Rationale: known failure 13; the offset must clear the rounding error of the hit on every shape
+    Rationale: mitsuba3 #1871, #1962; the offset must clear the rounding error of the hit on every shape
     at every scale. Scene: one shape, convex where its kind allows, at scales 1e-3, 1 and 1e3 and
     moved by 1e3. Expected: of hits by rays from all sides, none finds its start again (from convex
     shapes outwards: nothing at all), and none of the rays that go into a closed shape fails to meet
@@ -256,7 +256,7 @@ def _points(place, n, rng, z, half=1.0):
 def test_thin_walls_block_and_ends_do_not(place, tmp_path):
     """A segment through a thin wall is blocked; without the wall, its ends do not block it.
 
-    Rationale: known failure 13: Mitsuba's offsets jump over walls of 1e-4 and shorten segments by a
+    Rationale: mitsuba3 #1871, #1962: Mitsuba's offsets jump over walls of 1e-4 and shorten segments by a
     relative 9e-4. Scene: two squares that face each other 0.02 apart, between them a plate 1e-3
     thick, as large as the squares; 1e6 pairs of points, found by rays. Expected: with the plate all
     segments between the squares are blocked, without it none. The moved scene, where coordinates
@@ -372,7 +372,7 @@ def scaled_scene(name, scale, **parameters):
 def test_scale_does_not_change_the_image(name):
     """A scene in millimetres or kilometres gives the image that it gives in metres.
 
-    Rationale: known failure 13. Expected: equal images at scale 1e-3 and 1e3, with emitters'
+    Rationale: mitsuba3 #1871, #1962. Expected: equal images at scale 1e-3 and 1e3, with emitters'
     radiances kept, to that of scale 1 (our own: `path` is right at unit scale only). Statistic:
     means of 4x4 tiles of 16x16 pixels, 12 renders a side at 32 samples with different seeds, Welch
     with Sidak at 1e-3. Fails with Mitsuba's own offsets, which swallow the small scene.

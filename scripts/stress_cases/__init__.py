@@ -12,6 +12,7 @@ SECTIONS = (
     "weights",
     "fireflies",
     "non_finite",
+    "non_finite_shapes",
     "bad_input",
     "processes",
 )

@@ -6,12 +6,17 @@ standard error is small over many pairs of scenes.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from metrics import Sample, sidak, tile_means, welch
 
 import mitsuba as mi  # isort: skip
 
 from .case import Outcome
+
+# What every comparison is made with.
+WAYS = {"default parameters": {}, "all strategies": {"skip": "none"}}
 
 # Chance that a right program fails one case, had the seeds not been fixed: the level of all t-tests of a
 # case together, after Sidak's correction.
@@ -46,7 +51,15 @@ def greens(scene, integrator: dict, seeds, spp: int) -> tuple[np.ndarray, int]:
     return np.stack(rows), broken
 
 
-def judged(ours, theirs: Sample, reach: float, what: str) -> Outcome:
+@dataclass(frozen=True)
+class Judged(Outcome):
+    """The outcome of a test, with its ``p`` and the largest relative error that it may overlook."""
+
+    p: float = 1.0
+    seen: float = 0.0
+
+
+def judged(ours, theirs: Sample, reach: float, what: str) -> Judged:
     """Welch's test of the tiles of ``ours``, Sidak over them; ``reach``: the largest relative error of the
     image's mean that it may overlook (three standard errors of the difference), else it shows nothing."""
     ours = Sample.of(ours)
@@ -55,19 +68,16 @@ def judged(ours, theirs: Sample, reach: float, what: str) -> Outcome:
     mean, expected = ours.mean[-1], theirs.mean[-1]
     seen = 3 * found.error[-1] / abs(expected)
     ok = np.isfinite(ours.mean).all() and p >= LEVEL and seen <= reach
-    return Outcome(
-        bool(ok),
-        f"mean {mean:.5g}, {what} {expected:.5g}; p = {p:.2g} over {len(found.p)} values; "
-        f"sees errors of {100 * seen:.2g} %",
-    )
+    text = f"mean {mean:.5g}, {what} {expected:.5g}; p = {p:.2g} over {len(found.p)} values; "
+    return Judged(bool(ok), f"{text}sees errors of {100 * seen:.2g} %", p, seen)
 
 
-def against(ours, theirs, reach: float, what: str = "`path`") -> Outcome:
+def against(ours, theirs, reach: float, what: str = "`path`") -> Judged:
     """`judged` against other renders."""
     return judged(ours, Sample.of(theirs), reach, what)
 
 
-def against_known(ours, expected, reach: float) -> Outcome:
+def against_known(ours, expected, reach: float) -> Judged:
     """`judged` against a value that is known for all tiles, or values as of `tiles`."""
     return judged(ours, Sample.known(np.broadcast_to(expected, ours.shape[1])), reach, "known")
 
@@ -88,11 +98,24 @@ def family(pairs, most_error: float) -> Outcome:
     return Outcome(of_all >= LEVEL and error <= most_error, text)
 
 
-def deviation(a: Sample, b: Sample) -> float:
-    """Root mean square of what the tiles of ``b`` are off, over the mean of ``a``, less noise."""
+def deviation(a: Sample, b: Sample) -> tuple[float, float]:
+    """Root mean square of what the tiles of ``b`` are off, over the mean of ``a``, less noise; and that
+    noise, the root mean square of their standard errors."""
     difference = welch(a, b)
-    square = (difference.value**2).mean() - (difference.error**2).mean()
-    return float(np.sqrt(max(square, 0)) / a.mean.mean())
+    noise = (difference.error**2).mean()
+    square = (difference.value**2).mean() - noise
+    return tuple(float(np.sqrt(max(x, 0)) / a.mean.mean()) for x in (square, noise))
+
+
+def worst(outcomes: dict[str, Judged]) -> Outcome:
+    """Several tests, by what was tried, as one: expected if all are. Of those that are, only the one with
+    the smallest p is told."""
+    wrong = {name: outcome for name, outcome in outcomes.items() if not outcome.ok}
+    if wrong:
+        return together(wrong)
+    least = min(outcomes, key=lambda name: outcomes[name].p)
+    text = f"{len(outcomes)} comparisons, the smallest p: {least}: {outcomes[least].happened}; all see "
+    return Outcome(True, f"{text}errors of {100 * max(outcome.seen for outcome in outcomes.values()):.2g} %")
 
 
 def together(outcomes: dict[str, Outcome]) -> Outcome:

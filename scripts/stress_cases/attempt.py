@@ -23,7 +23,8 @@ MEMORY = 16 << 30
 
 def attempt(path: str, integrator: str) -> dict:
     """``stage`` that was reached (``load``, ``render`` or ``image``), and an exception's ``kind`` and
-    ``text``, or of the images of all seeds: their ``means``, the number of values that are not ``finite``."""
+    ``text``, or of the images of all seeds: their ``means``, how many values of them are ``bad``, not finite,
+    and how many were ``counted`` and left out."""
     stage = "load"
     try:
         scene = mi.load_file(path, parallel=False, resolution=SIZE, integrator=integrator)
@@ -31,17 +32,19 @@ def attempt(path: str, integrator: str) -> dict:
         if not scene.sensors():
             raise ValueError("no sensor")
         stage = "render"
-        images = [np.array(used.render(scene, 0, seed=seed, spp=SPP), dtype=np.float64) for seed in SEEDS]
+        images, counted = [], 0
+        for seed in SEEDS:
+            images.append(np.array(used.render(scene, 0, seed=seed, spp=SPP), dtype=np.float64))
+            counted += getattr(used, "statistics", {}).get("non_finite", 0)
     except Exception as error:
         text = " ".join(str(error).split())
         return {"stage": stage, "kind": type(error).__name__, "text": text}
     bad = sum(int((~np.isfinite(image)).sum()) for image in images)
-    statistics = getattr(used, "statistics", {})
     return {
         "stage": "image",
         "means": [float(image.mean()) for image in images],
         "bad": bad,
-        "counted": statistics.get("non_finite", 0),
+        "counted": counted,
     }
 
 

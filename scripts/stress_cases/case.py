@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Outcome:
-    """``ok``: whether that happened which the case expects; ``happened``: what did, with its figures, a few
-    words of Markdown for the table."""
+    """``ok``: whether that happened which the case expects, None if it could not be tried here; ``happened``:
+    what did, with its figures, a few words of Markdown for the table."""
 
-    ok: bool
+    ok: bool | None
     happened: str
 
 
@@ -28,3 +28,8 @@ class Case:
     expected: str
     run: Callable[[], Outcome]
     quick: bool = False
+
+
+def of_section(section: str) -> Callable[..., Case]:
+    """Makes a `Case` of that section from its other fields, in their order."""
+    return lambda name, *rest, **more: Case(name, section, *rest, **more)

@@ -20,6 +20,9 @@ import numpy as np
 mi.set_variant("llvm_ad_rgb")
 """
 
+# Said of what can't be tried.
+NO_DISK = "this user can't mount a disk"
+
 
 def environment(**changes: str | None) -> dict[str, str]:
     """This process's, with the modules that it finds; ``None`` removes a variable."""

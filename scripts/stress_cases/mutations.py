@@ -35,13 +35,13 @@ def _places(root):
 def _delete(rng, root):
     parent, child = rng.choice(_places(root))
     parent.remove(child)
-    return f"without {_words(child)}"
+    return f"without {_words(child)}", _names(child)
 
 
 def _double(rng, root):
     parent, child = rng.choice(_places(root))
     parent.append(copy.deepcopy(child))
-    return f"two of {_words(child)}"
+    return f"two of {_words(child)}", _names(child)
 
 
 def _number(rng, root):
@@ -49,47 +49,53 @@ def _number(rng, root):
     element, key = rng.choice(found)
     places = list(NUMBER.finditer(element.get(key)))
     place, value = rng.choice(places), rng.choice(VALUES)
-    words, text = _words(element), element.get(key)
+    words, names, text = _words(element), _names(element), element.get(key)
     element.set(key, text[: place.start()] + value + text[place.end() :])
-    return f"{key} of {words} with {value[:12]!r} for {place[0]}"
+    return f"{key} of {words} with {value[:12]!r} for {place[0]}", (*names, value)
 
 
 def _attribute(rng, root):
     element, key = rng.choice([(e, k) for _, e in _places(root) for k in e.attrib])
-    value, words = rng.choice((*VALUES, *PLUGINS)), _words(element)
+    value, words, names = rng.choice((*VALUES, *PLUGINS)), _words(element), _names(element)
     element.set(key, value)
-    return f"{key}={value[:12]!r} in {words}"
+    return f"{key}={value[:12]!r} in {words}", (*names, value)
 
 
 def _without_attribute(rng, root):
     element, key = rng.choice([(e, k) for _, e in _places(root) for k in e.attrib])
-    words = _words(element)
+    words, names = _words(element), _names(element)
     del element.attrib[key]
-    return f"no {key} in {words}"
+    return f"no {key} in {words}", (*names, key)
 
 
 def _tag(rng, root):
     _, element = rng.choice(_places(root))
-    words, element.tag = _words(element), rng.choice(TAGS)
-    return f"{words} as {element.tag}"
+    words, names = _words(element), _names(element)
+    element.tag = rng.choice(TAGS)
+    return f"{words} as {element.tag}", (*names, element.tag)
 
 
 def _words(element) -> str:
     return f"<{element.tag} {element.get('name') or element.get('type') or ''}>".replace(" >", ">")
 
 
+def _names(element) -> tuple[str, ...]:
+    """By which an error may name it: its kind, name, plugin or value."""
+    return (element.tag, *element.attrib.values())
+
+
 # Numbers most often: other mistakes mostly end in the parser.
 KINDS = (_delete, _double, _number, _number, _number, _number, _attribute, _without_attribute, _tag)
 
 
-def mutate(name: str, seed: int, folder: Path) -> tuple[Path, str]:
-    """A file in ``folder`` made of a scene of scenes/, and what is wrong with it."""
+def mutate(name: str, seed: int, folder: Path) -> tuple[Path, str, tuple[str, ...]]:
+    """A file in ``folder`` made of a scene of scenes/, what is wrong with it, and the names of what is."""
     rng = random.Random(f"{name} {seed}")
     tree = ET.parse(reference.scene_file(name))
-    words = rng.choice(KINDS)(rng, tree.getroot())
+    words, names = rng.choice(KINDS)(rng, tree.getroot())
     for data in ("meshes", "textures"):
         if not (folder / data).exists():
             (folder / data).symlink_to(reference.ROOT / "scenes" / data)
     path = folder / f"{name}_{seed}.xml"
     tree.write(path)
-    return path, f"`{name}`: {words}"
+    return path, f"`{name}`: {words}", names

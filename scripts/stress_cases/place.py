@@ -12,14 +12,14 @@ from metrics import Sample
 
 import mitsuba as mi  # isort: skip
 
-from .agreement import deviation, family, greens, together
-from .case import Case, Outcome
+from .agreement import WAYS, deviation, family, greens, together
+from .case import Outcome, of_section
 
-SECTION = "Scale and place"
+_case = of_section("Scale and place")
 DEPTH, SIZE = 6, 32
 
-# What every comparison is made with: the defaults (with so many samples that a pilot decides) and everything.
-SIDES = {"default": ({}, 128), "skip=none": ({"skip": "none"}, 16)}
+# Samples per pixel of each way to render: by default so many that a pilot decides.
+SPP = {"default parameters": 128, "all strategies": 16}
 
 
 # -- placing a scene of scenes/ ---------------------------------------------------------------
@@ -194,7 +194,7 @@ SUBJECTS = {
 
 # Times as many samples for tests of tiles, so that the standard error of a tile is below `MOST_ERROR` of the
 # mean: what is off by three of them is seen.
-MORE = {"default": 2, "skip=none": 8}
+MORE = {"default parameters": 2, "all strategies": 8}
 MOST_ERROR = 0.02
 
 # How far pixels of images that should be equal up to the rounding of all lengths may be apart, over the mean.
@@ -208,7 +208,7 @@ def _render(scene, parameters, spp, seed):
     return image, integrator.statistics
 
 
-def _ways(statistics):
+def _decided(statistics):
     """What was decided, without figures."""
     keys = ("light_paths", "connections", "coefficients")
     return [[record[key] for key in keys] for record in statistics["decisions"]]
@@ -222,6 +222,10 @@ EXACT = 1e-5
 # single precision in one unit and not in the other, or is rounded another way.
 DRAWN = 0.01
 
+# How far the means of such images may be apart, relative: a pixel that differs is off by a share of its own
+# value, and `DRAWN` of them by a tenth each make a thousandth of the mean.
+MEANS = 1e-3
+
 
 def _exact(subject: Subject, places: dict) -> Outcome:
     """One seed; images in all ``places`` equal the plain one (times the light) in every digit, so do the
@@ -233,19 +237,19 @@ def _equal(subject: Subject, first: Place, places: dict, digits: float) -> Outco
     """One seed; images in all ``places`` equal that of the ``first`` one (times the light), up to ``digits``
     of its mean in all but `DRAWN` of the pixels, and so do the decisions."""
     worst, differing, ok, words = 0.0, 0.0, True, []
-    for side, (parameters, spp) in SIDES.items():
-        plain, statistics = _render(subject.load(first), parameters, spp, 3)
-        ways = _ways(statistics)
-        ok &= plain.mean() > 0.01 and (side != "default" or bool(ways))
+    for way, parameters in WAYS.items():
+        plain, statistics = _render(subject.load(first), parameters, SPP[way], 3)
+        decided = _decided(statistics)
+        ok &= plain.mean() > 0.01 and (way != "default parameters" or bool(decided))
         for name, place in places.items():
-            image, statistics = _render(subject.load(place), parameters, spp, 3)
+            image, statistics = _render(subject.load(place), parameters, SPP[way], 3)
             apart = np.abs(image / place.light - plain) / plain.mean()
             differing = max(differing, float((apart > digits).mean()))
             worst = max(worst, abs(float(image.mean() / place.light / plain.mean()) - 1))
-            if _ways(statistics) != ways or statistics["non_finite"]:
+            if _decided(statistics) != decided or statistics["non_finite"]:
                 ok = False
-                words.append(f"{side}, {name}: {_ways(statistics)}, {statistics['non_finite']} not finite")
-    ok &= differing <= DRAWN and worst < 1e-3
+                words.append(f"{way}, {name}: {_decided(statistics)}, {statistics['non_finite']} not finite")
+    ok &= differing <= DRAWN and worst < MEANS
     text = f"{100 * differing:.2g} % of the pixels differ at most, means by {worst:.1g}"
     return Outcome(bool(ok), "; ".join([text, *words] if words else [text, "decisions the same"]))
 
@@ -259,9 +263,9 @@ def _turned(subject: Subject) -> Outcome:
     """Tile means of the turned scene agree with those of the plain one; and in other units it looks the
     same, seed for seed."""
     pairs = []
-    for side, (parameters, spp) in SIDES.items():
+    for way, parameters in WAYS.items():
         parameters = {"type": "bdpt"} | parameters
-        spp *= subject.samples * MORE[side]
+        spp = SPP[way] * subject.samples * MORE[way]
         plain, turned = (
             _tiles(subject.load(place), parameters, spp, seeds)
             for place, seeds in ((Place(), range(5)), (SMALL, range(10, 15)))
@@ -274,8 +278,14 @@ def _turned(subject: Subject) -> Outcome:
 AWAY = Place(shift=(7000.0, -5000.0, 5000.0))  # 1e4 units
 
 
-def _deviation(subject: Subject, parameters, spp) -> float:
-    """How far the tiles of the moved scene are off."""
+# Times as many samples for it as `SPP`, so that the standard error of a tile is below a third of what it may
+# be off (`SURE`): what is just within that is not noise.
+FOR_MOVED = {"default parameters": 4, "all strategies": 16}
+SURE = 3
+
+
+def _deviation(subject: Subject, parameters, spp) -> tuple[float, float]:
+    """How far the tiles of the moved scene are off, and the standard error of that of a tile."""
     plain, moved = (
         _tiles(subject.load(place), parameters, spp * subject.samples, seeds)
         for place, seeds in ((Place(), range(5)), (AWAY, range(10, 15)))
@@ -285,12 +295,17 @@ def _deviation(subject: Subject, parameters, spp) -> float:
 
 def _moved(subject: Subject) -> Outcome:
     """Our own error far from the origin is small, and that of `path` larger."""
-    ours = [_deviation(subject, {"type": "bdpt"} | p, spp) for p, spp in SIDES.values()]
-    text = f"tiles off by {100 * max(ours):.2g} %"
-    if not subject.by_path:
-        return Outcome(max(ours) < subject.moved, text)
-    theirs = _deviation(subject, {"type": "path"}, 128)
-    return Outcome(max(ours) < min(subject.moved, theirs), f"{text}, under `path` by {100 * theirs:.2g} %")
+    found = [
+        _deviation(subject, {"type": "bdpt"} | parameters, SPP[way] * FOR_MOVED[way])
+        for way, parameters in WAYS.items()
+    ]
+    ours, error = (max(numbers) for numbers in zip(*found, strict=True))
+    ok = ours < subject.moved and error < subject.moved / SURE
+    text = f"tiles off by {100 * ours:.2g} %, standard error {100 * error:.2g} %"
+    if subject.by_path:
+        theirs, _ = _deviation(subject, {"type": "path"}, 128)
+        ok, text = ok and ours < theirs, f"{text}; under `path` by {100 * theirs:.2g} %"
+    return Outcome(bool(ok), text)
 
 
 TURN = rotation([1, 2, 3], 35.7)
@@ -299,7 +314,8 @@ LIGHTS = {f"2^{k}": Place(light=2.0**k) for k in (-40, -20, 20, 40)}
 SMALL, LARGE = (Place(scale, TURN) for scale in (1e-4, 1e4))
 
 _EXACTLY = (
-    "the same image, seed for seed, with defaults and with skip=none, and the same decision of the pilot. "
+    "the same image, seed for seed, by default and with all strategies, and the same decision of the pilot; "
+    f"its mean to {MEANS:g}. "
     f"Powers of two are exact in floating point: {100 * DRAWN:g} % of the pixels may differ by more than "
     f"{EXACT:g} of the mean, where something takes part in a draw that is 0 in one of the units"
 )
@@ -309,37 +325,35 @@ def _cases():
     for name, subject in SUBJECTS.items():
         words = subject.words
         quick = name == "sun"
-        yield Case(
+        yield _case(
             f"scale-{name}",
-            SECTION,
             f"{words}, lengths times 2^-13 (1.2e-4), 2^-10, 2^10, 2^13",
             _EXACTLY,
             partial(_exact, subject, SCALES),
             quick,
         )
-        yield Case(
+        yield _case(
             f"light-{name}",
-            SECTION,
             f"{words}, lights times 2^-40 (0.9e-12), 2^-20, 2^20, 2^40",
             _EXACTLY,
             partial(_exact, subject, LIGHTS),
             name == "envmap",
         )
-        yield Case(
+        yield _case(
             f"turned-{name}",
-            SECTION,
             f"{words}, turned by 35.7° about (1, 2, 3), lengths times 1e-4 and 1e4",
             "tile means as of the plain scene (other seeds, 5 a side): Welch's t-test with Šidák at 1e-3, "
             f"standard error of a tile below {100 * MOST_ERROR:g} % of the mean; at 1e-4 the image and the "
             f"decision of 1e4, seed for seed: {100 * DRAWN:g} % of the pixels may differ by more than "
-            f"{NEAR:g} of the mean, where rounding sends a path another way; defaults and skip=none",
+            f"{NEAR:g} of the mean, where rounding sends a path another way, the image's mean by {MEANS:g}; "
+            "defaults and all strategies",
             partial(_turned, subject),
         )
-        yield Case(
+        yield _case(
             f"moved-{name}",
-            SECTION,
             f"{words}, moved by 1e4",
-            f"tiles off by less than {100 * subject.moved:g} % of the mean: coordinates of 1e4 have steps of "
+            f"tiles off by less than {100 * subject.moved:g} % of the mean (root mean square, less noise; "
+            "its standard error is below a third of that): coordinates of 1e4 have steps of "
             "1e-3, rays start 0.01 to 0.02 off a surface (32 steps of 2^-24); scenes are 2 to 5 wide, and "
             + ("a step is 5 % of the area of a lamp of radius 0.04; " if name == "lens" else "")
             + "`path`, where it sees the light, is off by more",

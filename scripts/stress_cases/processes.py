@@ -17,19 +17,24 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import reference
+from mitsuba_bdpt import choice
 
 import mitsuba as mi  # isort: skip
 
 from . import child
-from .case import Case, Outcome
+from .case import Case, Outcome, of_section
 
-SECTION = "Processes"
+_case = of_section("Processes")
 
 # Sums of the same numbers in another order, in single precision.
 ROUNDING = 1e-4
 
+# Along each side of most films here, and samples per pixel with which such a render asks a pilot.
+SIZE = 8
+PILOTED = choice.LEAST_SAMPLES // SIZE**2
 
-def _room(lamp=(0, 0.9, 0), light=1.0, wall=0.5, eye=(0, 0, 2.5), size=8, moved=0.0, texture=0.5):
+
+def _room(lamp=(0, 0.9, 0), light=1.0, wall=0.5, eye=(0, 0, 2.5), size=SIZE, moved=0.0, texture=0.5):
     """A room of two textured walls, a ball, a mesh, a lamp with area and a point light."""
     at = mi.ScalarTransform4f()
     bitmap = mi.Bitmap(np.full((2, 2, 3), texture, dtype=np.float32))
@@ -66,6 +71,11 @@ def _image(integrator, scene, **keywords) -> np.ndarray:
     return np.array(integrator.render(scene, **keywords), dtype=np.float64)
 
 
+def _decided(integrator) -> list[dict]:
+    """What the pilots of its last render have decided."""
+    return integrator.statistics["decisions"]
+
+
 def _off(image, expected) -> float:
     """The largest difference of two images, as a share of the expected one's mean."""
     return float(np.abs(image - expected).max() / expected.mean())
@@ -92,12 +102,36 @@ def _kept_by_dr_jit() -> int:
     return len(dr.whos(True).splitlines())
 
 
-def _in_a_row(count: int) -> Outcome:
-    """Render ``count`` times after a tenth of that as warm-up."""
-    scene = mi.load_dict(_room())
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 4})
-    grown, more, compiled = _growth(count, lambda number: _once(scene, bdpt, number))
-    return Outcome(grown < GROWTH and more <= 0 and compiled == 0, _grown(grown, more, compiled))
+# Parameters, the film's size and samples per pixel of renders in a row: plain ones; and twenty in turn, of
+# which the first asks a pilot. (One with the variance has nine passes.)
+PLAIN = (({}, SIZE, 1),)
+IN_TURN = (
+    ({}, 48, 64),
+    ({"variance": True}, SIZE, 16),
+    *(({"aovs": "albedo:albedo,nn:sh_normal"}, SIZE, 1), ({"points": "sampler"}, SIZE, 1)) * 6,
+    *(({"skip": "none"}, SIZE, 1), *PLAIN) * 3,
+)
+
+
+def _in_a_row(count: int, kinds: tuple) -> Outcome:
+    """Render ``count`` times, by all ``kinds`` in turn, after a tenth of that as warm-up."""
+    scenes = {size: mi.load_dict(_room(size=size)) for _, size, _ in kinds}
+    made = [
+        (scenes[size], mi.load_dict({"type": "bdpt", "max_depth": 4} | parameters), spp)
+        for parameters, size, spp in kinds
+    ]
+    asked = []
+
+    def once(number):
+        scene, bdpt, spp = made[number % len(made)]
+        compiled = _once(scene, bdpt, number, spp)
+        asked.append(bool(_decided(bdpt)))
+        return compiled
+
+    grown, more, compiled = _growth(count, once)
+    pilots = [spp * size**2 >= choice.LEAST_SAMPLES for _, size, spp in kinds] * (count // len(kinds))
+    text = f"{_grown(grown, more, compiled)}, {sum(asked)} pilots"
+    return Outcome(grown < GROWTH and more <= 0 and compiled == 0 and asked == pilots, text)
 
 
 def _scenes_in_a_row(count: int) -> Outcome:
@@ -117,11 +151,11 @@ def _scenes_in_a_row(count: int) -> Outcome:
 GROWTH = 2 << 20
 
 
-def _once(scene, integrator, number: int) -> int:
-    """Render one sample per pixel; the number of kernels that were compiled for it."""
+def _once(scene, integrator, number: int, spp: int = 1) -> int:
+    """Render; the number of kernels that were compiled for it."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        integrator.render(scene, seed=number, spp=1)
+        integrator.render(scene, seed=number, spp=spp)
         dr.sync_thread()
         history = [entry for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT]
     if hasattr(integrator, "statistics"):
@@ -136,7 +170,7 @@ def _growth(count: int, once: Callable[[int], int]) -> tuple[int, int, int]:
     for number in range(count):
         made = once(number)
         compiled += made if number >= count // 10 else 0
-        if number == count // 2:
+        if number == count // 2 - 1:
             before, variables = _resident(), _kept_by_dr_jit()
     return _resident() - before, _kept_by_dr_jit() - variables, compiled
 
@@ -150,21 +184,24 @@ def _grown(grown: int, more: int, compiled: int) -> str:
 
 def _alternating() -> Outcome:
     """Two scenes under two variants in turn, each with one integrator object for all."""
-    first, worst = {}, 0.0
+    first, worst, same = {}, 0.0, True
     made = {}
     for variant in ("llvm_ad_rgb", "llvm_ad_spectral"):
         mi.set_variant(variant)
         scenes = [mi.load_dict(_room()), reference.load_scene("glass_caustics", resolution=8)]
-        made[variant] = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.5}), scenes
+        made[variant] = mi.load_dict({"type": "bdpt", "max_depth": 5}), scenes
     for _ in range(3):
         for variant, (bdpt, scenes) in made.items():
             mi.set_variant(variant)
             for index, scene in enumerate(scenes):
-                image = _image(bdpt, scene, seed=3, spp=8)
-                key = variant, index
-                worst = max(worst, _off(image, first.setdefault(key, image)))
+                image = _image(bdpt, scene, seed=3, spp=PILOTED)
+                expected, decisions = first.setdefault((variant, index), (image, _decided(bdpt)))
+                worst = max(worst, _off(image, expected))
+                same &= bool(decisions) and _decided(bdpt) == decisions
     mi.set_variant("llvm_ad_rgb")
-    return Outcome(worst < ROUNDING, f"largest difference {worst:.1g} of the mean, 4 images rendered 3 times")
+    text = f"largest difference {worst:.1g} of the mean, 4 images rendered 3 times; "
+    text += "decisions of pilots the same" if same else f"not the same decisions: {_decided(bdpt)}"
+    return Outcome(worst < ROUNDING and same, text)
 
 
 def _edit(key: str, change) -> Callable:
@@ -204,21 +241,20 @@ def _edits() -> dict[str, tuple[Callable, dict]]:
     }
 
 
-def _edited(parameters: dict) -> Outcome:
-    """Render, edit, render: the image of a scene that was made so."""
+def _edited(parameters: dict, spp: int) -> Outcome:
+    """Render, edit, render: the image of a scene that was made so, and by what a pilot decides there."""
     wrong, worst = [], 0.0
     for words, (edit, room) in _edits().items():
         scene = mi.load_dict(_room())
-        bdpt = mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters})
-        before = _image(bdpt, scene, seed=1, spp=4)
+        bdpt, anew = (mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters}) for _ in range(2))
+        before = _image(bdpt, scene, seed=1, spp=spp)
         edit(mi.traverse(scene))
         built = _room(**room)
         if words.startswith("intensity"):
             built["spark"]["intensity"]["value"] = 3.0
-        image, expected = _image(bdpt, scene, seed=2, spp=16), mi.load_dict(built)
-        expected = _image(
-            mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters}), expected, seed=2, spp=16
-        )
+        image = _image(bdpt, scene, seed=2, spp=spp)
+        expected = _image(anew, mi.load_dict(built), seed=2, spp=spp)
+        ways, of_built = ([_way(made) for made in _decided(integrator)] for integrator in (bdpt, anew))
         off = _off(image, expected) if image.shape == expected.shape else np.inf
         # Numbers made along another way differ in their last bits, and few paths take another turn by it.
         changed = image.shape != before.shape or _off(before, expected) > 0.01
@@ -226,11 +262,20 @@ def _edited(parameters: dict) -> Outcome:
             float((np.abs(image - expected) > ROUNDING * expected.mean()).mean()) if off < np.inf else 1
         )
         worst = max(worst, outliers)
+        if ways != of_built or bool(ways) != (spp >= PILOTED):
+            wrong.append(f"{words}: decided {ways}, of a scene made so {of_built}")
         if outliers > 0.05 or abs(image.mean() / expected.mean() - 1) > 0.01 or not changed:
             wrong.append(
                 f"{words}: {outliers:.1%} of the values differ, the largest by {off:.2g}; {changed=}"
             )
-    return Outcome(not wrong, "; ".join(wrong) or f"at most {worst:.1%} of values differ in rounding")
+    text = f"at most {worst:.1%} of values differ by more than rounding"
+    text += ", decisions of pilots the same" if spp >= PILOTED else ""
+    return Outcome(not wrong, "; ".join(wrong) or text)
+
+
+def _way(decision: dict) -> list:
+    """What was decided, without figures."""
+    return [decision[key] for key in ("light_paths", "connections", "coefficients")]
 
 
 @contextlib.contextmanager
@@ -258,12 +303,13 @@ def _sigint_after(seconds: float):
 
 
 def _interrupted(times: int) -> Outcome:
-    """SIGINT at some moment of a render, then the same again."""
+    """SIGINT at some moment of a render, its pilot included, then the same again."""
     # Short passes: recording them takes as long as tracing them, and may be interrupted as well.
     scene = reference.load_scene("cornell_box", resolution=32)
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 2})
-    keywords = {"seed": 5, "spp": 32}
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 8})
+    keywords = {"seed": 5, "spp": choice.LEAST_SAMPLES // 32**2}
     whole = _image(bdpt, scene, **keywords)
+    decisions = _decided(bdpt)
     started = time.process_time()
     _image(bdpt, scene, **keywords)
     seconds = time.process_time() - started
@@ -279,8 +325,10 @@ def _interrupted(times: int) -> Outcome:
             if bdpt.statistics["passes"] and not 0.5 < film.mean() / whole.mean() < 2:
                 wrong.append(f"film of {bdpt.statistics['passes']}: mean {film.mean():.3g}")
         worst = max(worst, _off(_image(bdpt, scene, **keywords), whole))
-    text = f"{hit} of {times} met it, after {min(kept, default=0)} to {max(kept, default=0)} of 32 samples; "
-    text += "; ".join(wrong) + f"then off by {worst:.1g} of the mean at most"
+        if not decisions or _decided(bdpt) != decisions:
+            wrong.append(f"decided {_decided(bdpt)} in place of {decisions}")
+    text = f"{hit} of {times} met it, after {min(kept, default=0)} to {max(kept, default=0)} of "
+    text += "; ".join([f"{keywords['spp']} samples", *wrong, f"then off by {worst:.1g} of the mean at most"])
     return Outcome(not wrong and hit >= times // 2 and worst < ROUNDING, text)
 
 
@@ -291,7 +339,8 @@ scene = mi.load_dict(mi.cornell_box() | {"sensor": {"type": "perspective", "film
     "type": "hdrfilm", "width": 16, "height": 16}, "to_world": mi.ScalarTransform4f().look_at(
     [0, 0, 4], [0, 0, 0], [0, 1, 0])}})
 bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6})
-image = np.array(bdpt.render(scene, spp=16, seed=3), dtype=np.float64)
+image = np.array(bdpt.render(scene, spp=512, seed=3), dtype=np.float64)
+assert bdpt.statistics["decisions"], "no pilot"
 print(bdpt.statistics["kernels"]["compiled"], image.mean(), image.std(), np.isfinite(image).all())
 """
 
@@ -335,19 +384,22 @@ def _side_by_side() -> Outcome:
 
 def _without_cache(made: Callable) -> Outcome:
     """Render with the cache as ``made`` leaves it, a context manager of an environment and further keywords,
-    and with one that works."""
+    and with one that works. (Keywords are for what stands in for a disk.)"""
     with tempfile.TemporaryDirectory() as folder:
         try:
             _, expected = _told(child.python(RENDER, env=child.environment(DRJIT_CACHE_DIR=folder)))
             with made() as (changes, keywords):
                 if changes is None:
-                    return Outcome(True, "not tried: this user can't make such a folder")
+                    return Outcome(None, "this user can't make such a folder")
                 done = child.python(RENDER, env=child.environment(**changes), **keywords)
                 compiled, image = _told(done)
         except ValueError as error:
             return Outcome(False, str(error))
-    warned = "a warning" if done.stderr.strip() else "nothing said"
-    return Outcome(_same(image, expected), f"{compiled} kernels compiled, {warned}, the same image")
+    warned, same = "a warning" if done.stderr.strip() else "nothing said", _same(image, expected)
+    text = f"{compiled} kernels compiled, {warned}, {'the same' if same else 'another'} image"
+    if same and keywords:
+        return Outcome(None, f"{child.NO_DISK}; with small files only: {text}")
+    return Outcome(same, text)
 
 
 @contextlib.contextmanager
@@ -385,15 +437,11 @@ def _spoiled():
         yield {"DRJIT_CACHE_DIR": folder}, {}
 
 
-def _case(name: str, tried: str, expected: str, run: Callable[[], Outcome], quick: bool = False) -> Case:
-    return Case(name, SECTION, tried, expected, run, quick)
-
-
 SAME = "the same image, up to the rounding of sums in another order (1e-4 of the mean)"
 STAYS = (
     "after a tenth of them no kernel is compiled; in the second half no variable of Dr.Jit more and less "
-    "than 2 MiB "
-    "(a film of 8 x 8 and its sums take 10 KB, 500 of them 5 MB; pages come and go in hundreds of KB)"
+    "than 2 MiB (a film of 8 x 8 and its sums take 10 KB, 500 of them 5 MB, 25 of 48 x 48 9 MB; pages come "
+    "and go in hundreds of KB)"
 )
 
 
@@ -404,11 +452,17 @@ def _cache_case(name: str, tried: str, made: Callable) -> Case:
 
 
 CASES = (
-    _case("renders-100", "100 renders of 8 x 8 in one process", STAYS, partial(_in_a_row, 100), True),
-    _case("renders-1000", "1,000 of them", STAYS, partial(_in_a_row, 1000)),
+    _case("renders-100", "100 renders of 8 x 8 in one process", STAYS, partial(_in_a_row, 100, PLAIN), True),
+    _case(
+        "renders-1000",
+        "1,000 renders: of twenty each one of 48 x 48 that asks a pilot, others with `variance`, `aovs`, "
+        "`points=sampler`, `skip=none` or plain",
+        f"{STAYS}; 50 pilots",
+        partial(_in_a_row, 1000, IN_TURN),
+    ),
     _case(
         "scenes-400",
-        "400 of them, each of another scene object by another integrator object",
+        "400 plain ones, each of another scene object by another integrator object",
         f"{STAYS}; kernels for at most 1 %: Dr.Jit numbers what it calls anew in each scene, and now and "
         "then "
         "compiles a kernel of `path`, too",
@@ -416,34 +470,39 @@ CASES = (
     ),
     _case(
         "alternating-scenes-and-variants",
-        "two scenes under `llvm_ad_rgb` and `llvm_ad_spectral` in turn, three times",
-        SAME,
+        "two scenes under `llvm_ad_rgb` and `llvm_ad_spectral` in turn, three times, each with a pilot",
+        f"{SAME}, and the same decision",
         _alternating,
     ),
     _case(
         "edited-scenes",
-        "a scene edited by `mi.traverse` between two renders: light, reflectance, texture, camera, film, "
-        "lamp, mesh",
+        "a scene edited by `mi.traverse` between two renders with pilots: light, reflectance, texture, "
+        "camera, film, lamp, mesh",
         "the image of a scene that was made so: the mean within 1 %, at most 5 % of values other than in "
-        "rounding "
-        "(numbers made along another way differ in the last bits, and few paths take another turn)",
-        partial(_edited, {}),
+        "rounding (numbers made along another way differ in the last bits, and few paths take another turn); "
+        "the decision that is made there",
+        partial(_edited, {}, PILOTED),
         True,
     ),
     _case(
-        "edited-scenes-skip-none", "the same with `skip=none`", "the same", partial(_edited, {"skip": "none"})
+        "edited-scenes-skip-none",
+        "the same with `skip=none`, without pilots",
+        "the same",
+        partial(_edited, {"skip": "none"}, 16),
     ),
     _case(
         "interrupted",
-        "SIGINT at 12 moments of a render, by its CPU time, each time the render again",
-        "`KeyboardInterrupt`, in the film the passes that were done (mean within a factor of 2: of one "
-        "sample per "
-        f"pixel); then {SAME}",
+        "SIGINT at 12 moments of a render with a pilot, by its CPU time, each time the render again",
+        "`KeyboardInterrupt` at half of the moments at least (Python drops one that comes in a destructor, "
+        "and a render that takes less time than the first one has ended before the last), in the film the "
+        "passes that were done (mean within a factor of 2: of 8 samples per pixel); then "
+        f"{SAME}, by the same decision",
         partial(_interrupted, 12),
     ),
     _case(
         "two-processes",
-        "two processes fill an empty folder of compiled kernels at once, a third one follows",
+        "two processes fill an empty folder of compiled kernels at once, that of the pilot too, a third one "
+        "follows",
         f"{SAME}; the third one compiles nothing",
         _side_by_side,
     ),

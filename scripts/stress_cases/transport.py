@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 import mitsuba as mi  # isort: skip
 
-from .agreement import against, against_known, tiles, together
-from .case import Case, Outcome
-from .non_finite import Warned, camera
+from .agreement import WAYS, Judged, against, against_known, tiles, worst
+from .case import Outcome, of_section
+from .poisons import camera
+from .warned import Warned
 
-SECTION = "Transport"
+_case = of_section("Transport")
 
 SEEDS = range(8)
-
-WAYS = {"default": {}, "everything": {"skip": "none"}}
-SAID = {"default": "default parameters", "everything": "all strategies"}
 
 # With this ``rr_depth``, what roulette makes noisy is 0.99^1200 of the light.
 LATE = 1200
@@ -84,17 +84,16 @@ def closed_rooms():
             late = {} if depth >= 0 else {"rr_depth": LATE}
             for way, parameters in WAYS.items():
                 means = tiles(target, bdpt(max_depth=depth, **late, **parameters), SEEDS, spp)
-                outcomes[f"max_depth={depth}, {SAID[way]}"] = against_known(means, known, 0.03)
-        return together(outcomes)
+                outcomes[f"max_depth={depth}, {way}"] = against_known(means, known, 0.03)
+        return worst(outcomes)
 
     families = {
         "white": ("albedo 1, max_depth 4 and 40", ((1.0, 4, 64), (1.0, 40, 32))),
         "grey": (f"albedo 0.99, no limit of the depth, rr_depth={LATE}", ((0.99, -1, 8),)),
     }
     return [
-        Case(
+        _case(
             f"closed-{name}-{family}",
-            SECTION,
             f"{room}, {said}; all strategies, and defaults",
             f"the sum of albedo^m over all reflections; {STUDENT}, which sees errors of 3 % of the image's "
             "mean (roulette makes long paths noisy)",
@@ -134,10 +133,9 @@ def _too_bright_unlimited() -> Outcome:
     with Warned() as warnings:
         image = np.array(made.render(scene(wall=wall, lamp={"type": "point"}), spp=32))
     count = made.statistics["non_finite"]
-    ok = np.isfinite(image).all() and "up to 1.2" in warnings[0] and len(warnings) == 1 + bool(count)
-    return Outcome(
-        bool(ok), f"finite, mean {image.mean():.3g}; {count} values not finite; warned: {warnings[0]}"
-    )
+    first = warnings[0] if warnings else "of nothing"
+    ok = np.isfinite(image).all() and "up to 1.2" in first and len(warnings) == 1 + bool(count)
+    return Outcome(bool(ok), f"mean {image.mean():.3g}; {count} values not finite; warned: {first}")
 
 
 def _black() -> Outcome:
@@ -221,19 +219,19 @@ def nested(inner: float, radius: float, centre=(0.0, 0.0, 0.0)) -> dict:
     return {"inner": {"type": "sphere", "center": list(centre), "radius": radius, "bsdf": bsdf}}
 
 
-def _nested(inner: float, parameters: dict) -> Outcome:
+def _nested(inner: float, parameters: dict) -> Judged:
     target = glass(nested(inner, 0.6, (0.2, 0.1, 0.0)))
     # Deeper paths carry what total reflection keeps inside: nothing here, for all light came from outside.
     return against_known(tiles(target, bdpt(rr_depth=200, **parameters), SEEDS, 64), 1.0, 0.02)
 
 
-def _from_within() -> Outcome:
+def _from_within() -> Judged:
     """Known: the light of a white world from the centre of glass is the square of its index."""
     target = glass(**look((0, 0, 0), (0.3, 0.1, -1), 60))
     return against_known(tiles(target, bdpt(rr_depth=200), SEEDS, 64), 1.5**2, 0.02)
 
 
-def _total_reflection(parameters: dict) -> Outcome:
+def _total_reflection(parameters: dict) -> Judged:
     """A lamp in a glass cube, of whose sides light leaves within the critical angle only."""
     parts = {
         "cube": {
@@ -288,7 +286,7 @@ def surface(bsdf: dict):
     )
 
 
-def like_path(bsdf: dict, parameters: dict, spoilt=False, reach=0.02) -> Outcome:
+def like_path(bsdf: dict, parameters: dict, spoilt=False, reach=0.02) -> Judged:
     """Whether `surface` looks as under `path`, and every value is finite, or not where Mitsuba's plugin is
     ``spoilt``."""
     target = surface(bsdf)
@@ -297,7 +295,8 @@ def like_path(bsdf: dict, parameters: dict, spoilt=False, reach=0.02) -> Outcome
     count = made.statistics["non_finite"]
     ours = tiles(target, bdpt(max_depth=6, **parameters), SEEDS, 128)
     outcome = against(ours, tiles(target, {"type": "path", "max_depth": 6}, SEEDS, 512), reach)
-    return Outcome(outcome.ok and (count > 0) == spoilt, f"{outcome.happened}; {count} values not finite")
+    text = f"{outcome.happened}; {count} values not finite"
+    return replace(outcome, ok=outcome.ok and (count > 0) == spoilt, happened=text)
 
 
 def surfaces() -> dict:
@@ -344,9 +343,9 @@ def surface_cases():
         for name in names:
             text, bsdf = surfaces()[name]
             sharp = "sharp" in name or name.endswith("-0.0001")
-            for way in ("default", "everything") if sharp else ("default",):
-                outcomes[f"{text}, {SAID[way]}"] = like_path(bsdf, WAYS[way], spoilt)
-        return together(outcomes)
+            for way in WAYS if sharp else ("default parameters",):
+                outcomes[f"{text}, {way}"] = like_path(bsdf, WAYS[way], spoilt)
+        return worst(outcomes)
 
     def case(family, names):
         spoilt = family == "sharp-beside-glass"
@@ -357,9 +356,8 @@ def surface_cases():
                 "a `blendbsdf`, which reflects nothing (`path` drops it in silence)"
             )
         tried = surfaces()[names[0]][0] if len(names) == 1 else f"`{family}` of roughness 1e-4 to 1"
-        return Case(
+        return _case(
             f"surface-{family}",
-            SECTION,
             tried,
             f"as `path`, {finite}: {WELCH}, which sees errors of 2 % of the image's mean",
             lambda: run(names, spoilt),
@@ -373,9 +371,8 @@ def glass_cases():
     inside = {"water": 1.33, "air": 1.0, "diamond": 2.4}
     return [
         *(
-            Case(
+            _case(
                 f"corridor-{reflectance:g}",
-                SECTION,
                 f"up to 62 bounces in a corridor of mirrors of reflectance {reflectance:g}, a lamp behind",
                 f"that reflectance to the number of bounces; {tolerance}",
                 lambda r=reflectance: _corridor(r),
@@ -386,15 +383,14 @@ def glass_cases():
                 (0.98, f"{STUDENT}, which sees errors of 0.2 %"),
             )
         ),
-        Case(
+        _case(
             "nested-dielectrics",
-            SECTION,
             "balls of water, air and diamond in a ball of glass in a white world; all strategies, and "
             "defaults; the white world from the centre of glass",
             f"radiance 1, as nothing is absorbed, and 1.5^2 from within: {STUDENT}, which sees errors of 2 %",
-            lambda: together(
+            lambda: worst(
                 {
-                    f"{name}, {SAID[way]}": _nested(ior, parameters)
+                    f"{name}, {way}": _nested(ior, parameters)
                     for name, ior in inside.items()
                     for way, parameters in WAYS.items()
                 }
@@ -402,12 +398,11 @@ def glass_cases():
             ),
             True,
         ),
-        Case(
+        _case(
             "total-reflection",
-            SECTION,
             "a lamp in a glass cube of index 1.8: most of its light is reflected totally",
             f"as `path`: {WELCH}, which sees errors of 3 % (few paths leave the cube)",
-            lambda: together({SAID[way]: _total_reflection(parameters) for way, parameters in WAYS.items()}),
+            lambda: worst({way: _total_reflection(parameters) for way, parameters in WAYS.items()}),
         ),
     ]
 
@@ -416,32 +411,28 @@ CASES = (
     *closed_rooms(),
     *glass_cases(),
     *surface_cases(),
-    Case(
+    _case(
         "closed-point-0.99-roulette",
-        SECTION,
         "point light in a closed sphere, albedo 0.99, no limit of the depth, roulette from edge 5",
         "finite; no more can be asked: survival is 0.95 at most, as in `path`, so squares grow by 0.99^2 / "
         "0.95 with each bounce and the variance is infinite, for `path` as well",
         _roulette,
     ),
-    Case(
+    _case(
         "black",
-        SECTION,
         "all BSDFs black: diffuse, glass, rough metal; emitters hidden",
         "an image of zeros exactly, and no visibility ray",
         _black,
     ),
-    Case(
+    _case(
         "too-bright-limited",
-        SECTION,
         "a closed sphere of reflectance 1.5, max_depth=7",
         f"the sum of 1.5^m ({STUDENT}, which sees errors of 3 %); one warning for each render",
         _too_bright_depth,
         True,
     ),
-    Case(
+    _case(
         "too-bright-unlimited",
-        SECTION,
         "a closed sphere whose texture reflects 1.2, no limit of the depth",
         "there is no right value; finite, and warned of once",
         _too_bright_unlimited,

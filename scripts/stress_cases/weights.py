@@ -277,7 +277,7 @@ def _paths(name: str, heuristic: str, count: int, lanes: int, number: int, least
 
 CASES = (
     _paths("balance", "balance", 20, 1 << 17, 3, 10**7),
-    _paths("power", "power", 8, 1 << 16, 4, 10**6),
+    _paths("power", "power", 8, 1 << 15, 4, 10**6),
     _paths("maximum", "maximum", 8, 1 << 16, 5, 5 * 10**5),
     _paths("uniform", "uniform", 4, 1 << 14, 6, 10**5),
     _paths("few", "balance", 3, 1 << 11, 7, 10**4),
