@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from metrics import Sample, sidak, tile_means, welch
+from scipy import stats
 
 import mitsuba as mi  # isort: skip
 
@@ -18,8 +19,8 @@ from .case import Outcome
 # What every comparison is made with.
 WAYS = {"default parameters": {}, "all strategies": {"skip": "none"}}
 
-# Chance that a right program fails one case, had the seeds not been fixed: the level of all t-tests of a
-# case together, after Sidak's correction.
+# Chance that a right program fails one comparison, had the seeds not been fixed: the level of all its t-tests
+# together, after Sidak's correction.
 LEVEL = 1e-3
 
 TILES = 4  # along each side of the image
@@ -61,12 +62,13 @@ class Judged(Outcome):
 
 def judged(ours, theirs: Sample, reach: float, what: str) -> Judged:
     """Welch's test of the tiles of ``ours``, Sidak over them; ``reach``: the largest relative error of the
-    image's mean that it may overlook (three standard errors of the difference), else it shows nothing."""
+    image's mean that it may overlook (seen with a chance of one half), else it shows nothing."""
     ours = Sample.of(ours)
     found = welch(ours, theirs)
     p = sidak(found.p)
     mean, expected = ours.mean[-1], theirs.mean[-1]
-    seen = 3 * found.error[-1] / abs(expected)
+    level = -np.expm1(np.log1p(-LEVEL) / len(found.p))  # of each of them
+    seen = stats.t.isf(level / 2, found.freedom[-1]) * found.error[-1] / abs(expected)
     ok = np.isfinite(ours.mean).all() and p >= LEVEL and seen <= reach
     text = f"mean {mean:.5g}, {what} {expected:.5g}; p = {p:.2g} over {len(found.p)} values; "
     return Judged(bool(ok), f"{text}sees errors of {100 * seen:.2g} %", p, seen)

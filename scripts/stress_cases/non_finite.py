@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mitsuba_bdpt.mis import HEURISTICS
 
 import mitsuba as mi  # isort: skip
 
@@ -36,16 +37,19 @@ def bsdf_cases():
     said = {
         "weight": "weight of sampled directions",
         "direction": "sampled directions",
+        "eta": "index of refraction, beside glass,",
         "eval": "value",
         "pdf": "density",
     }
-    zero = {"weight": ["weight"], "direction": ["weight"], "eval": ["eval"], "pdf": ["weight", "eval"]}
+    zero = {"eval": ["eval"], "pdf": ["weight", "eval"]}
+    # Nobody asks for the index of refraction in a scene that refracts nothing.
+    more = {"eta": {"other": {"type": "sphere", "radius": 0.1, "bsdf": {"type": "dielectric"}}}}
 
     def make(name):
         def made(value):
             register()
-            names = [name] if value != 0 else zero[name]
-            return room({"type": "poison"} | dict.fromkeys(names, value))
+            names = [name] if value != 0 else zero.get(name, ["weight"])
+            return room({"type": "poison"} | dict.fromkeys(names, value), **more.get(name, {}))
 
         return made
 
@@ -62,6 +66,31 @@ def bsdf_cases():
         )
         for name in said
     ]
+
+
+def heuristics_case():
+    """Densities that are not finite under the other heuristics, which may give weights of 0 or 1 for them."""
+
+    def plate(value):
+        register()
+        names = ["pdf"] if value != 0 else ["weight", "eval"]
+        return room({"type": "poison"} | dict.fromkeys(names, value))
+
+    skies = [(said, make, bad) for said, make, bad in own_lamps() if "densities" in said]
+    poisoned = [("a plate's densities NaN", plate, NAN), ("a plate's densities infinite", plate, INF), *skies]
+
+    def run():
+        outcomes = {}
+        for heuristic in HEURISTICS:
+            for said, make, bad in poisoned:
+                ways = EVERYTHING | {"heuristic": heuristic, "hide_emitters": True}
+                outcomes[f"{heuristic}, {said}"] = compared(make, bad, ways)
+        return together(outcomes)
+
+    tried = (
+        "densities NaN or infinite, of half a plate or of half a user's environment, under every heuristic"
+    )
+    return _case("heuristics-nan", tried, TWIN, run, True)
 
 
 def own_lamps():
@@ -379,6 +408,7 @@ def _interrupted() -> Outcome:
 CASES = (
     *bsdf_cases(),
     *lamp_cases(),
+    heuristics_case(),
     *counted_cases(),
     _case(
         "pilot-nan",

@@ -182,7 +182,7 @@ SUBJECTS = {
     ),
     "envmap": Subject("window_room", "`window_room` (environment with a sun)"),
     "sun": Subject("smallvcm_cornell_sun", "`smallvcm_cornell_sun` (directional light, glass, mirror)"),
-    # Its lamps have radii of 0.04 and 0.06: a step of 1e-3 is 2.5 % of the radius, 5 % of the area.
+    # Its lamps have radii of 0.04 and 0.06: rays start up to half of that off the floor and the lamps.
     "lens": Subject(
         "thin_lens", "`thin_lens` (thin lens, lamps on spheres and a disk, glass)", samples=4, moved=0.05
     ),
@@ -193,7 +193,7 @@ SUBJECTS = {
 
 
 # Times as many samples for tests of tiles, so that the standard error of a tile is below `MOST_ERROR` of the
-# mean: what is off by three of them is seen.
+# mean. (With 5 seeds a side and 64 comparisons a tile that is off by nine of them is seen every other time.)
 MORE = {"default parameters": 2, "all strategies": 8}
 MOST_ERROR = 0.02
 
@@ -355,7 +355,7 @@ def _cases():
             f"tiles off by less than {100 * subject.moved:g} % of the mean (root mean square, less noise; "
             "its standard error is below a third of that): coordinates of 1e4 have steps of "
             "1e-3, rays start 0.01 to 0.02 off a surface (32 steps of 2^-24); scenes are 2 to 5 wide, and "
-            + ("a step is 5 % of the area of a lamp of radius 0.04; " if name == "lens" else "")
+            + ("these lamps have radii of 0.04; " if name == "lens" else "")
             + "`path`, where it sees the light, is off by more",
             partial(_moved, subject),
         )

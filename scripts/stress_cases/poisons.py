@@ -30,7 +30,7 @@ def poison():
     """The class of the BSDF ``poison``. (Mitsuba's classes exist once a variant is chosen.)"""
 
     class Poison(mi.BSDF):
-        """Diffuse; where u > 0.5, the scales multiply the sampled weight, the direction, the value, the
+        """Diffuse; where u > 0.5, the scales multiply the sampled weight, the direction, eta, the value, the
         density."""
 
         def __init__(self, props):
@@ -38,7 +38,7 @@ def poison():
             self.inner = mi.load_dict({"type": "diffuse", "reflectance": 0.6})
             self.m_flags = self.inner.flags()
             self.m_components = [self.m_flags]
-            self.scales = Scales(props, "weight", "direction", "eval", "pdf")
+            self.scales = Scales(props, "weight", "direction", "eta", "eval", "pdf")
 
         def scale(self, name, si):
             return self.scales.of(name, si.uv.x > 0.5)
@@ -47,6 +47,7 @@ def poison():
             bs, weight = self.inner.sample(ctx, si, u1, u2, active)
             bs.wo *= self.scale("direction", si)
             bs.pdf *= self.scale("pdf", si)
+            bs.eta *= self.scale("eta", si)
             return bs, weight * self.scale("weight", si)
 
         def eval(self, ctx, si, wo, active=True):
