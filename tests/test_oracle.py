@@ -430,14 +430,12 @@ class Sensor:
 
 
 class Flat:
-    """Stand-in for `rays.Quadrics`: no shape is curved."""
+    """Stand-in for `rays.Quadrics`: no shape is curved, or far larger than the distances to it."""
 
-    any = False
+    any = small = False
 
-    def starts(self, *_):
-        return mi.Float(0)
-
-    ends = starts
+    def at(self, *_):
+        return rays.Errors(mi.Float(0), mi.Float(0), mi.Float(0))
 
 
 class Nothing:

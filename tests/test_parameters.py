@@ -784,6 +784,22 @@ def test_films_that_are_refused(width, height, words):
         assert image(integrator(), scene, spp=1).shape == (3, 4, 3)
 
 
+@pytest.mark.parametrize("parameters", [{"skip": "none"}, {}], ids=["all", "default"])
+def test_gradients_of_any_scene_do_not_matter(parameters):
+    """Rationale: virtual calls visit emitters of other scenes too; one with gradients made Dr.Jit refuse
+    local memory in its own words. Expected: the image as without, also if the scene itself has some."""
+    scene, other = lamp_in_a_sphere(size=16), lamp_in_a_sphere(size=16)
+    bdpt = integrator(max_depth=4, **parameters)
+    plain = image(bdpt, scene, spp=16)
+    for touched in (other, scene):
+        params = mi.traverse(touched)
+        names = list(params.keys())
+        key = next(name for name in names if name.endswith(("radiance.value", "intensity.value")))
+        dr.enable_grad(params[key])
+        params.update()
+        assert np.array_equal(image(bdpt, scene, spp=16), plain)
+
+
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
     Expected: on a machine that has room for the film alone, each of them is refused in words."""

@@ -319,7 +319,7 @@ class Emitters:
             # Here and below a density that is NaN leaves the weight NaN, to be counted.
             weight=dr.select(pdf_first * pdf_second == 0, 0, radiance * (cos / (pdf_first * pdf_second))),
             d=d,
-            anchor=rays.sampled_anchor(ps.p, n, ps.p, self.quadrics.ends(shape, active)),
+            anchor=rays.sampled_anchor(ps.p, n, ps.p, self.quadrics.at(shape, active)),
             cos=cos,
             pdf_first=pdf_first,
             pdf_second=pdf_second,
@@ -340,11 +340,11 @@ class Emitters:
         for place, texture in self._beam_radiances:
             mask = active & (index == place)
             radiance = dr.select(mask, mi.Spectrum(texture.eval(si, mask)), radiance)
-        curvature = self.quadrics.ends(emitter.get_shape(), active)
+        errors = self.quadrics.at(emitter.get_shape(), active)
         return Emission(
             weight=dr.select(ps.pdf == 0, 0, radiance / ps.pdf),  # without cosine, as in Mitsuba
             d=d,
-            anchor=rays.sampled_anchor(ps.p, n, ps.p, curvature),
+            anchor=rays.sampled_anchor(ps.p, n, ps.p, errors),
             cos=dr.abs(dr.dot(n, d)),
             pdf_first=ps.pdf,
             pdf_second=mi.Float(1),
@@ -565,12 +565,11 @@ class Emitters:
         ratio = dr.select(infinite, self._density_across(si.p, ds.d), ratio)
         if UNKNOWN in self.kinds:
             ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
-        curvature, shape = mi.Float(0), None
-        if self.on_shapes:
-            curvature = self.quadrics.ends(emitter.get_shape(), active)
-        if self.quadrics.small:
-            shape = emitter.get_shape() if self.on_shapes else dr.zeros(mi.ShapePtr)
-        anchor = rays.sampled_anchor(ds.p, n, si.p, curvature)
+        shape = emitter.get_shape() if self.on_shapes else dr.zeros(mi.ShapePtr)
+        errors = self.quadrics.at(shape, active) if self.on_shapes else None
+        anchor = rays.sampled_anchor(ds.p, n, si.p, errors)
+        if not self.quadrics.small:
+            shape = None
         return Direct(weight, pdf, ds.d, anchor, shape, infinite, delta, ratio)
 
     # -- hits by camera subpaths ------------------------------------------------------------

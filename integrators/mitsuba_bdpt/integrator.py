@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict
+from functools import wraps
 
 import drjit as dr
 import mitsuba as mi
@@ -117,6 +118,18 @@ one cannot have a strategy (a sensor of a class that is not Mitsuba's has no t =
 """
 
 
+def _without_gradients(method):
+    """``method``, undisturbed by parameters with gradients, be they of other scenes: virtual calls visit
+    these too, and Dr.Jit cannot differentiate local memory."""
+
+    @wraps(method)
+    def undisturbed(*args, **kwargs):
+        with dr.suspend_grad():
+            return method(*args, **kwargs)
+
+    return undisturbed
+
+
 def _make_class():
     class BDPTIntegrator(mi.SamplingIntegrator):
         __doc__ = DOCUMENTATION
@@ -147,6 +160,7 @@ def _make_class():
             settings = self.settings
             return layer_names(settings.strategy_depth, settings.variance, feature_names(settings.aovs))
 
+        @_without_gradients
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, start=None):
             """Render ``scene``; see ``mi.Integrator.render`` for the arguments. ``start``: a
             `snapshot.Snapshot` of ``PassReport.snapshot`` to go on from, of the same scene; the image is
@@ -169,6 +183,7 @@ def _make_class():
             _warn_of_decisions_not_begun(self.settings.decisions, len(self.statistics["passes"]))
             return _result(sensor.film(), develop, evaluate)
 
+        @_without_gradients
         def decide(self, scene, sensor=0, seed=0, spp=0):
             """What the pilot of such a render chooses, as in ``statistics["decisions"]``: an empty list
             without a pilot, about which ``statistics["no_pilot"]`` says why. The parameter ``decisions`` of

@@ -144,8 +144,8 @@ class IrradianceMeter(Sensor):
         n = ps.n
         if self._smooth_mesh is not None:
             n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
-        curvature = self._quadrics.ends(mi.ShapePtr(self._shape))
-        return ps, rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, curvature)
+        errors = self._quadrics.at(mi.ShapePtr(self._shape))
+        return ps, rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
 
     def _start(self, uv, u_lens, like) -> CameraStart:
         ps, anchor = self._sample(uv, like)

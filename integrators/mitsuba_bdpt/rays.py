@@ -2,8 +2,9 @@
 
 Mitsuba offsets ray origins by 8.9e-5 (1 + max|p|), which swallows small scenes whole and leaves
 gaps in large ones. Here the offset along the geometric normal follows from the rounding error of
-the hit itself: ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t)`` with maximum norms, where ``o`` and ``t``
-belong to the ray that found ``p``. It scales with the scene. Visibility rays end short of their
+the hit itself: ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t, reach)`` with maximum norms, where ``o`` and ``t``
+belong to the ray that found ``p``, and ``reach`` is how far the numbers go that hits on its shape are
+computed from (`reach_of`). It scales with the scene. Visibility rays end short of their
 target by the target's own offset, not by a fraction of the distance. Towards spheres and cylinders they
 have to end earlier; where these are so small that this would pass by what stands before them, the ray asks
 which shape it meets first (`sight`).
@@ -15,11 +16,12 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from .objects import own_parameters
+from .objects import children, number, own_parameters
 
-# Measured: from 16 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to
-# 1 % of hits on cylinders); 32 keeps a factor of two in hand.
+# Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
+# cylinders), whether they are as large as the distances to them or 10^6 times larger.
 OFFSET_ULPS = 32
 
 
@@ -55,50 +57,67 @@ class Anchor:
         return self.p + self.n * dr.mulsign(self.offset, dr.dot(self.n, d))
 
 
-def rounding_offset(p, o, t):
-    """Offset that clears the rounding error of a hit ``p`` found from ``o`` at distance ``t``."""
+def rounding_offset(p, o, t, reach):
+    """Offset that clears the rounding error of a hit ``p`` found from ``o`` at distance ``t``, on a shape of
+    this ``reach``."""
     magnitude = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(o)))
-    return (OFFSET_ULPS * 2.0**-24) * dr.maximum(magnitude, t)
+    return (OFFSET_ULPS * 2.0**-24) * dr.maximum(dr.maximum(magnitude, t), reach)
+
+
+@dataclass
+class Errors:
+    """What rounding does to hits on a shape: ``ends``, the curvature 1 / radius on spheres and cylinders,
+    which visibility rays that end there meet too early; ``starts``, the same of cylinders alone (hits on
+    spheres are moved to their surface); ``reach``, see `reach_of`."""
+
+    ends: object
+    starts: object
+    reach: object
 
 
 class Quadrics:
-    """Curvature of the scene's spheres and cylinders, by shape pointer. ``small``: one of them is so small
-    that rays ask what they meet, see `SMALL`."""
+    """`Errors` of the scene's shapes, by pointer. ``any``: one of them is a sphere or cylinder; ``small``:
+    one of these is so small that rays ask what they meet, see `SMALL`."""
 
     def __init__(self, scene):
         shapes = scene.shapes()
-        rows = [_curvatures(s) for s in shapes]
-        self._size = 0
-        self.any = any(any(row) for row in rows)
+        grouped = [_curvatures(s) for group in groups(scene) for s in children(group).values()]
+        # An instance does not tell of which group it is: it has the largest curvatures of all of them.
+        within = tuple(max((row[i] for row in grouped), default=0.0) for i in (0, 1))
+        rows = [Errors(*_curvatures(s, within), reach_of(s)) for s in shapes]
+        self.any = any(row.ends for row in rows)
         extent = 2 * scene.bbox().bounding_sphere().radius if self.any else 0
         # Not `>`: the extent may be NaN.
-        self.small = any(row[0] and not row[0] * extent <= SMALL for row in rows)
-        if self.any:
-            ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
-            self._size = max(ids) + 1
-            table = [(0.0, 0.0)] * self._size
-            for number, row in zip(ids, rows, strict=True):
-                table[number] = row
-            self._ends, self._starts = (mi.Float(column) for column in zip(*table, strict=True))
-            dr.make_opaque(self._ends, self._starts)
+        self.small = any(row.ends and not row.ends * extent <= SMALL for row in rows)
+        ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
+        self._size = max(ids, default=0) + 1
+        table = [Errors(0.0, 0.0, 0.0)] * self._size
+        for index, row in zip(ids, rows, strict=True):
+            table[index] = row
+        self._table = Errors(*(mi.Float([getattr(row, n) for row in table]) for n in vars(table[0])))
+        dr.make_opaque(self._table)
 
-    def ends(self, shape, active=True):
-        """1 / radius where ``shape`` is a sphere or cylinder, else 0."""
-        return self._look_up("_ends", shape, active)
-
-    def starts(self, shape, active=True):
-        """1 / radius where ``shape`` is a cylinder (hits on spheres are exact), else 0."""
-        return self._look_up("_starts", shape, active)
-
-    def _look_up(self, column, shape, active):
-        if not self.any:
-            return mi.Float(0)
-        number = dr.reinterpret_array(mi.UInt32, shape)
-        known = mi.Bool(active) & (number < self._size)  # shapes inside instances are not
-        return dr.gather(mi.Float, getattr(self, column), number, known)
+    def at(self, shape, active=True, instance=None) -> Errors:
+        """The `Errors` of hits on ``shape``, or on the ``instance`` in which it was met."""
+        index = dr.reinterpret_array(mi.UInt32, shape)
+        if instance is not None:
+            met = dr.reinterpret_array(mi.UInt32, instance)
+            index = dr.select(met != 0, met, index)
+        known = mi.Bool(active) & (index < self._size)
+        found = Errors(mi.Float(0), mi.Float(0), dr.gather(mi.Float, self._table.reach, index, known))
+        if self.any:  # else nothing of what follows from curvatures is recorded
+            found.ends = dr.gather(mi.Float, self._table.ends, index, known)
+            found.starts = dr.gather(mi.Float, self._table.starts, index, known)
+        return found
 
 
-def _curvatures(shape) -> tuple[float, float]:
+def groups(scene) -> list:
+    """The scene's shape groups."""
+    return [c for c in children(scene).values() if isinstance(c, mi.Shape) and c.class_name() == "ShapeGroup"]
+
+
+def _curvatures(shape, within=(0.0, 0.0)) -> tuple[float, float]:
+    """Columns of `Errors`; ``within``: those of the shapes in groups."""
     if shape.shape_type() == mi.ShapeType.Sphere.value:
         box = shape.bbox()
         return 2 / max(float(box.max.x - box.min.x), 1e-30), 0.0
@@ -107,21 +126,72 @@ def _curvatures(shape) -> tuple[float, float]:
         across = dr.norm(mi.Vector3f(to_world @ mi.Vector3f(1, 0, 0)))
         inverse = 1 / max(float(dr.slice(across)), 1e-30)
         return inverse, inverse
+    if shape.class_name() == "Instance" and any(within):
+        scale = np.linalg.norm(_matrix(shape)[:3, :3], axis=0).min()
+        return tuple(inverse / max(scale, 1e-30) for inverse in within)
     return 0.0, 0.0
+
+
+def _matrix(shape) -> np.ndarray:
+    return np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+
+
+def reach_of(shape) -> float:
+    """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: corners
+    of rectangles, centers and radii of spheres and cylinders, vertices of a triangle (the longest edge of a
+    mesh, from any point of the triangle), coordinates within an instance. 0 for others: disks, curves and
+    grids are as exact near by as far away."""
+    if shape.class_name() == "Instance":
+        return _reach_within(shape)
+    if shape.shape_type() in _WHOLE:
+        return _largest(shape.bbox())
+    params = own_parameters(shape) if shape.is_mesh() else {}
+    if "vertex_positions" not in params or not len(params["faces"]):
+        return 0.0
+    p = dr.unravel(mi.Point3f, mi.Float(params["vertex_positions"]))
+    faces = dr.unravel(mi.Vector3u, mi.UInt32(params["faces"]))
+    a, b, c = (dr.gather(mi.Point3f, p, index) for index in faces)
+    edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
+    return _finite(number(dr.max(dr.max(edges))))
+
+
+_WHOLE = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Sphere, mi.ShapeType.Cylinder)}
+
+
+def _largest(box) -> float:
+    return _finite(np.abs([box.min, box.max]).max())
+
+
+def _finite(x) -> float:
+    """0 for a shape without a size, which is somebody else's business."""
+    return float(x) if np.isfinite(x) else 0.0
+
+
+def _reach_within(instance) -> float:
+    matrix, box = _matrix(instance), instance.bbox()
+    corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    corners[:, :3] = low + corners[:, :3] * (high - low)
+    if not (np.isfinite(corners).all() and abs(np.linalg.det(matrix[:3, :3])) > 0):
+        return 0.0
+    local = np.abs(corners @ np.linalg.inv(matrix).T)[:, :3].max()
+    scale = np.linalg.norm(matrix[:3, :3], axis=0).max()
+    return _finite(max(local * scale, np.abs(matrix[:3, 3]).max()))
 
 
 def surface_anchor(si, ray, quadrics: Quadrics) -> Anchor:
     """Anchor of the hit ``si`` that ``ray`` found."""
-    offset = rounding_offset(si.p, ray.o, si.t)
-    offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * quadrics.starts(si.shape, si.is_valid())
-    curvature = quadrics.ends(si.shape, si.is_valid())
-    return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, curvature)
+    errors = quadrics.at(si.shape, si.is_valid(), si.instance)
+    offset = rounding_offset(si.p, ray.o, si.t, errors.reach)
+    offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * errors.starts
+    return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
 
 
-def sampled_anchor(p, n, reference, curvature) -> Anchor:
-    """Anchor of a point sampled on a surface, to be joined with the point ``reference``."""
-    offset = rounding_offset(p, reference, dr.norm(p - reference))
-    return Anchor(mi.Point3f(p), mi.Normal3f(n), offset, mi.Float(curvature))
+def sampled_anchor(p, n, reference, errors: Errors | None) -> Anchor:
+    """Anchor of a point sampled on a shape of these ``errors``, None off shapes, to be joined with the point
+    ``reference``."""
+    offset = rounding_offset(p, reference, dr.norm(p - reference), errors.reach if errors else 0)
+    return Anchor(mi.Point3f(p), mi.Normal3f(n), offset, mi.Float(errors.ends if errors else 0))
 
 
 def free_anchor(p) -> Anchor:

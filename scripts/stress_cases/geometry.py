@@ -350,6 +350,64 @@ def _tiny(kind) -> Outcome:
     return Outcome(outcome.ok, text)
 
 
+def _hidden() -> Outcome:
+    """A black plate close below a lamp on a small sphere or cylinder, and the same without the plate."""
+    away, brightest, gaps, broken = 8.0, 0.0, [], 0
+    camera = _camera((0, 3, 4), (0, 0, 0), 2)
+    for kind in ("sphere", "cylinder"):
+        for radius, gap in ((1e-2, 0.03), (5e-3, 0.02), (1e-3, 0.02), (1e-6, 0.07)):
+            plate = _floor(0, 0.5) | {"to_world": _transform().translate([0, 0, away - gap]).scale(0.5)}
+            for side in WAYS.values():
+                means = []
+                for r, more in ((radius, {"plate": plate}), (radius, {}), (10 * radius, {})):
+                    lamp = {"type": "sphere", "center": [0, 0, away], "radius": r}
+                    if kind == "cylinder":
+                        lamp = {"type": "cylinder", "p0": [-0.1, 0, away], "p1": [0.1, 0, away], "radius": r}
+                    lamp["emitter"] = _area(r ** (-2 if kind == "sphere" else -1))
+                    scene = _scene(sensor=camera, floor=_floor(), lamp=lamp, **more)
+                    image, bad = _tiles(scene, side | {"max_depth": 2}, 128, range(1))
+                    means.append(float(image.mean()))
+                    broken += bad
+                hidden, seen, large = means
+                brightest = max(brightest, hidden / large)
+                gaps.append(abs(seen / large - 1))
+    ok = brightest == 0 and max(gaps) < 0.03 and not broken
+    text = f"{100 * brightest:.2g} % of the light behind the plate; without it off by {100 * max(gaps):.2g} %"
+    return Outcome(ok, f"{text} at most, {broken} samples not finite")
+
+
+def _large() -> Outcome:
+    """A ball under a lamp on floors 10 to 3e3 wide, all turned by an odd angle: rectangles, triangles,
+    spheres and cylinders so large that they are as flat, and an instance of a cube far from its origin."""
+    turn = _transform().rotate([0.6, 0, 0.8], 33)
+    lamp = turn @ _transform().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(0.5)
+    common = {
+        "sensor": _camera((0, -4, 2), (0, 0, 0)),
+        "ball": {"type": "sphere", "to_world": turn @ _transform().translate([0, 0, 1]).scale(0.5)},
+        "lamp": {"type": "rectangle", "to_world": lamp, "bsdf": _grey(0), "emitter": _area(10)},
+    }
+    common["sensor"]["to_world"] = turn @ common["sensor"]["to_world"]
+    floors = {}
+    for size in (10.0, 1e3):
+        floors[f"rectangle {size:g}"] = {"type": "rectangle", "to_world": turn @ _transform().scale(size)}
+        block = _transform().translate([0, 0, -size]).scale(size)
+        floors[f"cube {size:g}"] = {"type": "cube", "to_world": turn @ block}
+    for size in (3e3,):  # 7e-4 lower two units away
+        down = turn @ _transform().translate([0, 0, -size])
+        floors[f"sphere {size:g}"] = {"type": "sphere", "to_world": down.scale(size)}
+        lying = down.rotate([1, 0, 0], 90).translate([0, 0, -size]).scale([size, size, 2 * size])
+        floors[f"cylinder {size:g}"] = {"type": "cylinder", "to_world": lying}
+    makes = {name: floor | {"bsdf": _grey(0.5)} for name, floor in floors.items()}
+    scene = _scene(**common, floor=makes.pop("rectangle 10"))
+    pairs = [(_scene(**common, floor=floor), scene, PATH) for floor in makes.values()]
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": _grey(0.5)}}
+    far = {"to_world": _transform().translate([1000, 1000, 999]).scale([10, 10, 1])}
+    group["cube"] |= far
+    back = {"type": "instance", "to_world": turn @ _transform().translate([-1000, -1000, -1000])}
+    instanced = _scene(**common, group=group, floor=back | {"group": {"type": "ref", "id": "group"}})
+    return _against([*pairs, (instanced, scene, PATH)], {"max_depth": 4}, most_error=0.03)
+
+
 # -- the camera in odd places -----------------------------------------------------------------
 
 
@@ -470,6 +528,21 @@ CASES = (
             partial(_tiny, kind),
         )
         for kind in ("rectangle", "disk", "sphere")
+    ),
+    _case(
+        "hidden-lamps",
+        "lamps on spheres and cylinders of 1e-2 to 1e-6, 8 above a floor, a black plate 0.02 to 0.07 below",
+        "no light at all; without the plate that of a lamp ten times as large and as bright altogether, to "
+        "3 % (one render of 2^15 samples each)",
+        _hidden,
+        True,
+    ),
+    _case(
+        "large-floors",
+        "a ball and a lamp on floors 1e3 and 3e3 wide, turned: rectangles, cubes, spheres, cylinders; on a "
+        "cube that an instance brings 1000 units back",
+        f"what `path` sees on a rectangle of 10: {_WELCH}",
+        _large,
     ),
     _case(
         "camera-in-glass",
