@@ -56,7 +56,7 @@ from .emitter_tables import (
 )
 from .infinity import Disks
 from .objects import children, living_emitters, number, share_functions
-from .spheres import cone_density, is_turned_sphere, sphere_normal
+from .spheres import cone_density, is_turned_sphere, may_light_itself, sphere_normal
 
 
 @dataclass
@@ -100,10 +100,10 @@ class Direct:
     pdf_w: object
     d: object
     anchor: rays.Anchor
-    shape: object
     infinite: object
     delta: object
     emission_ratio: object
+    shape: object = None
 
 
 class Emitters:
@@ -192,6 +192,8 @@ class Emitters:
             refuse_curves(
                 scene, emitters[sampled.index(True)], "lives with a class that has no sample_position"
             )
+        glass = [s and may_light_itself(e.get_shape()) for e, s in zip(emitters, sampled, strict=True)]
+        self._any_glass, self._glass = any(glass), mi.Bool(glass)
         self._smooth_meshes = SmoothMeshes.of(
             [e if s else None for e, s in zip(emitters, sampled, strict=True)]
         )
@@ -534,6 +536,9 @@ class Emitters:
             narrow = density > 0
             ds.pdf = dr.select(narrow, density, ds.pdf)
             weight = dr.select(narrow, _radiance_over_density(emitter, ds, si, narrow), weight)
+        if self._any_glass:
+            own = active & (si.shape == emitter.get_shape()) & dr.gather(mi.Bool, self._glass, index, active)
+            weight = dr.select(own, 0, weight)
         area = self._is(index, active, AREA)
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
         delta = self._is(index, active, *POSITIONS, DIRECTIONAL)
@@ -570,7 +575,7 @@ class Emitters:
         anchor = rays.sampled_anchor(ds.p, n, si.p, errors)
         if not self.quadrics.small:
             shape = None
-        return Direct(weight, pdf, ds.d, anchor, shape, infinite, delta, ratio)
+        return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio, shape)
 
     # -- hits by camera subpaths ------------------------------------------------------------
 

@@ -53,6 +53,14 @@ def is_turned_sphere(shape) -> bool:
     return sphere is not None and sphere.turned
 
 
+def may_light_itself(shape) -> bool:
+    """Whether ``shape`` is a sphere that shines outwards and lets light through: no point of it lights
+    another, but rounding puts some outside, and Mitsuba samples the cone from there into the sphere."""
+    sphere, through = Sphere.of(shape), (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
+    flags = shape.bsdf().flags()
+    return sphere is not None and sphere.outward > 0 and any(mi.has_flag(flags, flag) for flag in through)
+
+
 def is_small(sphere: Sphere, extent) -> bool:
     """Whether a sphere may be `NARROW` as seen from a point at most ``extent`` away."""
     # Not `<`: the extent of a scene with a vertex at infinity is NaN.

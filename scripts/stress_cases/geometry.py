@@ -377,7 +377,7 @@ def _hidden() -> Outcome:
 
 
 def _large() -> Outcome:
-    """A ball under a lamp on floors 10 to 3e3 wide, all turned by an odd angle: rectangles, triangles,
+    """A ball under a lamp on floors 30 to 3e3 wide, all turned by an odd angle: rectangles, triangles,
     spheres and cylinders so large that they are as flat, and an instance of a cube far from its origin."""
     turn = _transform().rotate([0.6, 0, 0.8], 33)
     lamp = turn @ _transform().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(0.5)
@@ -388,7 +388,7 @@ def _large() -> Outcome:
     }
     common["sensor"]["to_world"] = turn @ common["sensor"]["to_world"]
     floors = {}
-    for size in (10.0, 1e3):
+    for size in (30.0, 1e3):
         floors[f"rectangle {size:g}"] = {"type": "rectangle", "to_world": turn @ _transform().scale(size)}
         block = _transform().translate([0, 0, -size]).scale(size)
         floors[f"cube {size:g}"] = {"type": "cube", "to_world": turn @ block}
@@ -398,10 +398,10 @@ def _large() -> Outcome:
         lying = down.rotate([1, 0, 0], 90).translate([0, 0, -size]).scale([size, size, 2 * size])
         floors[f"cylinder {size:g}"] = {"type": "cylinder", "to_world": lying}
     makes = {name: floor | {"bsdf": _grey(0.5)} for name, floor in floors.items()}
-    scene = _scene(**common, floor=makes.pop("rectangle 10"))
+    scene = _scene(**common, floor=makes.pop("rectangle 30"))
     pairs = [(_scene(**common, floor=floor), scene, PATH) for floor in makes.values()]
     group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": _grey(0.5)}}
-    far = {"to_world": _transform().translate([1000, 1000, 999]).scale([10, 10, 1])}
+    far = {"to_world": _transform().translate([1000, 1000, 999]).scale([30, 30, 1])}
     group["cube"] |= far
     back = {"type": "instance", "to_world": turn @ _transform().translate([-1000, -1000, -1000])}
     instanced = _scene(**common, group=group, floor=back | {"group": {"type": "ref", "id": "group"}})
@@ -541,7 +541,7 @@ CASES = (
         "large-floors",
         "a ball and a lamp on floors 1e3 and 3e3 wide, turned: rectangles, cubes, spheres, cylinders; on a "
         "cube that an instance brings 1000 units back",
-        f"what `path` sees on a rectangle of 10: {_WELCH}",
+        f"what `path` sees on a rectangle of 30: {_WELCH}",
         _large,
     ),
     _case(
