@@ -112,13 +112,12 @@ def _found_anew(scene, kernel, kappa, path):
         rebuilt = reconstruct.rebuild(scene, kernel.emitters, path)
     except reconstruct.Lost as why:
         return None, str(why)
-    # The estimate is divided by the class's count, and, from `rr_depth` on, by the probability of survival.
-    count = 1 / kernel.plan.served if path.t <= 1 else 1.0
+    # The estimate is divided by the class's count and by the probability that roulette let the path live.
+    count = (1 / kernel.plan.served if path.t <= 1 else 1.0) * path.survival
     ratio = path.estimate.max() * count / rebuilt.estimate(path.s).max()
-    played = max(path.s, path.t) > int(kernel.rr_depth[0])
-    if ratio < 1 - AGREE or (ratio > 1 + AGREE and not played):
+    if abs(ratio - 1) > AGREE:
         return rebuilt, f"the estimate is {ratio:.3g} times that of the path"
-    weight = kappa[path.s] / (kappa @ rebuilt.relative(path.s))
+    weight = kappa[path.s] / (kappa @ rebuilt.compared(path.s))
     if abs(weight - path.weight) > AGREE * path.weight:
         return rebuilt, f"the weight is {path.weight:.3g}, that of the path {weight:.3g}"
     return rebuilt, ""

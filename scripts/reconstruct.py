@@ -30,30 +30,44 @@ class Lost(ValueError):
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """``f`` of a path, three colours, and ``log_p`` of its k + 2 strategies, s = 0 first, in one unit."""
+    """``f`` of a path, three colours; of its k + 2 strategies, s = 0 first, ``log_p`` as the weights compare
+    them, and ``log_turned``, the logarithm of what their delta events on the light side add to f / p: `f` and
+    ``log_p`` count those in solid angle on the light's side, a light subpath has them on the camera's."""
 
     f: np.ndarray
     log_p: np.ndarray
+    log_turned: np.ndarray
 
     def estimate(self, s: int) -> np.ndarray:
         """f / p of a strategy."""
-        return self.f * np.exp(-self.log_p[s])
+        return self.f * np.exp(self.log_turned[s] - self.log_p[s])
 
     def relative(self, s: int) -> np.ndarray:
         """Densities of all strategies over that of one."""
-        return np.exp(np.minimum(self.log_p - self.log_p[s], 700))
+        return _ratios(self.log_p - self.log_turned, s)
+
+    def compared(self, s: int) -> np.ndarray:
+        """The same as the weights see them, which take both solid angles of a refraction for equal (Georgiev,
+        eqs. 53, 54)."""
+        return _ratios(self.log_p, s)
+
+
+def _ratios(log_p, s: int) -> np.ndarray:
+    return np.exp(np.minimum(log_p - log_p[s], 700))
 
 
 @dataclass(frozen=True)
 class _Event:
     """What happens at a vertex: f cos (of delta events over their probability), densities of going on to the
-    light and to the camera, cosines with the geometric normal on the two sides."""
+    light and to the camera, cosines with the geometric normal on the two sides, solid angle of a delta event
+    on the camera's side over that on the light's."""
 
     value: np.ndarray
     to_light: float
     to_camera: float
     cos_light: float
     cos_camera: float
+    turned: float
 
 
 def rebuild(scene, emitters, path) -> Rebuilt:
@@ -68,7 +82,9 @@ def rebuild(scene, emitters, path) -> Rebuilt:
     if path.infinite:
         to_area[0] = 0
     log_f = to_area.sum() + sensor
-    return Rebuilt(radiance * np.prod([e.value for e in events], axis=0) * np.exp(log_f), log_p)
+    # Of the events at x_1 ... x_{s-1}: where a strategy joins vertices they are 1.
+    log_turned = np.cumsum([0, 0, *(np.log(e.turned) for e in events[::-1]), 0])
+    return Rebuilt(radiance * np.prod([e.value for e in events], axis=0) * np.exp(log_f), log_p, log_turned)
 
 
 def _follow(scene, path):
@@ -115,9 +131,9 @@ def _check_place(si, path, i: int):
 def _scatter(si, d, delta: bool, i: int):
     """The `_Event` at a vertex that goes on along ``d``, and the direction in which it really goes on."""
     ctx, bsdf, wo = mi.BSDFContext(), si.bsdf(), si.to_local(_vector(d))
-    to_light = to_camera = 1.0
+    to_light = to_camera = turned = 1.0
     if delta:
-        wo, value = _lobe(ctx, bsdf, si, wo, i)
+        wo, value, turned = _lobe(ctx, bsdf, si, wo, i)
     else:
         back = mi.SurfaceInteraction3f(si)
         back.wi = wo
@@ -127,20 +143,31 @@ def _scatter(si, d, delta: bool, i: int):
     out = si.to_world(wo)
     cosines = dr.abs(dr.dot(si.n, out)), dr.abs(dr.dot(si.n, si.to_world(si.wi)))
     dr.eval(out, cosines)
-    return _Event(value, to_light, to_camera, *(float(x[0]) for x in cosines)), out
+    return _Event(value, to_light, to_camera, *(float(x[0]) for x in cosines), turned), out
 
 
 def _lobe(ctx, bsdf, si, wo, i: int):
     """Direction and weight of the delta lobe that leads along ``wo``."""
     bs, weight = bsdf.sample(ctx, si, mi.Float(LOBES), mi.Point2f(0.5))
     leads = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (dr.dot(bs.wo, wo) > SAME_DIRECTION)
-    dr.eval(bs.wo, weight, leads)
+    turned = _turned(si, bs)
+    dr.eval(bs.wo, weight, leads, turned)
     found = np.flatnonzero(np.array(leads))
     if not len(found):
         raise Lost(f"no delta lobe at vertex {i} leads to the next vertex")
     lobe = mi.UInt32(int(found[0]))
-    weights = np.array(weight, dtype=float).reshape(3, -1)
-    return dr.gather(mi.Vector3f, bs.wo, lobe), weights[:, found[0] % weights.shape[1]]
+    weights, turned = np.array(weight, dtype=float).reshape(3, -1), np.array(turned, dtype=float)
+    chosen = weights[:, found[0] % weights.shape[1]], turned[found[0] % len(turned)]
+    return dr.gather(mi.Vector3f, bs.wo, lobe), *chosen
+
+
+def _turned(si, bs):
+    """Solid angle on the camera's side of a delta event over that on the light's: refraction keeps
+    eta^2 |m.w| dw, m the normal about which it refracts (along eta_c c + eta_l l)."""
+    m = si.wi + bs.eta * bs.wo  # bs.eta = eta_l / eta_c
+    ratio = dr.square(bs.eta) * dr.abs(dr.dot(m, bs.wo) / dr.dot(m, si.wi))
+    refracted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission) & (dr.abs(bs.eta - 1) > 1e-5)
+    return dr.select(refracted, ratio, 1)
 
 
 def _densities(scene, emitters, path, events, end):

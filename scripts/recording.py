@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 from copy import copy
 from dataclasses import dataclass, field
+from itertools import pairwise
 from unittest import mock
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
@@ -145,7 +146,7 @@ class Path:
     the direction to it (``infinite``); ``shapes`` numbers of Dr.Jit, 0 for none; ``delta``: the event was a
     delta event. ``value`` (three colours) what the strategy (``s``, ``t``) adds with the ``weight``, roulette
     and the draw of a connection included; ``estimate`` without these two, unweighted. ``pdf_w`` of the
-    sensor's direction."""
+    sensor's direction. ``survival``: the probability with which roulette let both subpaths live."""
 
     s: int
     t: int
@@ -157,6 +158,7 @@ class Path:
     shapes: list
     delta: list
     infinite: bool
+    survival: float = 1.0
 
 
 @dataclass
@@ -169,6 +171,8 @@ class _Visit:
     shape: np.ndarray
     delta: np.ndarray
     hit: np.ndarray
+    throughput: np.ndarray
+    weight: np.ndarray
     joined: np.ndarray | None = None
     infinite: np.ndarray | None = None
     pdf_w: np.ndarray | None = None
@@ -244,6 +248,15 @@ class Recorder:
 
         return watched
 
+    @staticmethod
+    def _survival(subpath, count: int, i: int) -> float:
+        """The probability with which roulette let the first ``count`` vertices of a subpath come about."""
+        visits = [] if subpath is None else subpath.visits[: count - 1] if count else []
+        found = 1.0
+        for a, b in pairwise(visits):
+            found *= (a.throughput[:, i] * a.weight[:, i]).max() / b.throughput[:, i].max()
+        return found
+
     def _visit(self, side, vertex) -> _Visit:
         shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
         away = mi.Point3f(-vertex.si.wi)  # of rays that have left the scene: their direction, in world space
@@ -253,6 +266,8 @@ class Recorder:
             self._numbers(dr.select(vertex.hit, shape, 0)).astype(int),
             self._numbers(delta).astype(bool),
             self._numbers(vertex.hit).astype(bool),
+            self._numbers(vertex.throughput, 3),
+            self._numbers(1.0 if self._step is None else self._step.weight, 3),
         )
         end = vertex.endpoint
         if end is not None and side.adjoint:
@@ -354,7 +369,8 @@ class Recorder:
             towards, pdf_w = [(last.joined[:, i], 0, False)], last.pdf_w[i]
         p, shapes, delta = zip(*towards, *back, strict=True)
         numbers = (c["value"], c["estimate"], float(c["weight"]))
-        return Path(s, t, *numbers, pdf_w, np.array(p), list(shapes), list(delta), infinite)
+        survival = self._survival(self.camera, t, i) * self._survival(self.light, s, i)
+        return Path(s, t, *numbers, pdf_w, np.array(p), list(shapes), list(delta), infinite, survival)
 
     def _vertices(self, subpath, count: int, i: int, joined: bool) -> list:
         """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath; no

@@ -574,11 +574,7 @@ def test_a_lamp_of_glass_does_not_light_itself(bsdf, parameters):
         scene = mi.load_dict(
             {
                 "type": "scene",
-                "sensor": {
-                    "type": "perspective",
-                    "film": film,
-                    "to_world": T.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-                },
+                "sensor": {"type": "perspective", "film": film, "to_world": eye},
                 "ball": {
                     "type": "sphere",
                     "radius": 0.6,
