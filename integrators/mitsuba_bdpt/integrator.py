@@ -112,7 +112,8 @@ Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``N
 that is called with a `rendering.PassReport` after each pass.
 
 Not supported, and refused in words: scalar and polarized variants, participating media,
-derivatives, ``strategy_images`` on a ``specfilm``. Emitters and sensors of every kind take part; where
+derivatives (``integrator.render`` itself ignores gradients), ``strategy_images`` on a ``specfilm``. Threads
+need a scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where
 one cannot have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and
 ``explain`` says so.
 """
