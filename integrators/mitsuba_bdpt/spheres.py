@@ -56,9 +56,12 @@ def is_turned_sphere(shape) -> bool:
 def may_light_itself(shape) -> bool:
     """Whether ``shape`` is a sphere that shines outwards and lets light through: no point of it lights
     another, but rounding puts some outside, and Mitsuba samples the cone from there into the sphere."""
-    sphere, through = Sphere.of(shape), (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     flags = shape.bsdf().flags()
-    return sphere is not None and sphere.outward > 0 and any(mi.has_flag(flags, flag) for flag in through)
+    through = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
+    if not any(mi.has_flag(flags, flag) for flag in through):  # of nearly all lamps: no kernel runs for them
+        return False
+    sphere = Sphere.of(shape)
+    return sphere is not None and sphere.outward > 0
 
 
 def is_small(sphere: Sphere, extent) -> bool:

@@ -392,17 +392,16 @@ def _large() -> Outcome:
         floors[f"rectangle {size:g}"] = {"type": "rectangle", "to_world": turn @ _transform().scale(size)}
         block = _transform().translate([0, 0, -size]).scale(size)
         floors[f"cube {size:g}"] = {"type": "cube", "to_world": turn @ block}
-    for size in (3e3,):  # 7e-4 lower two units away
-        down = turn @ _transform().translate([0, 0, -size])
-        floors[f"sphere {size:g}"] = {"type": "sphere", "to_world": down.scale(size)}
-        lying = down.rotate([1, 0, 0], 90).translate([0, 0, -size]).scale([size, size, 2 * size])
-        floors[f"cylinder {size:g}"] = {"type": "cylinder", "to_world": lying}
+    size = 3e3  # 7e-4 lower two units away
+    down = turn @ _transform().translate([0, 0, -size])
+    floors["sphere"] = {"type": "sphere", "to_world": down.scale(size)}
+    lying = down.rotate([1, 0, 0], 90).translate([0, 0, -size]).scale([size, size, 2 * size])
+    floors["cylinder"] = {"type": "cylinder", "to_world": lying}
     makes = {name: floor | {"bsdf": _grey(0.5)} for name, floor in floors.items()}
     scene = _scene(**common, floor=makes.pop("rectangle 30"))
     pairs = [(_scene(**common, floor=floor), scene, PATH) for floor in makes.values()]
-    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": _grey(0.5)}}
-    far = {"to_world": _transform().translate([1000, 1000, 999]).scale([30, 30, 1])}
-    group["cube"] |= far
+    far = _transform().translate([1000, 1000, 999]).scale([30, 30, 1])
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": _grey(0.5), "to_world": far}}
     back = {"type": "instance", "to_world": turn @ _transform().translate([-1000, -1000, -1000])}
     instanced = _scene(**common, group=group, floor=back | {"group": {"type": "ref", "id": "group"}})
     return _against([*pairs, (instanced, scene, PATH)], {"max_depth": 4}, most_error=0.03)
