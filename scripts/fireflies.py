@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
+import oracle
 import reconstruct
 import recording
 import reference
@@ -34,7 +35,6 @@ from metrics import TRIM, rel_mse, rel_mse_epsilon
 from mistakes import answered
 from mitsuba_bdpt.__main__ import number
 from reference import benchmark_depth
-from stress_cases import oracle
 from tables import table
 
 import drjit as dr  # isort: skip

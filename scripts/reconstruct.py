@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-from stress_cases import oracle
+import oracle
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -120,12 +120,13 @@ def _direction(path, i: int):
 
 
 def _check_place(si, path, i: int):
+    end = ", where the emitter is (one without area cannot be hit)" if i == len(path.p) - 1 else ""
     if not bool(si.is_valid()[0]):
-        raise Lost(f"nothing is hit at vertex {i}")
+        raise Lost(f"nothing is hit at vertex {i}{end}")
     edge = np.linalg.norm(path.p[i] - path.p[i - 1])
     off = np.linalg.norm(np.array(si.p).ravel() - path.p[i]) / edge
     if off > SAME_PLACE:
-        raise Lost(f"vertex {i} is off by {off:.2g} of the edge to it")
+        raise Lost(f"vertex {i} is off by {off:.2g} of the edge to it{end}")
 
 
 def _scatter(si, d, delta: bool, i: int):

@@ -11,7 +11,7 @@ import pytest
 from mitsuba_bdpt import sensors
 from mitsuba_bdpt.emitters import Emitters
 from mitsuba_bdpt.kernel import Shared
-from mitsuba_bdpt.rays import Quadrics
+from mitsuba_bdpt.rays import ShapeErrors
 from scene_parts import (
     EGG,
     EMITTERS,
@@ -215,7 +215,7 @@ def test_direct_sample_agrees_with_hits(name):
     seen &= np.array(lit)
     assert seen.sum() > 500
     assert off((direct.weight * direct.pdf_w).x, radiance.x) < 0.02
-    # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rays.Quadrics).
+    # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rays.ShapeErrors).
     few = {"cylinder": 0.05, "textured sphere": 0.02}.get(name, 0.01)
     assert off(direct.pdf_w, connect * to_angle) < few
     edge = dr.select(at.is_valid(), dr.rcp(dr.square(at.t)), 1)
@@ -347,7 +347,7 @@ CAMERAS = {
 
 
 def camera_of(sensor):
-    camera = sensors.prepare(sensor, Quadrics(mi.load_dict({"type": "scene"})))
+    camera = sensors.prepare(sensor, ShapeErrors(mi.load_dict({"type": "scene"})))
     return camera, like_of_rgb()
 
 

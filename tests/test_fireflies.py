@@ -156,7 +156,8 @@ def test_wrong_paths_are_not_found():
     moved = path.p + np.array([0, 0, 0.1]) * (np.arange(5) == 2)[:, None]
     assert "leads to the next vertex" in doubt(p=moved)
     along = path.p[4] + 0.1 * (path.p[4] - path.p[3])
-    assert "vertex 4 is off by" in doubt(p=np.array([*path.p[:4], along]))
+    behind = doubt(p=np.array([*path.p[:4], along]))
+    assert "vertex 4 is off by" in behind and "one without area cannot be hit" in behind
     assert "no delta lobe at vertex 2" in doubt(delta=[False, True, True, True, False])
     assert "weight is 0.5, that of the path 1" in doubt(weight=0.5)
     assert "estimate is 2 times" in doubt(estimate=2 * path.estimate)

@@ -57,6 +57,25 @@ def test_what_reflects_more_than_it_receives_is_named(bsdf, said):
     assert all(said in text for text in warnings)
 
 
+def test_spots_that_rounding_changes_are_named():
+    """Rationale: at 0.1 degrees 1 - cos has 26 steps of single precision. Expected: one warning per render
+    that names the spot and by how much; none at 0.3 degrees."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2})
+
+    def said(*angles):
+        lamps = {f"lamp {i}": {"type": "spot", "cutoff_angle": a} for i, a in enumerate(angles)}
+        film = {"type": "hdrfilm", "width": 8, "height": 8}
+        sensor = {"type": "perspective", "film": film}
+        scene = mi.load_dict({"type": "scene", "sensor": sensor, "ball": {"type": "sphere"}, **lamps})
+        with Warned() as warnings:
+            integrator.render(scene, spp=1)
+        return list(warnings)
+
+    assert said(0.3, 20) == []
+    (text,) = said(0.1, 20)
+    assert "spot 'lamp 0' has cutoff_angle=0.1 (some 4%)" in text and "lamp 1" not in text
+
+
 def test_coefficients_of_spectra_are_no_reflectances():
     """Rationale: a spectral variant keeps three coefficients for each colour of a texture, above 1 for one of
     more than 0.85. Expected: nothing is said of it; a number above 1 is still named."""

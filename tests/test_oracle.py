@@ -24,11 +24,11 @@ from types import SimpleNamespace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import oracle
 import pytest
 from mitsuba_bdpt import bsdf, connect, emitters, kernel, mis, rays, sensor_records, sensors, sinks
-from stress_cases import oracle
+from oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
-from stress_cases.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------
 
@@ -430,7 +430,7 @@ class Sensor:
 
 
 class Flat:
-    """Stand-in for `rays.Quadrics`: no shape is curved, or far larger than the distances to it."""
+    """Stand-in for `rays.ShapeErrors`: no shape is curved, or far larger than the distances to it."""
 
     any = small = False
 
@@ -518,7 +518,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         refracts=True,
         points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
-        quadrics=Flat(),
+        shape_errors=Flat(),
     )
     result = [f(0)] * (k + 2)
     stored = []
@@ -692,7 +692,7 @@ def test_densities_of_emission_are_those_of_hits(name):
     ray = rays.spawn(e.anchor, e.d, like)
     y1 = scene.ray_intersect(ray)
     there = y1.is_valid() & ~e.delta
-    anchor = rays.surface_anchor(y1, ray, lights.quadrics)
+    anchor = rays.surface_anchor(y1, ray, lights.shape_errors)
     y0 = scene.ray_intersect(rays.spawn(anchor, -e.d, like), there)
     near = dr.norm(y0.p - e.si.p) < 1e-3
     there &= dr.select(e.infinite, ~y0.is_valid(), y0.is_valid() & near)
@@ -736,7 +736,7 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
             **more,
         }
     )
-    camera = sensors.prepare(sensor, rays.Quadrics(mi.load_dict({"type": "scene"})))
+    camera = sensors.prepare(sensor, rays.ShapeErrors(mi.load_dict({"type": "scene"})))
     like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(4096)
     u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]

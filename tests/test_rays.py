@@ -121,7 +121,7 @@ def first_hits(scene, place, n, rng, inside, distance=3.0):
 
 def anchor_of(scene, si, ray):
     """The anchor of a hit, as a subpath makes it."""
-    return rays.surface_anchor(si, ray, rays.Quadrics(scene))
+    return rays.surface_anchor(si, ray, rays.ShapeErrors(scene))
 
 
 def bad_rays(kind, place, folder, n, seed=0):
@@ -476,3 +476,22 @@ def test_spheres_are_small_in_scenes_without_bounds(extent):
     """Rationale: one vertex at infinity leaves a scene without a size; lamps on spheres were then taken for
     large, and up to 58 % too bright. Expected: small."""
     assert spheres.is_small(spheres.Sphere([0, 0, 0], 1e-3, 1.0, False), extent)
+
+
+def test_reach_of_a_mesh_is_its_longest_finite_edge():
+    """Rationale: one vertex at infinity or of NaN spoils its triangles, not the offset of rays on the others.
+    Expected: the largest coordinate of an edge, here 7, exactly; 0 if no edge is finite."""
+
+    def reach(*rows):
+        mesh = mi.Mesh("mesh", len(rows), 2)
+        params = mi.traverse(mesh)
+        params["vertex_positions"] = mi.Float(np.array(rows, np.float32).ravel())
+        params["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+        params.update()
+        return rays.reach_of(mesh)
+
+    triangle = ([90, 0, 0], [97, 1, 0], [92, 3, 0])
+    assert reach(*triangle, [91, 2, 0]) == 7
+    assert reach(*triangle, [np.inf, 2, 0]) == 7
+    assert reach(*triangle, [np.nan, 2, 0]) == 7
+    assert reach(*triangle[:2], [np.nan, 2, 0], [0, 0, 0]) == 0

@@ -14,7 +14,7 @@ import pytest
 import scene_parts as parts
 from mitsuba_bdpt import sensors
 from mitsuba_bdpt.kernel import Shared
-from mitsuba_bdpt.rays import Quadrics
+from mitsuba_bdpt.rays import ShapeErrors
 
 COUNT = 200_000
 T = parts.T
@@ -44,7 +44,7 @@ def prepared(name):
     scene = mi.load_dict(parts.open_scene(SENSORS[name]()))
     sensor = scene.sensors()[0]
     u = np.random.default_rng(6).random((10, COUNT), dtype=np.float32)
-    return scene, sensor, sensors.prepare(sensor, Quadrics(scene)), u
+    return scene, sensor, sensors.prepare(sensor, ShapeErrors(scene)), u
 
 
 def start_of(camera, u):
@@ -177,7 +177,7 @@ def test_sensors_by_their_rays_alone(name):
     parts.register_plugins()
     scene = mi.load_dict(parts.open_scene(parts.SENSORS[name]()))
     sensor = scene.sensors()[0]
-    camera = sensors.prepare(sensor, Quadrics(scene))
+    camera = sensors.prepare(sensor, ShapeErrors(scene))
     u = np.random.default_rng(6).random((10, COUNT), dtype=np.float32)
     start = start_of(camera, u)
     uv = camera.region.to_uv(start.position)

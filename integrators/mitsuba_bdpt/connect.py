@@ -110,7 +110,7 @@ def read_light_vertex(kernel, path: LightPath, slot) -> Vertex:
         si=si,
         bsdf=si.bsdf(),
         cos=mi.Float(1),
-        anchor=rays.Anchor(si.p, si.n, anchor.x, anchor.y if kernel.quadrics.any else mi.Float(0)),
+        anchor=rays.Anchor(si.p, si.n, anchor.x, anchor.y if kernel.shape_errors.any else mi.Float(0)),
         throughput=path.throughput[slot],
         partial=mis.Partial(path.newest[slot], path.older[slot]),
         edges=s - 1,
@@ -193,7 +193,7 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     active &= _counts(kernel, value, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
-    to_point, own = rays.sight(kernel.quadrics, z.anchor, e.anchor, e.shape, z.si)
+    to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.shape, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     count(counters, "shadow_s1", active)
     active &= ~rays.occluded(kernel.scene, ray, active, own)
@@ -279,7 +279,7 @@ def splat(kernel, y: Vertex, stream, counters):
     count(counters, "shadow_t1", active)
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
-        pi, _ = rays.intersect_past_emitters(scene, kernel.quadrics, ray, active, coherent=False)
+        pi, _ = rays.intersect_past_emitters(scene, kernel.shape_errors, ray, active, coherent=False)
         active &= ~pi.is_valid()
     else:
         active &= ~rays.occluded(scene, ray, active)
@@ -368,7 +368,7 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
         counted = {"non_finite": lost}
         c = finite(inner(kernel, z, y), counted)
         nonzero = nonzero + _one(c.active)
-        ray, own = rays.sight(kernel.quadrics, z.anchor, y.anchor, y.si.shape, z.si)
+        ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, y.si.shape, z.si)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
         return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
 
@@ -412,7 +412,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
 
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
-    small = kernel.quadrics.small
+    small = kernel.shape_errors.small
     none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.UInt32(0) if small else mi.Point3f(z.si.p)
     _, chosen, total, end, u, nonzero, lost = dr.while_loop(
         (*none, u, mi.UInt32(0), mi.UInt32(0)),
@@ -431,7 +431,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     own = None
     if small:
         y = read_light_vertex(kernel, path, end)
-        ray, own = rays.sight(kernel.quadrics, z.anchor, y.anchor, y.si.shape, z.si)
+        ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, y.si.shape, z.si)
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     active &= ~rays.occluded(kernel.scene, ray, active, own)

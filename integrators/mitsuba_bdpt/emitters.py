@@ -120,12 +120,12 @@ class Emitters:
     by the light subpaths that it starts; ``evaluated``: one that lives, be it in another scene, makes it
     necessary to record kernels without symbolic loops, calls and branches. ``left_out``: what single ones
     cannot take part in, and why. ``disks`` where light subpaths from infinity start, if any do;
-    ``quadrics`` of the scene, for rays.
+    ``shape_errors`` of the scene, for rays.
     """
 
     def __init__(self, scene):
         self.scene = scene
-        self.quadrics = rays.Quadrics(scene)
+        self.shape_errors = rays.ShapeErrors(scene)
         emitters = scene.emitters()
         kinds = [kind_of(e) for e in emitters]
         self.kinds = frozenset(kinds)
@@ -321,7 +321,7 @@ class Emitters:
             # Here and below a density that is NaN leaves the weight NaN, to be counted.
             weight=dr.select(pdf_first * pdf_second == 0, 0, radiance * (cos / (pdf_first * pdf_second))),
             d=d,
-            anchor=rays.sampled_anchor(ps.p, n, ps.p, self.quadrics.at(shape, active)),
+            anchor=rays.sampled_anchor(ps.p, n, ps.p, self.shape_errors.at(shape, active)),
             cos=cos,
             pdf_first=pdf_first,
             pdf_second=pdf_second,
@@ -342,7 +342,7 @@ class Emitters:
         for place, texture in self._beam_radiances:
             mask = active & (index == place)
             radiance = dr.select(mask, mi.Spectrum(texture.eval(si, mask)), radiance)
-        errors = self.quadrics.at(emitter.get_shape(), active)
+        errors = self.shape_errors.at(emitter.get_shape(), active)
         return Emission(
             weight=dr.select(ps.pdf == 0, 0, radiance / ps.pdf),  # without cosine, as in Mitsuba
             d=d,
@@ -571,9 +571,9 @@ class Emitters:
         if UNKNOWN in self.kinds:
             ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
         shape = emitter.get_shape() if self.on_shapes else dr.zeros(mi.ShapePtr)
-        errors = self.quadrics.at(shape, active) if self.on_shapes else None
+        errors = self.shape_errors.at(shape, active) if self.on_shapes else None
         anchor = rays.sampled_anchor(ds.p, n, si.p, errors)
-        if not self.quadrics.small:
+        if not self.shape_errors.small:
             shape = None
         return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio, shape)
 

@@ -19,7 +19,7 @@ from .plan import UNLIMITED
 from .rendering import Render
 from .snapshot import Snapshot
 from .strategies import layer_names
-from .suspects import brighteners, not_finite
+from .suspects import brighteners, narrow_spots, not_finite
 from .world import bsdfs
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
@@ -50,14 +50,14 @@ All of them are combined by multiple importance sampling.
      does everything.
  * - light_paths
    - |string| or |float|
-   - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses, else 1/4, or 1 with
-     ``skip=none``), 0, 1, 1/2, 1/4, 1/8 or 1/16. One light subpath serves camera subpaths of different
-     pixels. Given by hand, there is no pilot.
+   - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses; without one 1/4, but 1 on
+     films of fewer than 64 pixels and 0 under an even sky; with ``skip=none`` 1), 0, 1, 1/2, 1/4, 1/8 or
+     1/16. One light subpath serves camera subpaths of different pixels. Given by hand, there is no pilot.
  * - connections
    - |string|
    - Inner connections per camera vertex: ``all``, ``one`` (drawn by its unshadowed contribution),
-     ``none``, or ``auto`` (default: what the pilot chooses, else ``one``, or ``all`` with ``skip=none``).
-     Given by hand, there is no pilot.
+     ``none``, or ``auto`` (default: what the pilot chooses; without one ``one``, but ``none`` under an even
+     sky; with ``skip=none`` ``all``). Given by hand, there is no pilot.
  * - points
    - |string|
    - ``sobol`` (default): Owen-scrambled Sobol' points for all draws that gain by them, at every vertex;
@@ -173,7 +173,7 @@ def _make_class():
             if start is not None:
                 _check_resumable(start, self.settings)
                 render.resume(start)
-            _warn_of_brighteners(scene)
+            _warn_of_suspects(scene)
             try:
                 self._cancelled = False
                 render.run(self.on_pass, lambda: self._cancelled)
@@ -341,13 +341,19 @@ def _log(statistics: dict):
         )
 
 
-def _warn_of_brighteners(scene):
-    found = brighteners(bsdfs(scene))
-    if found:
+def _warn_of_suspects(scene):
+    bright, narrow = brighteners(bsdfs(scene)), narrow_spots(scene)
+    if bright:
         mi.Log(
             mi.LogLevel.Warn,
-            f"bdpt: {_some(found)}: more light returns than arrives, and where it cannot "
+            f"bdpt: {_some(bright)}: more light returns than arrives, and where it cannot "
             "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
+        )
+    if narrow:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"bdpt: {_some(narrow)}: Mitsuba rounds how the light falls off across so narrow a cone, with "
+            "every integrator, and strategies do not agree about it; make it 0.2 degrees or more",
         )
 
 

@@ -83,7 +83,7 @@ class Kernel:
     def __init__(self, world, plan, settings, heuristic):
         self.scene, self.camera, self.emitters = world.scene, world.camera, world.emitters
         self.plan, self.heuristic = plan, heuristic
-        self.quadrics = world.emitters.quadrics
+        self.shape_errors = world.emitters.shape_errors
         self.surfaces, self.refracts = world.surfaces, world.refracts
         self.traits = world.traits
         depth = min(settings.max_depth, UNLIMITED)
@@ -377,7 +377,7 @@ def _camera_walk(kernel, start, active) -> Walk:
     """A camera subpath on its first edge."""
     ray = start.ray
     if kernel.plan.hide_emitters:
-        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.quadrics, ray, active, coherent=True)
+        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     partial = _first_partial(kernel, start)

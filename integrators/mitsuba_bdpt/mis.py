@@ -175,7 +175,9 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
         heuristic.scale(partial.d_vc, step.pdf_rev_w),
     )
     # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its forward and
-    # reverse probabilities cancel.
+    # reverse probabilities cancel. Both solid angles of a refraction count as equal: strategies on its two
+    # sides are compared up to the ratio of these, which is the same in every strategy's weight, so that
+    # weights sum to 1.
     kept = 0
     if not is_absent(older):
         kept = dr.select(

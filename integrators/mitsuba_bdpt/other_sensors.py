@@ -125,9 +125,9 @@ class IrradianceMeter(Sensor):
     delta = False
     needs_film_sample = True
 
-    def __init__(self, sensor, quadrics):
+    def __init__(self, sensor, shape_errors):
         super().__init__(sensor)
-        self._shape, self._quadrics = sensor.get_shape(), quadrics
+        self._shape, self._shape_errors = sensor.get_shape(), shape_errors
         self._smooth_mesh = SmoothMeshes.of([sensor])
         sphere = Sphere.of(self._shape)
         self._sphere = sphere if sphere is not None and sphere.turned else None
@@ -144,7 +144,7 @@ class IrradianceMeter(Sensor):
         n = ps.n
         if self._smooth_mesh is not None:
             n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
-        errors = self._quadrics.at(mi.ShapePtr(self._shape))
+        errors = self._shape_errors.at(mi.ShapePtr(self._shape))
         return ps, rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
 
     def _start(self, uv, u_lens, like) -> CameraStart:

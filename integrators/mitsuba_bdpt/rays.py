@@ -75,7 +75,7 @@ class Errors:
     reach: object
 
 
-class Quadrics:
+class ShapeErrors:
     """`Errors` of the scene's shapes, by pointer. ``any``: one of them is a sphere or cylinder; ``small``:
     one of these is so small that rays ask what they meet, see `SMALL`."""
 
@@ -138,7 +138,7 @@ def _matrix(shape) -> np.ndarray:
 
 def reach_of(shape) -> float:
     """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: corners
-    of rectangles, centers and radii of spheres and cylinders, vertices of a triangle (the longest edge of a
+    of rectangles, centers and radii of spheres and cylinders, vertices of a triangle (the longest finite edge of a
     mesh, from any point of the triangle), coordinates within an instance. 0 for others: disks, curves and
     grids are as exact near by as far away."""
     if shape.class_name() == "Instance":
@@ -151,8 +151,8 @@ def reach_of(shape) -> float:
     p = dr.unravel(mi.Point3f, mi.Float(params["vertex_positions"]))
     faces = dr.unravel(mi.Vector3u, mi.UInt32(params["faces"]))
     a, b, c = (dr.gather(mi.Point3f, p, index) for index in faces)
-    edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
-    return _finite(number(dr.max(dr.max(edges))))
+    edges = dr.max(dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a)))
+    return number(dr.max(dr.select(dr.isfinite(dr.sum(a + b + c)), edges, 0)))
 
 
 _WHOLE = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Sphere, mi.ShapeType.Cylinder)}
@@ -179,9 +179,9 @@ def _reach_within(instance) -> float:
     return _finite(max(local * scale, np.abs(matrix[:3, 3]).max()))
 
 
-def surface_anchor(si, ray, quadrics: Quadrics) -> Anchor:
+def surface_anchor(si, ray, shape_errors: ShapeErrors) -> Anchor:
     """Anchor of the hit ``si`` that ``ray`` found."""
-    errors = quadrics.at(si.shape, si.is_valid(), si.instance)
+    errors = shape_errors.at(si.shape, si.is_valid(), si.instance)
     offset = rounding_offset(si.p, ray.o, si.t, errors.reach)
     offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * errors.starts
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
@@ -244,10 +244,10 @@ class Own:
     t: object
 
 
-def sight(quadrics: Quadrics, a: Anchor, b: Anchor, shape, like):
-    """Ray from ``a`` to ``b`` on ``shape``, and an `Own` for `occluded`: None unless ``quadrics`` are
+def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, shape, like):
+    """Ray from ``a`` to ``b`` on ``shape``, and an `Own` for `occluded`: None unless ``shape_errors`` are
     small."""
-    if not quadrics.small:
+    if not shape_errors.small:
         return segment(a, b, like), None
     end = b.towards(a.p - b.p)
     ray = segment_to(a, end, like)
@@ -263,7 +263,7 @@ def occluded(scene, ray, active, own: Own | None = None):
     return pi.is_valid() & ~((pi.shape == own.shape) & (pi.t >= own.t))
 
 
-def intersect_past_emitters(scene, quadrics, ray, active, coherent):
+def intersect_past_emitters(scene, shape_errors, ray, active, coherent):
     """First hit along ``ray`` on a shape that does not emit, and the ray that found it.
 
     This is how ``path`` treats camera rays under ``hide_emitters``.
@@ -272,7 +272,7 @@ def intersect_past_emitters(scene, quadrics, ray, active, coherent):
     def body(ray, pi, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
         onward = mi.Ray3f(ray)
-        onward.o = surface_anchor(si, ray, quadrics).towards(ray.d)
+        onward.o = surface_anchor(si, ray, shape_errors).towards(ray.d)
         # maxt bounds a segment: what was travelled is taken off (infinity stays infinity).
         onward.maxt = ray.maxt - dr.dot(onward.o - ray.o, ray.d)
         onward = dr.select(active, onward, ray)

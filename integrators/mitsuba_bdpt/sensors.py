@@ -12,7 +12,7 @@ from .sensor_records import Sensor
 UNTARGETED = "target = none"
 
 
-def prepare(sensor, quadrics, bounded=True) -> Sensor:
+def prepare(sensor, shape_errors, bounded=True) -> Sensor:
     """The sensor for one render of a scene that has surfaces (``bounded``) or none. Kinds that light vertices
     cannot be joined with take part by camera subpaths alone, and say why. Raises ``NotImplementedError`` for
     what Mitsuba itself cannot render."""
@@ -24,7 +24,7 @@ def prepare(sensor, quadrics, bounded=True) -> Sensor:
     if kind == "BatchSensor":
         return _batch(sensor)
     if kind == "IrradianceMeter":
-        return _meter(sensor, quadrics)
+        return _meter(sensor, shape_errors)
     if kind == "RadianceMeter":
         return Opaque(
             sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
@@ -55,7 +55,7 @@ def _batch(sensor) -> Sensor:
     return Opaque(sensor, "the views of the batch are not all perspective or all thinlens", views)
 
 
-def _meter(sensor, quadrics) -> Sensor:
+def _meter(sensor, shape_errors) -> Sensor:
     film = sensor.film()
     if film.sample_border():
         raise NotImplementedError(
@@ -70,4 +70,4 @@ def _meter(sensor, quadrics) -> Sensor:
         )
     if tuple(film.size()) != (1, 1):
         return Opaque(sensor, "the film has more than one pixel: which of them a point belongs to is unknown")
-    return IrradianceMeter(sensor, quadrics)
+    return IrradianceMeter(sensor, shape_errors)

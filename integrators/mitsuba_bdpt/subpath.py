@@ -168,7 +168,7 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
         si=si,
         bsdf=si.bsdf(),
         cos=cos,
-        anchor=rays.surface_anchor(si, ray, kernel.quadrics),
+        anchor=rays.surface_anchor(si, ray, kernel.shape_errors),
         throughput=throughput,
         partial=partial,
         edges=walk.edges,

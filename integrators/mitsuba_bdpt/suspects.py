@@ -1,4 +1,5 @@
-"""Numbers among a scene's parameters that spoil images: reflectances above 1, and what is not finite."""
+"""Numbers among a scene's parameters that spoil images: reflectances above 1, spots that rounding changes,
+and what is not finite."""
 
 from __future__ import annotations
 
@@ -14,6 +15,10 @@ _SCALES = ("reflectance", "transmittance", "base_color")
 
 # What is above 1 by more than rounding (8 bits per colour, half precision).
 _MORE_THAN_ALL = 1 + 1e-3
+
+# Steps of single precision, 2^-24, over 1 - cos of the cutoff angle: below 0.2 degrees. Measured, and this
+# quotient: 2.4 % less light and 0.039 at 0.1 degrees, 0.25 % and 0.0043 at 0.3.
+_COARSE = 1e-2
 
 # Numbers of a bitmap that are looked at, at most: 3 ms.
 _QUICKLY_READ = 1 << 18
@@ -50,6 +55,19 @@ def _largest(texture) -> float:
         return 0.0  # of colours these are coefficients of spectra, which are 1 at most
     step = max(-(-dr.width(data) // _QUICKLY_READ), 1)
     return float(np.nanmax(np.array(data.array[::step], dtype=np.float32), initial=0))
+
+
+def narrow_spots(scene) -> list[str]:
+    """The spots whose falloff Mitsuba computes from too few steps of a cosine, in words."""
+    found = []
+    for emitter in scene.emitters():
+        if emitter.class_name() != "SpotLight":
+            continue
+        angle = number(own_parameters(emitter)["cutoff_angle"])
+        rounding = 2.0**-24 / (2 * np.sin(np.deg2rad(angle) / 2) ** 2)
+        if rounding > _COARSE:
+            found.append(f"spot '{emitter.id()}' has cutoff_angle={angle:g} (some {rounding:.0%})")
+    return found
 
 
 def not_finite(scene) -> list[str]:

@@ -21,7 +21,7 @@ class World:
         self.scene = scene
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene)
-        self.camera = prepare(sensor, self.emitters.quadrics, self.surfaces)
+        self.camera = prepare(sensor, self.emitters.shape_errors, self.surfaces)
         found = bsdfs(scene)
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
         self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)

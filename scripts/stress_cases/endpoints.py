@@ -12,7 +12,7 @@ import numpy as np
 
 import mitsuba as mi  # isort: skip
 
-from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
+from oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
 
 KINDS = {
     "AreaLight": AREA,
@@ -155,10 +155,10 @@ def _lamp(emitter, probability) -> Lamp:
         lamp.cone = 2 * np.pi * (1 - np.cos(cutoff))
     if shape is not None:
         lamp.area = float(np.array(shape.surface_area()).ravel()[0])
-        box = shape.bbox()
-        middle = (np.array(box.min, dtype=np.float64) + np.array(box.max)) / 2
-        if shape.class_name() == "Sphere" and _faces_outwards(shape, middle):
-            lamp.center, lamp.radius = middle, float(box.max[0] - box.min[0]) / 2
+        if shape.class_name() == "Sphere":
+            matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+            if _faces_outwards(shape, matrix[:3, 3]):
+                lamp.center, lamp.radius = matrix[:3, 3], np.linalg.norm(matrix[:3, 0])
     return lamp
 
 

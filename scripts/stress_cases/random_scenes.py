@@ -82,6 +82,9 @@ def shining(shape):
 # By name, of a place, an angle and a size.
 LAMPS = {
     **{name: lambda c, a, s, make=make: shining(make(c, a, s)) for name, make in SHAPES.items()},
+    # Seen under cones of which Mitsuba's density cancels.
+    "bulb": lambda c, a, s: shining(SHAPES["sphere"](c, a, 0.05 * s)),
+    "glint": lambda c, a, s: shining(SHAPES["sphere"](c, a, 2e-3 * s)),
     "around": lambda c, a, s: shining({"type": "sphere", "radius": 9.0, "flip_normals": True}),
     "point": lambda c, a, s: {"type": "point", "position": c},
     "spot": lambda c, a, s: {"type": "spot", "cutoff_angle": 30 + a / 9, "to_world": turned(c, a)},

@@ -16,11 +16,12 @@ from mitsuba_bdpt import mis
 
 import mitsuba as mi  # isort: skip
 
-from . import oracle
+import oracle
+from oracle import Paths
+
 from .capture import Capture
 from .case import Case, Outcome
 from .chains import COEFFICIENTS, random_paths, recursion
-from .oracle import Paths
 from .random_scenes import renders
 
 SECTION = "Weights"
