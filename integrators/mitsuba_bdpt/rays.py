@@ -138,9 +138,9 @@ def _matrix(shape) -> np.ndarray:
 
 def reach_of(shape) -> float:
     """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: corners
-    of rectangles, centers and radii of spheres and cylinders, vertices of a triangle (the longest finite edge
-    of a mesh, from any point of the triangle), coordinates within an instance. 0 for others: disks, curves and
-    grids are as exact near by as far away."""
+    of rectangles, centers and radii of spheres and cylinders, vertices of a triangle (of a mesh the longest
+    finite edge, from any point of the triangle), coordinates within an instance. 0 for others: disks, curves
+    and grids are as exact near by as far away."""
     if shape.class_name() == "Instance":
         return _reach_within(shape)
     if shape.shape_type() in _WHOLE:
