@@ -15,7 +15,7 @@ kind of path:
 * other strategies: the densest other one, with its density over that of the strategy that made the path, by
   one sample of each; "none" if no other can make it.
 * `path`: what Mitsuba's `path` adds with the same path (s = 0 and s = 1, balance heuristic) over what was
-  added.
+  added. Its roulette is counted where s = 0 or 1 made the path; it is the same there.
 * found anew: how many of these paths were found again from their vertices with the same estimate and weight.
 """
 
@@ -180,8 +180,10 @@ def _elsewhere(firefly: Firefly) -> tuple[str, str]:
     if not by_path > 0:
         return text, "cannot make it"
     # `path` adds f / (p_0 + p_1), the render what it says: divided by its count, its roulette and its draw.
+    # Along a camera subpath the roulette is that of `path`; how it would treat a light subpath is not known.
+    survival = path.survival if path.s <= 1 else 1.0
     estimate = firefly.rebuilt.estimate(path.s).max()
-    return text, f"{estimate / by_path / path.value.max():.3g}x"
+    return text, f"{estimate / (by_path * survival * path.value.max()):.3g}x"
 
 
 HEAD = [

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba_bdpt
-from mitsuba_bdpt.files import check_writable
-from mitsuba_bdpt.render import MAGIC, message, prepare_output
+from mitsuba_bdpt.files import check_format, check_writable
+from mitsuba_bdpt.render import message, prepare_output
 
 STATUS = 2
 SOURCES = Path(__file__).resolve().parent, Path(mitsuba_bdpt.__file__).resolve().parent
@@ -70,13 +70,6 @@ def check_output(path: Path, suffix: str) -> None:
         return
     if path.suffix.lower() != suffix:
         raise ValueError(f"output={str(path)!r} must end in {suffix}")
-    if suffix in MAGIC and path.is_file():  # of a pipe nothing must be read
-        with path.open("rb") as file:
-            start = file.read(4)
-        if start and start != MAGIC[suffix]:
-            raise ValueError(
-                f"output={str(path)!r} would overwrite a file that exists and is not {suffix[1:].upper()}. "
-                "Move it away, or name another output."
-            )
+    check_format(path, path)
     path.parent.mkdir(parents=True, exist_ok=True)
     check_writable(path)

@@ -46,7 +46,7 @@ from metrics import (
 from mistakes import answered
 
 import mitsuba as mi  # isort: skip
-from mitsuba_bdpt import render  # isort: skip
+from mitsuba_bdpt import files, render  # isort: skip
 from mitsuba_bdpt.__main__ import number, property_  # isort: skip
 from mitsuba_bdpt.checkpoints import named_files  # isort: skip
 from mitsuba_bdpt.files import replacing  # isort: skip
@@ -520,7 +520,7 @@ def read_exr(path: Path, *layers: str):
     ``ValueError`` for another file."""
     with path.open("rb") as file:  # OpenEXR does not say what hinders it
         start = file.read(4)
-    if start != render.MAGIC[".exr"]:
+    if start != files.MAGIC[".exr"]:
         raise ValueError(f"{str(path)!r} is not an EXR")
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels, header = file.channels(), dict(file.header())

@@ -6,9 +6,27 @@ import contextlib
 import os
 from pathlib import Path
 
+MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
+"""The first four bytes of an image's file, by suffix."""
+
 
 def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def check_format(path: Path, output: Path) -> None:
+    """Raise ``ValueError`` if ``path``, which goes with ``output``, is a file of another format than the one
+    that its suffix names; an image of that format may be replaced."""
+    kind = path.suffix.lower()
+    if kind not in MAGIC or not path.is_file():  # of a pipe nothing must be read
+        return
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start and start != MAGIC[kind]:
+        raise ValueError(
+            f"output={str(output)!r} would overwrite {str(path)!r}, which exists and is not "
+            f"{kind[1:].upper()}. Move it away, or name another output."
+        )
 
 
 def check_writable(path: Path) -> None:

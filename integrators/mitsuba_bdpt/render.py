@@ -22,7 +22,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 import mitsuba_bdpt
 
 from . import checkpoints, cluster
-from .files import check_writable, replacing
+from .files import check_format, check_writable, replacing
 from .loading import choose_sensor, load
 
 UNLIMITED_SPP = 1 << 16
@@ -34,7 +34,6 @@ PASS_SPP = 16
 SETS = {"time": {"timeout"}, "until_error": {"until_error", "variance"}}
 """The integrator's parameters that an option sets, see `loading.load`."""
 
-MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
 INTERRUPTED = 130
 """The exit status of a process that SIGINT has ended."""
 
@@ -87,16 +86,7 @@ def prepare_output(output: Path) -> None:
     if output.suffix.lower() != ".exr":
         raise ValueError(f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case.")
     for path in (output, output.with_suffix(".png")):
-        if not path.is_file():  # of a pipe nothing must be read
-            continue
-        kind = path.suffix.lower()
-        with path.open("rb") as file:
-            start = file.read(4)
-        if start and start != MAGIC[kind]:
-            raise ValueError(
-                f"output={str(output)!r} would overwrite {str(path)!r}, which exists and is not "
-                f"{kind[1:].upper()}. Move it away, or name another output."
-            )
+        check_format(path, output)
     output.parent.mkdir(parents=True, exist_ok=True)
     for path in (output, output.with_suffix(".png")):
         check_writable(path)

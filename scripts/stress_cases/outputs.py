@@ -14,7 +14,7 @@ from pathlib import Path
 from unittest import mock
 
 import reference
-from mitsuba_bdpt import __main__, render
+from mitsuba_bdpt import __main__, files, render
 
 import mitsuba as mi  # isort: skip
 
@@ -130,7 +130,7 @@ def _no_file(folder: Path, kind: str) -> Path:
     elif kind == "a text":
         (folder / "a.exr").write_text("precious")
     elif kind == "a PNG named EXR":
-        (folder / "a.exr").write_bytes(render.MAGIC[".png"] + b"precious")
+        (folder / "a.exr").write_bytes(files.MAGIC[".png"] + b"precious")
     elif kind == "a folder where the checkpoint goes":
         (folder / "a.checkpoint.npz").mkdir()
     elif kind == "no name":
