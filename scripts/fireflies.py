@@ -1,7 +1,7 @@
 """Name the paths behind the worst values of a scene's renders.
 
     python scripts/fireflies.py glass_caustics thin_lens
-    python scripts/fireflies.py window_room --seeds 24 --top 4
+    python scripts/fireflies.py window_room --seeds 96 --top 4
 
 renders each scene with the benchmark's parameters and takes the samples that are worst against the reference:
 those that by themselves are off by more than ``--level`` times the value of their pixel. It traces them again
