@@ -193,7 +193,7 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     active &= _counts(kernel, value, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
-    to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.shape, z.si)
+    to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     count(counters, "shadow_s1", active)
     active &= ~rays.occluded(kernel.scene, ray, active, own)
@@ -368,7 +368,7 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
         counted = {"non_finite": lost}
         c = finite(inner(kernel, z, y), counted)
         nonzero = nonzero + _one(c.active)
-        ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, y.si.shape, z.si)
+        ray, own = _sight(kernel, z, y)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
         return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
 
@@ -431,11 +431,16 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     own = None
     if small:
         y = read_light_vertex(kernel, path, end)
-        ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, y.si.shape, z.si)
+        ray, own = _sight(kernel, z, y)
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     active &= ~rays.occluded(kernel.scene, ray, active, own)
     return dr.select(active, value / survival, 0)
+
+
+def _sight(kernel, z: Vertex, y: Vertex):
+    """`rays.sight` from ``z`` to the light vertex ``y``."""
+    return rays.sight(kernel.shape_errors, z.anchor, y.anchor, rays.met(y.si.shape, y.si.instance), z.si)
 
 
 def candidate_count(kernel, z: Vertex, path: LightPath):

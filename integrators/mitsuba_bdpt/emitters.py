@@ -90,8 +90,8 @@ class Direct:
 
     ``weight`` radiance / ``pdf_w``; ``pdf_w`` solid angle at the camera vertex with the selection, or
     the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
-    the visibility ray (unused where ``infinite``), on ``shape`` (None if the scene has none so small that
-    the ray asks for it, see `rays.SMALL`); ``emission_ratio`` is
+    the visibility ray (unused where ``infinite``), ``met`` the number of its shape (None if the scene has
+    none so small that the ray asks for it, see `rays.SMALL`); ``emission_ratio`` is
     pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
     geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
     """
@@ -103,7 +103,7 @@ class Direct:
     infinite: object
     delta: object
     emission_ratio: object
-    shape: object = None
+    met: object = None
 
 
 class Emitters:
@@ -573,9 +573,8 @@ class Emitters:
         shape = emitter.get_shape() if self.on_shapes else dr.zeros(mi.ShapePtr)
         errors = self.shape_errors.at(shape, active) if self.on_shapes else None
         anchor = rays.sampled_anchor(ds.p, n, si.p, errors)
-        if not self.shape_errors.small:
-            shape = None
-        return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio, shape)
+        met = rays.met(shape) if self.shape_errors.small else None
+        return Direct(weight, pdf, ds.d, anchor, infinite, delta, ratio, met)
 
     # -- hits by camera subpaths ------------------------------------------------------------
 

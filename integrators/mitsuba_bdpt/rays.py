@@ -4,10 +4,10 @@ Mitsuba offsets ray origins by 8.9e-5 (1 + max|p|), which swallows small scenes 
 gaps in large ones. Here the offset along the geometric normal follows from the rounding error of
 the hit itself: ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t, reach)`` with maximum norms, where ``o`` and ``t``
 belong to the ray that found ``p``, and ``reach`` is how far the numbers go that hits on its shape are
-computed from (`reach_of`). It scales with the scene. Visibility rays end short of their
-target by the target's own offset, not by a fraction of the distance. Towards spheres and cylinders they
-have to end earlier; where these are so small that this would pass by what stands before them, the ray asks
-which shape it meets first (`sight`).
+computed from, as far as their rounding moves hits along the normal (`reaches`). It scales with the scene.
+Visibility rays end short of their target by the target's own offset, not by a fraction of the distance.
+Towards spheres and cylinders they have to end earlier; where these are so small that this would pass by what
+stands before them, the ray asks what it meets first (`sight`).
 """
 
 from __future__ import annotations
@@ -37,6 +37,10 @@ LEAST_COSINE = 0.1
 # those that end early would do so by more than two radii (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
 
+# Distance, in radii of a sphere or cylinder, from which on rays to its back that end early would end before
+# its front: the chord is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).
+FAR = 200
+
 
 @dataclass
 class Anchor:
@@ -44,7 +48,7 @@ class Anchor:
 
     ``p`` position, ``n`` geometric normal of unit length (zero for a point in free space),
     ``offset`` distance in scene units by which a ray leaves the surface along ``n``, ``curvature``
-    1 / radius on spheres and cylinders, 0 elsewhere.
+    1 / radius on spheres and cylinders, negative where normals point inwards, 0 elsewhere.
     """
 
     p: object
@@ -67,8 +71,9 @@ def rounding_offset(p, o, t, reach):
 @dataclass
 class Errors:
     """What rounding does to hits on a shape: ``ends``, the curvature 1 / radius on spheres and cylinders,
-    which visibility rays that end there meet too early; ``starts``, the same of cylinders alone (hits on
-    spheres are moved to their surface); ``reach``, see `reach_of`."""
+    which visibility rays that end there meet too early (negative if normals point inwards, as far as that is
+    asked, see `FAR`); ``starts``, that of shapes whose hits lie off their surface for the same reason:
+    cylinders, and all that is round within instances; ``reach``, the largest of `reaches`."""
 
     ends: object
     starts: object
@@ -81,85 +86,149 @@ class ShapeErrors:
 
     def __init__(self, scene):
         shapes = scene.shapes()
-        grouped = [_curvatures(s) for group in groups(scene) for s in children(group).values()]
-        # An instance does not tell of which group it is: it has the largest curvatures of all of them.
-        within = tuple(max((row[i] for row in grouped), default=0.0) for i in (0, 1))
-        rows = [Errors(*_curvatures(s, within), reach_of(s)) for s in shapes]
+        extent = 2 * scene.bbox().bounding_sphere().radius
+        grouped = [shape for group in groups(scene) for shape in children(group).values()]
+        rows = [Errors(*_curvatures(s, grouped, extent), 0.0) for s in shapes]
         self.any = any(row.ends for row in rows)
-        extent = 2 * scene.bbox().bounding_sphere().radius if self.any else 0
         # Not `>`: the extent may be NaN.
-        self.small = any(row.ends and not row.ends * extent <= SMALL for row in rows)
+        self.small = any(row.ends and not abs(row.ends) * extent <= SMALL for row in rows)
         ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
         self._size = max(ids, default=0) + 1
-        table = [Errors(0.0, 0.0, 0.0)] * self._size
-        for index, row in zip(ids, rows, strict=True):
+        table, first = [Errors(0.0, 0.0, 0.0)] * self._size, [0] * self._size
+        triangles = [np.zeros(1)]  # entry 0 stands for shapes without
+        for index, row, shape in zip(ids, rows, shapes, strict=True):
+            reach = reaches(shape)
+            row.reach = float(reach.max(initial=0))
+            if len(reach) > 1 and reach.min() < row.reach:
+                first[index] = sum(map(len, triangles))
+                triangles.append(reach)
             table[index] = row
         self._table = Errors(*(mi.Float([getattr(row, n) for row in table]) for n in vars(table[0])))
-        dr.make_opaque(self._table)
+        self._triangles = None
+        if len(triangles) > 1:
+            self._triangles = mi.UInt32(first), mi.Float(np.concatenate(triangles).astype(np.float32))
+        dr.make_opaque(self._table, self._triangles)
 
-    def at(self, shape, active=True, instance=None) -> Errors:
-        """The `Errors` of hits on ``shape``, or on the ``instance`` in which it was met."""
-        index = dr.reinterpret_array(mi.UInt32, shape)
-        if instance is not None:
-            met = dr.reinterpret_array(mi.UInt32, instance)
-            index = dr.select(met != 0, met, index)
+    def at(self, shape, active=True, instance=None, triangle=None) -> Errors:
+        """The `Errors` of hits on ``shape``, or on the ``instance`` in which it was met: of all its surface,
+        or of one ``triangle``."""
+        index = met(shape, instance)
         known = mi.Bool(active) & (index < self._size)
         found = Errors(mi.Float(0), mi.Float(0), dr.gather(mi.Float, self._table.reach, index, known))
+        if triangle is not None and self._triangles is not None:
+            first, reach = self._triangles
+            place = dr.gather(mi.UInt32, first, index, known)
+            apart = known & (place > 0)
+            found.reach = dr.select(apart, dr.gather(mi.Float, reach, place + triangle, apart), found.reach)
         if self.any:  # else nothing of what follows from curvatures is recorded
             found.ends = dr.gather(mi.Float, self._table.ends, index, known)
             found.starts = dr.gather(mi.Float, self._table.starts, index, known)
         return found
 
 
+def met(shape, instance=None):
+    """Number of what a ray meets: of the ``instance`` if there is one, else of the ``shape``."""
+    index = dr.reinterpret_array(mi.UInt32, shape)
+    if instance is None:
+        return index
+    instance = dr.reinterpret_array(mi.UInt32, instance)
+    return dr.select(instance != 0, instance, index)
+
+
 def groups(scene) -> list:
     """The scene's shape groups."""
-    return [c for c in children(scene).values() if isinstance(c, mi.Shape) and c.class_name() == "ShapeGroup"]
+    shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
+    return [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
 
 
-def _curvatures(shape, within=(0.0, 0.0)) -> tuple[float, float]:
-    """Columns of `Errors`; ``within``: those of the shapes in groups."""
-    if shape.shape_type() == mi.ShapeType.Sphere.value:
-        box = shape.bbox()
-        return 2 / max(float(box.max.x - box.min.x), 1e-30), 0.0
-    if shape.shape_type() == mi.ShapeType.Cylinder.value:
-        to_world = own_parameters(shape)["to_world"]
-        across = dr.norm(mi.Vector3f(to_world @ mi.Vector3f(1, 0, 0)))
-        inverse = 1 / max(float(dr.slice(across)), 1e-30)
-        return inverse, inverse
-    if shape.class_name() == "Instance" and any(within):
-        scale = np.linalg.norm(_matrix(shape)[:3, :3], axis=0).min()
-        return tuple(inverse / max(scale, 1e-30) for inverse in within)
+def _curvatures(shape, grouped, extent) -> tuple[float, float]:
+    """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent`` with shapes in groups."""
+    kind = shape.shape_type()
+    if kind in _ROUND:
+        matrix = _matrix(shape)
+        # Across the axis of a cylinder, and of a sphere whatever the axis.
+        inverse = 1 / max(float(np.linalg.norm(matrix[:3, 0])), 1e-30)
+        far = not inverse * extent <= FAR  # the extent may be NaN
+        sign = _outward(shape, matrix) if far else 1.0
+        return sign * inverse, inverse if kind == mi.ShapeType.Cylinder.value else 0.0
+    if _is_instance(shape):
+        # An instance does not tell of which group it is: it has the largest curvature of all of them.
+        within = [_curvatures(inner, [], np.inf)[0] for inner in grouped]
+        largest = max(within, key=abs, default=0.0) / max(_stretch(shape)[-1], 1e-30)
+        return largest, abs(largest)
     return 0.0, 0.0
+
+
+_ROUND = {mi.ShapeType.Sphere.value: 0.0, mi.ShapeType.Cylinder.value: 0.5}
+"""Spheres and cylinders, with the height of their middle in their own coordinates."""
+
+
+def _outward(shape, matrix) -> float:
+    """1 if the normals of a sphere or cylinder point outwards, else -1: of a hit from its middle."""
+    middle = matrix[:3] @ [0, 0, _ROUND[shape.shape_type()], 1]
+    radius = float(np.linalg.norm(matrix[:3, 0]))
+    pi = dr.zeros(mi.PreliminaryIntersection3f)
+    pi.t, pi.shape = dr.opaque(mi.Float, radius), mi.ShapePtr(shape)
+    d = dr.opaque(mi.Vector3f, (matrix[:3, 0] / radius).tolist())
+    si = shape.compute_surface_interaction(mi.Ray3f(dr.opaque(mi.Point3f, middle.tolist()), d), pi)
+    return 1.0 if number(dr.dot(si.n, d)) >= 0 else -1.0
+
+
+def _is_instance(shape) -> bool:
+    return shape.class_name() == "Instance"
 
 
 def _matrix(shape) -> np.ndarray:
     return np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
 
 
-def reach_of(shape) -> float:
-    """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: corners
-    of rectangles, centers and radii of spheres and cylinders, vertices of a triangle (of a mesh the longest
-    finite edge, from any point of the triangle), coordinates within an instance. 0 for others: disks, curves
-    and grids are as exact near by as far away."""
-    if shape.class_name() == "Instance":
-        return _reach_within(shape)
+def _stretch(shape) -> np.ndarray:
+    """By how much ``to_world`` stretches lengths, the largest first; zeros if it is not finite."""
+    linear = _matrix(shape)[:3, :3]
+    return np.linalg.svd(linear, compute_uv=False) if np.isfinite(linear).all() else np.zeros(3)
+
+
+def reaches(shape) -> np.ndarray:
+    """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: one
+    number, of a mesh one for each triangle.
+
+    Coordinates whose rounding moves hits within the surface do not count: those of corners of rectangles and
+    edges of triangles weigh |n_i| / max |n|, so that a floor along the axes has 0, however large. Of spheres,
+    cylinders and grids all coordinates count, of instances all within them. 0 for others: disks and curves
+    are as exact near by as far away."""
+    if _is_instance(shape):
+        return np.array([_reach_within(shape)])
+    if shape.shape_type() == mi.ShapeType.Rectangle.value:
+        matrix = _matrix(shape)
+        corner = np.abs(matrix[:3, 3]) + np.abs(matrix[:3, :2]).sum(1)
+        return _along(np.cross(matrix[:3, 0], matrix[:3, 1])[None], corner[None])
     if shape.shape_type() in _WHOLE:
-        return _largest(shape.bbox())
+        return np.array([_finite(np.abs([shape.bbox().min, shape.bbox().max]).max())])
     params = own_parameters(shape) if shape.is_mesh() else {}
     if "vertex_positions" not in params or not len(params["faces"]):
-        return 0.0
-    p = dr.unravel(mi.Point3f, mi.Float(params["vertex_positions"]))
-    faces = dr.unravel(mi.Vector3u, mi.UInt32(params["faces"]))
-    a, b, c = (dr.gather(mi.Point3f, p, index) for index in faces)
-    edges = dr.max(dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a)))
-    return number(dr.max(dr.select(dr.isfinite(dr.sum(a + b + c)), edges, 0)))
+        return np.zeros(1)
+    return _reaches_of_triangles(params["vertex_positions"], params["faces"])
 
 
-_WHOLE = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Sphere, mi.ShapeType.Cylinder)}
+_WHOLE = {*_ROUND, mi.ShapeType.SDFGrid.value}
 
 
-def _largest(box) -> float:
-    return _finite(np.abs([box.min, box.max]).max())
+def _reaches_of_triangles(positions, faces) -> np.ndarray:
+    p = dr.unravel(mi.Point3f, mi.Float(positions))
+    a, b, c = (dr.gather(mi.Point3f, p, index) for index in dr.unravel(mi.Vector3u, mi.UInt32(faces)))
+    edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
+    n = dr.abs(dr.cross(b - a, c - a))
+    found = dr.max(n * edges) / dr.max(n)
+    return dr.select(dr.isfinite(found), found, 0).numpy().astype(np.float64)
+
+
+def _along(n, coordinates) -> np.ndarray:
+    """Coordinates, one row each, weighted by normals of any length; 0 where one of them is not finite."""
+    n = np.abs(n)
+    largest = n.max(-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        found = (n * coordinates).max(-1) / largest
+    return np.where(np.isfinite(found), found, 0)
 
 
 def _finite(x) -> float:
@@ -175,13 +244,12 @@ def _reach_within(instance) -> float:
     if not (np.isfinite(corners).all() and abs(np.linalg.det(matrix[:3, :3])) > 0):
         return 0.0
     local = np.abs(corners @ np.linalg.inv(matrix).T)[:, :3].max()
-    scale = np.linalg.norm(matrix[:3, :3], axis=0).max()
-    return _finite(max(local * scale, np.abs(matrix[:3, 3]).max()))
+    return _finite(max(local * _stretch(instance)[0], np.abs(matrix[:3, 3]).max()))
 
 
 def surface_anchor(si, ray, shape_errors: ShapeErrors) -> Anchor:
     """Anchor of the hit ``si`` that ``ray`` found."""
-    errors = shape_errors.at(si.shape, si.is_valid(), si.instance)
+    errors = shape_errors.at(si.shape, si.is_valid(), si.instance, si.prim_index)
     offset = rounding_offset(si.p, ray.o, si.t, errors.reach)
     offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * errors.starts
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
@@ -216,11 +284,15 @@ def end_point(a: Anchor, b: Anchor):
 
 def _early(back, b: Anchor):
     """The share of a ray's length, against the direction ``back``, in which it may meet the sphere or
-    cylinder of its end ``b`` already."""
+    cylinder of its end ``b`` already. 0 if it ends at the back of one so small that it would pass the front:
+    this is in its way."""
     dist = dr.norm(back)
+    along = dr.dot(b.n, back)
     # The error of t grows towards the outline, as 1 / cos.
-    cos = dr.maximum(dr.abs(dr.dot(b.n, back)) / dist, LEAST_COSINE)
-    return (QUADRIC_ULPS * 2.0**-24) * dist * b.curvature / cos
+    cos = dr.maximum(dr.abs(along) / dist, LEAST_COSINE)
+    early = (QUADRIC_ULPS * 2.0**-24) * dist * dr.abs(b.curvature) / cos
+    behind = (along * b.curvature < -2) & (dist * dr.abs(b.curvature) > FAR)
+    return dr.select(behind, 0, early)
 
 
 def segment_to(a: Anchor, end, like) -> mi.Ray3f:
@@ -238,20 +310,21 @@ def segment(a: Anchor, b: Anchor, like) -> mi.Ray3f:
 
 @dataclass
 class Own:
-    """The ``shape`` that a visibility ray ends at, and the distance ``t`` from which on it may meet it."""
+    """What a visibility ray ends at, by its number (see `met`), and the distance ``t`` from which on it may
+    meet it."""
 
-    shape: object
+    number: object
     t: object
 
 
-def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, shape, like):
-    """Ray from ``a`` to ``b`` on ``shape``, and an `Own` for `occluded`: None unless ``shape_errors`` are
-    small."""
+def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, like):
+    """Ray from ``a`` to ``b`` on the shape of this ``number``, and an `Own` for `occluded`: None unless
+    ``shape_errors`` are small."""
     if not shape_errors.small:
         return segment(a, b, like), None
     end = b.towards(a.p - b.p)
     ray = segment_to(a, end, like)
-    return ray, Own(shape, ray.maxt * (1 - _early(a.p - end, b)))
+    return ray, Own(number, ray.maxt * (1 - _early(a.p - end, b)))
 
 
 def occluded(scene, ray, active, own: Own | None = None):
@@ -260,7 +333,7 @@ def occluded(scene, ray, active, own: Own | None = None):
     if own is None:
         return scene.ray_test(ray, active=active)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    return pi.is_valid() & ~((pi.shape == own.shape) & (pi.t >= own.t))
+    return pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t))
 
 
 def intersect_past_emitters(scene, shape_errors, ray, active, coherent):
