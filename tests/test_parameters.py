@@ -847,6 +847,8 @@ AREA_LIGHT = {"type": "area", "radiance": 1.0}
 CHECKS = {"type": "area", "radiance": {"type": "checkerboard"}}
 GAUSSIAN = {"rfilter": {"type": "gaussian"}, "sample_border": True}
 STRETCHED = mi.ScalarTransform4f().scale([1, 2, 1])
+# The columns are of length 1.
+SHEARED = mi.ScalarTransform4f([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 REFUSED_PARTS = {
     "curve lamp": (
         lambda folder: {"lamp": curve(folder) | {"emitter": AREA_LIGHT}},
@@ -859,6 +861,18 @@ REFUSED_PARTS = {
     "projector": (
         lambda _: {"lamp": {"type": "projector", "to_world": STRETCHED}},
         "to_world of projector 'lamp' distorts angles .*1, 2, 1.*set fov instead",
+    ),
+    "stretched spot": (
+        lambda _: {"lamp": {"type": "spot", "to_world": STRETCHED}},
+        "to_world of spot 'lamp' distorts angles .*1, 2, 1.*set cutoff_angle instead",
+    ),
+    "long spot": (
+        lambda _: {"lamp": {"type": "spot", "to_world": mi.ScalarTransform4f().scale([1, 1, 2])}},
+        "to_world of spot 'lamp' distorts angles .*1, 1, 2.*set cutoff_angle instead",
+    ),
+    "sheared spot": (
+        lambda _: {"lamp": {"type": "spot", "to_world": SHEARED}},
+        "to_world of spot 'lamp' distorts angles .*leave out scaling and shear",
     ),
     "narrow spot": (
         lambda _: {"lamp": {"type": "spot", "cutoff_angle": 0.013}},

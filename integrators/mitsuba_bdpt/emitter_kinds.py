@@ -187,14 +187,19 @@ def _check_rotation(emitter):
         )
 
 
-def check_projector(emitter):
-    """Raise ``ValueError`` if the ``to_world`` of a projector distorts angles."""
+def check_angles(emitter):
+    """Raise ``ValueError`` if the ``to_world`` of a projector or spot distorts angles: what it sends into a
+    direction is a function of the angles before, and densities of directions are those of these angles.
+    Scaled by one factor or mirrored, it keeps them."""
     columns = _columns(emitter)
     scale = np.linalg.norm(columns, axis=0).mean()
-    if not np.allclose(columns.T @ columns, np.eye(3) * scale**2, atol=1e-3 * scale**2):
+    if not np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2):
+        plugin, angle = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}[
+            emitter.class_name()
+        ]
         raise ValueError(
-            f"bdpt: to_world of projector '{emitter.id()}' distorts angles (the lengths of its columns are "
-            f"{_lengths(columns)}); leave out scaling and shear, and set fov instead"
+            f"bdpt: to_world of {plugin} '{emitter.id()}' distorts angles (the lengths of its columns are "
+            f"{_lengths(columns)}); leave out scaling and shear, and set {angle} instead"
         )
 
 
