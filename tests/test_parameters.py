@@ -847,6 +847,7 @@ AREA_LIGHT = {"type": "area", "radiance": 1.0}
 CHECKS = {"type": "area", "radiance": {"type": "checkerboard"}}
 GAUSSIAN = {"rfilter": {"type": "gaussian"}, "sample_border": True}
 STRETCHED = mi.ScalarTransform4f().scale([1, 2, 1])
+MIRRORED = mi.ScalarTransform4f().scale([1, 1, -1])
 # The columns are of length 1.
 SHEARED = mi.ScalarTransform4f([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 REFUSED_PARTS = {
@@ -857,6 +858,20 @@ REFUSED_PARTS = {
     "texture beside curve": (
         lambda folder: {"lamp": {"type": "cylinder", "emitter": CHECKS}, "curve": curve(folder)},
         "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
+    ),
+    "mirrored cylinder": (
+        lambda _: {"lamp": {"type": "cylinder", "to_world": MIRRORED, "emitter": AREA_LIGHT}},
+        "emitter '.*' is on a cylinder .*'lamp'.* mirrors it.*leave out the negative scale",
+    ),
+    "mirrored cylinder of beams": (
+        lambda _: {
+            "lamp": {"type": "cylinder", "to_world": MIRRORED, "emitter": {"type": "directionalarea"}}
+        },
+        "emitter '.*' is on a cylinder .*'lamp'.* mirrors it",
+    ),
+    "meter on a mirrored cylinder": (
+        lambda _: {"meter": meter_on({"type": "cylinder", "to_world": MIRRORED})},
+        "irradiance meter '.*' is on a cylinder .*'meter'.* mirrors it.*flip_normals turns normals",
     ),
     "projector": (
         lambda _: {"lamp": {"type": "projector", "to_world": STRETCHED}},
@@ -908,11 +923,30 @@ def test_endpoints_that_are_refused(name, tmp_path):
     make, message = REFUSED_PARTS[name]
     made = make(tmp_path)
     scene = {"type": "scene", **made}
-    if name not in ("batch border", "meter border", "meter on a grid"):
+    if not name.startswith(("batch", "meter")):
         scene["eye"] = sensor()
     scene = mi.load_dict(scene)
     with pytest.raises((NotImplementedError, ValueError), match=message):
         integrator().render(scene, spp=1)
+
+
+def test_mirrored_shapes_that_are_fine():
+    """Rationale: only cylinders have contradicting normals, and only where their points are sampled.
+    Expected: a mirrored cylinder that reflects, emitting ones that are turned, scaled or have their normals
+    flipped, and other shapes that are mirrored and emit, are rendered."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(0.1)
+    lamp = {"type": "cylinder", "to_world": turned, "emitter": AREA_LIGHT}
+    scene = {
+        "type": "scene",
+        "eye": sensor(),
+        "pipe": {"type": "cylinder", "to_world": MIRRORED},
+        "lamp": lamp,
+        "flipped": lamp | {"flip_normals": True},
+        "backwards": {"type": "cylinder", "p0": [0, 0, 1], "p1": [0, 0, 0.5], "emitter": AREA_LIGHT},
+    }
+    for kind in ("rectangle", "disk", "sphere", "cube"):
+        scene[kind] = {"type": kind, "to_world": MIRRORED, "emitter": AREA_LIGHT}
+    assert np.isfinite(image(integrator(max_depth=2), mi.load_dict(scene), spp=1)).all()
 
 
 def triangle_lamp(positions, face, **attributes):
