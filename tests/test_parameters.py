@@ -17,6 +17,7 @@ import mitsuba_bdpt
 import numpy as np
 import pytest
 from mitsuba_bdpt import connect, passes, rendering
+from mitsuba_bdpt.world import World
 
 T = mi.ScalarTransform4f
 
@@ -826,9 +827,42 @@ def test_scenes_that_are_refused():
         bdpt.render(fog)
     with pytest.raises(NotImplementedError, match="volpath"):
         bdpt.explain(fog)
+    cloud = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+    clouds = grouped({"cloud": cloud})
+    with pytest.raises(NotImplementedError, match="cloud.*participating medium.*volpath"):
+        bdpt.render(clouds)
     empty = mi.load_dict({"type": "scene", "lamp": {"type": "point"}})
     with pytest.raises(ValueError, match="no sensor"):
         bdpt.render(empty)
+
+
+def grouped(shapes):
+    """A scene with an instance of a group of ``shapes``."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(),
+            "lamp": {"type": "point"},
+            "group": {"type": "shapegroup", **shapes},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        }
+    )
+
+
+def test_materials_in_groups_are_known():
+    """Rationale: what a scene's BSDFs do decides which densities are asked for and which paths are possible.
+    Expected: those of shapes in groups count, the one that Mitsuba gives to every instance does not."""
+    mixture = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": {"type": "plastic"}}
+    for bsdf, smooth, delta, refracts in (
+        ({"type": "dielectric"}, False, True, True),
+        ({"type": "conductor"}, False, True, False),
+        ({"type": "roughdielectric"}, True, False, True),
+        (mixture, True, True, False),
+    ):
+        scene = grouped({"ball": {"type": "sphere", "bsdf": bsdf}})
+        world = World(scene, scene.sensors()[0])
+        assert (world.smooth, world.delta, world.refracts) == (smooth, delta, refracts), bsdf["type"]
+        assert world.traits.full_pdf == (bsdf is mixture)
 
 
 def curve(folder):
@@ -857,6 +891,14 @@ REFUSED_PARTS = {
     ),
     "texture beside curve": (
         lambda folder: {"lamp": {"type": "cylinder", "emitter": CHECKS}, "curve": curve(folder)},
+        "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
+    ),
+    "texture beside a group of curves": (
+        lambda folder: {
+            "lamp": {"type": "cylinder", "emitter": CHECKS},
+            "group": {"type": "shapegroup", "curve": curve(folder)},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        },
         "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
     ),
     "mirrored cylinder": (

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .cylinders import check_not_mirrored
-from .objects import children, number, own_parameters
+from .objects import all_shapes, children, number, own_parameters
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
 # direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
@@ -171,7 +171,7 @@ def check_coordinates(emitter):
 def refuse_curves(scene, emitter, why: str):
     """Raise ``NotImplementedError`` if a call on shapes, which ``emitter`` needs, would meet curves: they
     have no ``sample_position``."""
-    for shape in scene.shapes():
+    for shape in all_shapes(scene):
         if shape.shape_type() in _CURVES:
             raise NotImplementedError(
                 f"bdpt: emitter '{emitter.id()}' {why}, which is not supported beside curves "

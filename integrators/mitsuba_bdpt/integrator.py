@@ -111,11 +111,12 @@ decided: an empty text where one did, and where ``decisions`` were given.
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
 
-Not supported, and refused in words: scalar and polarized variants, participating media,
-derivatives (``integrator.render`` itself ignores gradients), ``strategy_images`` on a ``specfilm``. Threads
-need a scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where
-one cannot have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and
-``explain`` says so.
+Not supported, and refused in words: scalar and polarized variants, participating media (also in shape
+groups; a medium that an emitter lies in is ignored, as by ``volpath``), derivatives
+(``integrator.render`` itself ignores gradients), ``strategy_images`` on a ``specfilm``. Threads need a
+scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where one cannot
+have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and ``explain``
+says so.
 """
 
 
