@@ -801,6 +801,27 @@ def test_gradients_of_any_scene_do_not_matter(parameters):
         assert np.array_equal(image(bdpt, scene, spp=16), plain)
 
 
+def test_gradients_do_not_matter_to_what_is_told():
+    """Rationale: as above. Expected: what `decide`, `explain` and `assemble` give is the same with gradients
+    as without, also where a pilot is asked (2^17 samples)."""
+    scene, bdpt = lamp_in_a_sphere(size=16), integrator(max_depth=4)
+    kept = []
+    bdpt.on_pass = lambda report: kept.append(report.snapshot())
+    bdpt.render(scene, spp=1)
+    bdpt.on_pass = None
+
+    def told():
+        image = np.array(bdpt.assemble(kept[0], scene))
+        return bdpt.decide(scene, spp=512), bdpt.explain(scene, spp=512), image.tolist()
+
+    plain = told()
+    assert "pilot:" in plain[1]
+    params = mi.traverse(scene)
+    dr.enable_grad(params["lamp.intensity.value"])
+    params.update()
+    assert told() == plain
+
+
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
     Expected: on a machine that has room for the film alone, each of them is refused in words."""
