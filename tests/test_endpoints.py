@@ -250,6 +250,22 @@ def test_directions_of_a_spot():
         assert abs(a.mean() - b.mean()) < 5 * error
 
 
+@pytest.mark.parametrize("scale", [3, 0.2, [-1, 1, 1], [0.5, -0.5, 0.5]], ids=str)
+def test_spots_that_are_scaled_or_mirrored(scale):
+    """Rationale: a cone scaled by one factor, or mirrored, is the same cone; other matrices, which make it
+    another one, are refused. Expected: the flux is that of the lamp as it was, by the same random numbers.
+    Tolerance: 1e-4, rounding of the falloff."""
+    flux = []
+    for matrix in (T(), T().scale(scale)):
+        lamp = EMITTERS["spot"]()
+        scene = mi.load_dict(room() | {"lamp": lamp | {"to_world": lamp["to_world"] @ matrix}})
+        u = [mi.Float(np.random.default_rng(i).random(10_000, dtype=np.float32)) for i in range(4)]
+        sample = mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3])
+        e = Emitters(scene).sample_emission(*sample, like_of_rgb(), mi.Bool(True))
+        flux.append(np.array(e.weight, dtype=np.float64).mean())
+    assert flux[1] == pytest.approx(flux[0], rel=1e-4)
+
+
 def test_emitters_are_chosen_by_sampling_weight():
     """Rationale: selection is part of every density. Expected: the share of emissions per emitter is
     its sampling_weight's (a weight of zero: never chosen, and `path` does not see it either), and the

@@ -26,7 +26,7 @@ ORDER = (
     ("cameras", "other_sensors"),
     ("emitter_tables", "infinity", "sensor_records"),
     ("emitter_kinds", "spheres"),
-    ("bsdf", "rays", "mis", "sobol"),
+    ("bsdf", "cylinders", "rays", "mis", "sobol"),
     ("objects",),
     ("llvm", "files", "spread", "_version"),
 )

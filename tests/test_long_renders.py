@@ -132,6 +132,25 @@ def test_what_a_scene_names_is_part_of_it():
         checkpoints.digest(options)
 
 
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin1"]
+)
+def test_encodings_of_a_scene_file(encoding):
+    """Rationale: Mitsuba takes more encodings than UTF-8, such a file with a byte order mark or without one,
+    and comments that XML does not. Expected: what the file names is found, and a render with checkpoints
+    begins."""
+    name = "k\u00fche.ply"
+    Path(name).write_text("a mesh")
+    shape = f'<shape type="ply"><string name="filename" value="{name}"/></shape>'
+    text = f'<?xml version="1.0" encoding="{encoding}"?>\n<scene version="3.0.0"><!-- a -- b -->{{}}</scene>'
+    Path("names.xml").write_bytes(text.format(shape).encode(encoding))
+    assert [path.name for path in checkpoints.named_files(Path("names.xml"))] == [name]
+    box = SCENE.read_text().partition("<scene")[2].partition(">")[2].rpartition("</scene>")[0]
+    Path("box.xml").write_bytes(text.format(box).encode(encoding))
+    command = [ARGUMENTS[0], "box.xml", *ARGUMENTS[2:]]
+    assert main([*command, "--spp", "4", "-o", "a.exr", "--checkpoint", "60"]) == 0
+
+
 def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):
     """Rationale: the image would be half of one scene, half of the other."""
     Path("a.xml").write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')

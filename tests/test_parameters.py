@@ -17,6 +17,7 @@ import mitsuba_bdpt
 import numpy as np
 import pytest
 from mitsuba_bdpt import connect, passes, rendering
+from mitsuba_bdpt.world import World
 
 T = mi.ScalarTransform4f
 
@@ -800,6 +801,27 @@ def test_gradients_of_any_scene_do_not_matter(parameters):
         assert np.array_equal(image(bdpt, scene, spp=16), plain)
 
 
+def test_gradients_do_not_matter_to_what_is_told():
+    """Rationale: as above. Expected: what `decide`, `explain` and `assemble` give is the same with gradients
+    as without, also where a pilot is asked (2^17 samples)."""
+    scene, bdpt = lamp_in_a_sphere(size=16), integrator(max_depth=4)
+    kept = []
+    bdpt.on_pass = lambda report: kept.append(report.snapshot())
+    bdpt.render(scene, spp=1)
+    bdpt.on_pass = None
+
+    def told():
+        image = np.array(bdpt.assemble(kept[0], scene))
+        return bdpt.decide(scene, spp=512), bdpt.explain(scene, spp=512), image.tolist()
+
+    plain = told()
+    assert "pilot:" in plain[1]
+    params = mi.traverse(scene)
+    dr.enable_grad(params["lamp.intensity.value"])
+    params.update()
+    assert told() == plain
+
+
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
     Expected: on a machine that has room for the film alone, each of them is refused in words."""
@@ -826,9 +848,42 @@ def test_scenes_that_are_refused():
         bdpt.render(fog)
     with pytest.raises(NotImplementedError, match="volpath"):
         bdpt.explain(fog)
+    cloud = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
+    clouds = grouped({"cloud": cloud})
+    with pytest.raises(NotImplementedError, match="cloud.*participating medium.*volpath"):
+        bdpt.render(clouds)
     empty = mi.load_dict({"type": "scene", "lamp": {"type": "point"}})
     with pytest.raises(ValueError, match="no sensor"):
         bdpt.render(empty)
+
+
+def grouped(shapes):
+    """A scene with an instance of a group of ``shapes``."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor(),
+            "lamp": {"type": "point"},
+            "group": {"type": "shapegroup", **shapes},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        }
+    )
+
+
+def test_materials_in_groups_are_known():
+    """Rationale: what a scene's BSDFs do decides which densities are asked for and which paths are possible.
+    Expected: those of shapes in groups count, the one that Mitsuba gives to every instance does not."""
+    mixture = {"type": "blendbsdf", "weight": 0.5, "a": {"type": "diffuse"}, "b": {"type": "plastic"}}
+    for bsdf, smooth, delta, refracts in (
+        ({"type": "dielectric"}, False, True, True),
+        ({"type": "conductor"}, False, True, False),
+        ({"type": "roughdielectric"}, True, False, True),
+        (mixture, True, True, False),
+    ):
+        scene = grouped({"ball": {"type": "sphere", "bsdf": bsdf}})
+        world = World(scene, scene.sensors()[0])
+        assert (world.smooth, world.delta, world.refracts) == (smooth, delta, refracts), bsdf["type"]
+        assert world.traits.full_pdf == (bsdf is mixture)
 
 
 def curve(folder):
@@ -847,6 +902,9 @@ AREA_LIGHT = {"type": "area", "radiance": 1.0}
 CHECKS = {"type": "area", "radiance": {"type": "checkerboard"}}
 GAUSSIAN = {"rfilter": {"type": "gaussian"}, "sample_border": True}
 STRETCHED = mi.ScalarTransform4f().scale([1, 2, 1])
+MIRRORED = mi.ScalarTransform4f().scale([1, 1, -1])
+# The columns are of length 1.
+SHEARED = mi.ScalarTransform4f([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 REFUSED_PARTS = {
     "curve lamp": (
         lambda folder: {"lamp": curve(folder) | {"emitter": AREA_LIGHT}},
@@ -856,9 +914,43 @@ REFUSED_PARTS = {
         lambda folder: {"lamp": {"type": "cylinder", "emitter": CHECKS}, "curve": curve(folder)},
         "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
     ),
+    "texture beside a group of curves": (
+        lambda folder: {
+            "lamp": {"type": "cylinder", "emitter": CHECKS},
+            "group": {"type": "shapegroup", "curve": curve(folder)},
+            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
+        },
+        "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
+    ),
+    "mirrored cylinder": (
+        lambda _: {"lamp": {"type": "cylinder", "to_world": MIRRORED, "emitter": AREA_LIGHT}},
+        "emitter '.*' is on a cylinder .*'lamp'.* mirrors it.*leave out the negative scale",
+    ),
+    "mirrored cylinder of beams": (
+        lambda _: {
+            "lamp": {"type": "cylinder", "to_world": MIRRORED, "emitter": {"type": "directionalarea"}}
+        },
+        "emitter '.*' is on a cylinder .*'lamp'.* mirrors it",
+    ),
+    "meter on a mirrored cylinder": (
+        lambda _: {"meter": meter_on({"type": "cylinder", "to_world": MIRRORED})},
+        "irradiance meter '.*' is on a cylinder .*'meter'.* mirrors it.*flip_normals turns normals",
+    ),
     "projector": (
         lambda _: {"lamp": {"type": "projector", "to_world": STRETCHED}},
         "to_world of projector 'lamp' distorts angles .*1, 2, 1.*set fov instead",
+    ),
+    "stretched spot": (
+        lambda _: {"lamp": {"type": "spot", "to_world": STRETCHED}},
+        "to_world of spot 'lamp' distorts angles .*1, 2, 1.*set cutoff_angle instead",
+    ),
+    "long spot": (
+        lambda _: {"lamp": {"type": "spot", "to_world": mi.ScalarTransform4f().scale([1, 1, 2])}},
+        "to_world of spot 'lamp' distorts angles .*1, 1, 2.*set cutoff_angle instead",
+    ),
+    "sheared spot": (
+        lambda _: {"lamp": {"type": "spot", "to_world": SHEARED}},
+        "to_world of spot 'lamp' distorts angles .*leave out scaling and shear",
     ),
     "narrow spot": (
         lambda _: {"lamp": {"type": "spot", "cutoff_angle": 0.013}},
@@ -894,11 +986,30 @@ def test_endpoints_that_are_refused(name, tmp_path):
     make, message = REFUSED_PARTS[name]
     made = make(tmp_path)
     scene = {"type": "scene", **made}
-    if name not in ("batch border", "meter border", "meter on a grid"):
+    if not name.startswith(("batch", "meter")):
         scene["eye"] = sensor()
     scene = mi.load_dict(scene)
     with pytest.raises((NotImplementedError, ValueError), match=message):
         integrator().render(scene, spp=1)
+
+
+def test_mirrored_shapes_that_are_fine():
+    """Rationale: only cylinders have contradicting normals, and only where their points are sampled.
+    Expected: a mirrored cylinder that reflects, emitting ones that are turned, scaled or have their normals
+    flipped, and other shapes that are mirrored and emit, are rendered."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(0.1)
+    lamp = {"type": "cylinder", "to_world": turned, "emitter": AREA_LIGHT}
+    scene = {
+        "type": "scene",
+        "eye": sensor(),
+        "pipe": {"type": "cylinder", "to_world": MIRRORED},
+        "lamp": lamp,
+        "flipped": lamp | {"flip_normals": True},
+        "backwards": {"type": "cylinder", "p0": [0, 0, 1], "p1": [0, 0, 0.5], "emitter": AREA_LIGHT},
+    }
+    for kind in ("rectangle", "disk", "sphere", "cube"):
+        scene[kind] = {"type": kind, "to_world": MIRRORED, "emitter": AREA_LIGHT}
+    assert np.isfinite(image(integrator(max_depth=2), mi.load_dict(scene), spp=1)).all()
 
 
 def triangle_lamp(positions, face, **attributes):

@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import children, number, own_parameters
+from .cylinders import check_not_mirrored
+from .objects import all_shapes, children, number, own_parameters
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
 # direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
@@ -54,6 +55,8 @@ def kind_of(emitter) -> int:
     kind = _KINDS.get(emitter.class_name(), UNKNOWN)
     if kind == INFINITE and "to_world" in own_parameters(emitter):
         _check_rotation(emitter)
+    if kind in (AREA, DIRECTIONAL_AREA):
+        check_not_mirrored(emitter.get_shape(), f"emitter '{emitter.id()}'")
     if kind == AREA and not _tells_its_points(emitter):
         return UNSAMPLED
     return kind
@@ -168,7 +171,7 @@ def check_coordinates(emitter):
 def refuse_curves(scene, emitter, why: str):
     """Raise ``NotImplementedError`` if a call on shapes, which ``emitter`` needs, would meet curves: they
     have no ``sample_position``."""
-    for shape in scene.shapes():
+    for shape in all_shapes(scene):
         if shape.shape_type() in _CURVES:
             raise NotImplementedError(
                 f"bdpt: emitter '{emitter.id()}' {why}, which is not supported beside curves "
@@ -187,14 +190,19 @@ def _check_rotation(emitter):
         )
 
 
-def check_projector(emitter):
-    """Raise ``ValueError`` if the ``to_world`` of a projector distorts angles."""
+def check_angles(emitter):
+    """Raise ``ValueError`` if the ``to_world`` of a projector or spot distorts angles: what it sends into a
+    direction is a function of the angles before, and densities of directions are those of these angles.
+    Scaled by one factor or mirrored, it keeps them."""
     columns = _columns(emitter)
     scale = np.linalg.norm(columns, axis=0).mean()
-    if not np.allclose(columns.T @ columns, np.eye(3) * scale**2, atol=1e-3 * scale**2):
+    if not np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2):
+        plugin, angle = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}[
+            emitter.class_name()
+        ]
         raise ValueError(
-            f"bdpt: to_world of projector '{emitter.id()}' distorts angles (the lengths of its columns are "
-            f"{_lengths(columns)}); leave out scaling and shear, and set fov instead"
+            f"bdpt: to_world of {plugin} '{emitter.id()}' distorts angles (the lengths of its columns are "
+            f"{_lengths(columns)}); leave out scaling and shear, and set {angle} instead"
         )
 
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_projector, is_textured
+from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_angles, is_textured
 from .objects import children, own_parameters
 from .spheres import Sphere, is_small
 
@@ -56,6 +56,7 @@ def placement(emitter, kind, extent) -> Placement:
         position = dr.slice(mi.Point3f(own_parameters(emitter)["position"]))
         return Placement(position=position, density_w=1 / (4 * dr.pi))
     if kind == SPOT:
+        check_angles(emitter)
         params = own_parameters(emitter)
         to_world = params["to_world"]
         x, y, z = (
@@ -132,7 +133,7 @@ class _Projector:
     sample another image than they show."""
 
     def __init__(self, emitter):
-        check_projector(emitter)
+        check_angles(emitter)
         to_world = own_parameters(emitter)["to_world"]
         matrix = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
         probes = matrix @ np.array([[0, 0, 1, 1], [1, 0, 1, 1], [0, 1, 1, 1]], dtype=np.float64).T

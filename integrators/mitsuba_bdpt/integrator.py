@@ -111,11 +111,12 @@ decided: an empty text where one did, and where ``decisions`` were given.
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
 
-Not supported, and refused in words: scalar and polarized variants, participating media,
-derivatives (``integrator.render`` itself ignores gradients), ``strategy_images`` on a ``specfilm``. Threads
-need a scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where
-one cannot have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and
-``explain`` says so.
+Not supported, and refused in words: scalar and polarized variants, participating media (also in shape
+groups; a medium that an emitter lies in is ignored, as by ``volpath``), derivatives
+(all other methods of ``integrator`` ignore gradients), ``strategy_images`` on a ``specfilm``. Threads need a
+scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where one cannot
+have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and ``explain``
+says so.
 """
 
 
@@ -197,6 +198,7 @@ def _make_class():
             _warn_of_what_was_lost(self.statistics, scene)
             return [decision.record() for decision in render.decisions]
 
+        @_without_gradients
         def assemble(self, snapshot, scene, sensor=0, develop=True, evaluate=True):
             """The image of a snapshot, also of several that were joined (`Snapshot.joined`), traced by
             this integrator or one with the same parameters; what `render` would have returned."""
@@ -221,6 +223,7 @@ def _make_class():
         def render_backward(self, *args, **kwargs):
             raise NotImplementedError(NO_DERIVATIVES)
 
+        @_without_gradients
         def explain(self, scene, sensor=0, spp=None):
             """What will be done for ``scene`` and what is skipped, and why, as text; with ``spp`` also
             what the pilot of such a render finds."""

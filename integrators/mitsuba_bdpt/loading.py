@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 from argparse import Namespace
 from collections.abc import Mapping
@@ -13,15 +14,36 @@ import mitsuba as mi
 KEPT = ("max_depth", "rr_depth", "hide_emitters")
 """What an integrator that replaces the scene's takes over: the same paths are to be found."""
 
+# What files in other encodings than UTF-8 begin with: a byte order mark, or the first "<" of a file without.
+# Of two that fit the first counts.
+_STARTS = (
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (b"<\0\0\0", "utf-32-le"),
+    (b"\0\0\0<", "utf-32-be"),
+    (b"<\0", "utf-16-le"),
+    (b"\0<", "utf-16-be"),
+)
+
 
 def elements(file: Path) -> list[ElementTree.Element]:
     """All elements of a scene file, in its order; raises ``ValueError`` if it is not XML."""
-    text = file.read_text(encoding="utf-8", errors="replace")
+    text = _decoded(file.read_bytes())
     try:
         # Mitsuba takes comments that hold two hyphens, XML does not.
         return list(ElementTree.fromstring(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)).iter())
     except (ElementTree.ParseError, ValueError) as error:
         raise ValueError(f"{str(file)!r} is not well-formed XML: {error}") from error
+
+
+def _decoded(data: bytes) -> str:
+    """The text of a scene file, whose encoding Mitsuba tells by its first bytes."""
+    if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)[\"']", data, re.IGNORECASE):
+        return data.decode("latin-1")
+    encoding = next((name for start, name in _STARTS if data.startswith(start)), "utf-8-sig")
+    return data.decode(encoding, errors="replace")
 
 
 def in_proportion(scene: Path, definitions: dict) -> dict:

@@ -68,6 +68,18 @@ def children(owner) -> dict:
     return _collector(mi.variant())().of(owner)
 
 
+def all_shapes(scene) -> list:
+    """The scene's shapes, those in shape groups included. (An instance does not tell of which group it is:
+    groups are found among what the scene holds.)"""
+    groups = [
+        child
+        for child in children(scene).values()
+        if isinstance(child, mi.Shape) and child.class_name().startswith("ShapeGroup")
+    ]
+    grouped = [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
+    return [*scene.shapes(), *grouped]
+
+
 def own_parameters(owner) -> dict:
     """The parameters of ``owner`` alone, by name. (``mi.traverse`` goes through all that it holds: that takes
     longer.)"""

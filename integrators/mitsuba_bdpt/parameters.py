@@ -13,6 +13,7 @@ import numpy as np
 
 from . import choice, features, mis, points
 from .colour import Bands, film_colours
+from .objects import all_shapes
 from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
 from .strategies import layer_names
 
@@ -208,7 +209,7 @@ def check_scene(scene, sensor):
             f"bdpt: sensor '{sensor.id()}' lies in a participating medium, which is not supported; "
             "use integrator type 'volpath'"
         )
-    for shape in scene.shapes():
+    for shape in all_shapes(scene):
         if shape.is_medium_transition():
             raise NotImplementedError(
                 f"bdpt: shape '{shape.id()}' bounds a participating medium, which is not supported; "

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from . import bsdf
 from .emitters import Emitters
-from .objects import children
+from .objects import all_shapes
 from .sensors import prepare
 
 
@@ -30,13 +30,6 @@ class World:
 
 
 def bsdfs(scene):
-    """The BSDFs of all shapes, those of shape groups included."""
-    found = [s.bsdf() for s in scene.shapes()]
-    waiting = list(scene.shapes())
-    while waiting:
-        for value in children(waiting.pop()).values():
-            if isinstance(value, mi.BSDF):
-                found.append(value)
-            elif isinstance(value, mi.Shape):
-                waiting.append(value)
+    """The BSDFs of all shapes, those of shape groups included; that of an instance is never met."""
+    found = [s.bsdf() for s in all_shapes(scene) if s.class_name() != "Instance"]
     return [b for b in found if b is not None]
