@@ -68,16 +68,17 @@ def children(owner) -> dict:
     return _collector(mi.variant())().of(owner)
 
 
+def grouped_shapes(scene) -> list:
+    """The shapes in the scene's shape groups. (An instance does not tell of which group it is: groups are
+    found among what the scene holds.)"""
+    shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
+    groups = [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
+    return [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
+
+
 def all_shapes(scene) -> list:
-    """The scene's shapes, those in shape groups included. (An instance does not tell of which group it is:
-    groups are found among what the scene holds.)"""
-    groups = [
-        child
-        for child in children(scene).values()
-        if isinstance(child, mi.Shape) and child.class_name().startswith("ShapeGroup")
-    ]
-    grouped = [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
-    return [*scene.shapes(), *grouped]
+    """The scene's shapes, those in shape groups included."""
+    return [*scene.shapes(), *grouped_shapes(scene)]
 
 
 def own_parameters(owner) -> dict:

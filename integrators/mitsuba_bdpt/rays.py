@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import children, number, own_parameters
+from .objects import grouped_shapes, number, own_parameters
 
 # Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
 # cylinders), whether they are as large as the distances to them or 10^6 times larger.
@@ -87,7 +87,8 @@ class ShapeErrors:
     def __init__(self, scene):
         shapes = scene.shapes()
         extent = 2 * scene.bbox().bounding_sphere().radius
-        grouped = [shape for group in groups(scene) for shape in children(group).values()]
+        # An instance does not tell of which group it is: it has the largest curvature of all of them.
+        grouped = max((_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene)), key=abs, default=0.0)
         rows = [Errors(*_curvatures(s, grouped, extent), 0.0) for s in shapes]
         self.any = any(row.ends for row in rows)
         # Not `>`: the extent may be NaN.
@@ -95,12 +96,12 @@ class ShapeErrors:
         ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
         self._size = max(ids, default=0) + 1
         table, first = [Errors(0.0, 0.0, 0.0)] * self._size, [0] * self._size
-        triangles = [np.zeros(1)]  # entry 0 stands for shapes without
+        triangles, count = [np.zeros(1)], 1  # entry 0 stands for shapes without
         for index, row, shape in zip(ids, rows, shapes, strict=True):
             reach = reaches(shape)
             row.reach = float(reach.max(initial=0))
             if len(reach) > 1 and reach.min() < row.reach:
-                first[index] = sum(map(len, triangles))
+                first[index], count = count, count + len(reach)
                 triangles.append(reach)
             table[index] = row
         self._table = Errors(*(mi.Float([getattr(row, n) for row in table]) for n in vars(table[0])))
@@ -135,14 +136,9 @@ def met(shape, instance=None):
     return dr.select(instance != 0, instance, index)
 
 
-def groups(scene) -> list:
-    """The scene's shape groups."""
-    shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
-    return [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
-
-
 def _curvatures(shape, grouped, extent) -> tuple[float, float]:
-    """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent`` with shapes in groups."""
+    """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent``; ``grouped``: the largest
+    ``ends`` of shapes in groups."""
     kind = shape.shape_type()
     if kind in _ROUND:
         matrix = _matrix(shape)
@@ -152,10 +148,8 @@ def _curvatures(shape, grouped, extent) -> tuple[float, float]:
         sign = _outward(shape, matrix) if far else 1.0
         return sign * inverse, inverse if kind == mi.ShapeType.Cylinder.value else 0.0
     if _is_instance(shape):
-        # An instance does not tell of which group it is: it has the largest curvature of all of them.
-        within = [_curvatures(inner, [], np.inf)[0] for inner in grouped]
-        largest = max(within, key=abs, default=0.0) / max(_stretch(shape)[-1], 1e-30)
-        return largest, abs(largest)
+        within = grouped / max(_stretch(shape)[-1], 1e-30)
+        return within, abs(within)
     return 0.0, 0.0
 
 
