@@ -24,16 +24,16 @@ def path_of(output: Path) -> Path:
 
 def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
     """Meshes, textures, spectra and scene files that a scene file names, and those that the latter name, as
-    far as they exist; raises ``ValueError`` if one of the scene files is not XML. ``definitions`` of
-    parameters, for names that hold some."""
-    found = []
+    far as they exist, each once; raises ``ValueError`` if one of the scene files is not XML. ``definitions``
+    of parameters, for names that hold some."""
+    found = {}
     _note_files(scene, dict(definitions), [Path()], found)
-    return found
+    return list(found)
 
 
-def _note_files(scene: Path, values: dict, folders: list[Path], found: list[Path]) -> None:
-    """Add to ``found`` what a scene file names, looked for as Mitsuba does: beside it, then in ``folders``.
-    ``values`` of parameters, to which its own defaults are added."""
+def _note_files(scene: Path, values: dict, folders: list[Path], found: dict[Path, None]) -> None:
+    """Add to ``found``, a set in the order of the files, what a scene file names, looked for as Mitsuba does:
+    beside it, then in ``folders``. ``values`` of parameters, to which its own defaults are added."""
     folders = [scene.parent, *folders]
 
     def resolved(name, exists):
@@ -50,7 +50,7 @@ def _note_files(scene: Path, values: dict, folders: list[Path], found: list[Path
         if path is None:
             continue
         is_new = path not in found
-        found.append(path)
+        found[path] = None
         if element.tag == "include" and is_new:
             _note_files(path, values, folders, found)
 
