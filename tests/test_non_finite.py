@@ -4,6 +4,8 @@ Families of such values are in scripts/stress_cases/non_finite.py and non_finite
 expected of each and the reason of each tolerance; the quick ones are run by tests/test_stress.py.
 """
 
+import math
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -57,23 +59,49 @@ def test_what_reflects_more_than_it_receives_is_named(bsdf, said):
     assert all(said in text for text in warnings)
 
 
+def beside_spots(*angles):
+    """A scene with a spot of each cutoff angle."""
+    lamps = {f"lamp {i}": {"type": "spot", "cutoff_angle": angle} for i, angle in enumerate(angles)}
+    film = {"type": "hdrfilm", "width": 8, "height": 8}
+    sensor = {"type": "perspective", "film": film}
+    return mi.load_dict({"type": "scene", "sensor": sensor, "ball": {"type": "sphere"}, **lamps})
+
+
 def test_spots_that_rounding_changes_are_named():
     """Rationale: at 0.1 degrees 1 - cos has 26 steps of single precision. Expected: one warning per render
-    that names the spot and by how much; none at 0.3 degrees."""
+    that names the spot and by how much at most; none at 0.3 degrees."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 2})
 
     def said(*angles):
-        lamps = {f"lamp {i}": {"type": "spot", "cutoff_angle": a} for i, a in enumerate(angles)}
-        film = {"type": "hdrfilm", "width": 8, "height": 8}
-        sensor = {"type": "perspective", "film": film}
-        scene = mi.load_dict({"type": "scene", "sensor": sensor, "ball": {"type": "sphere"}, **lamps})
         with Warned() as warnings:
-            integrator.render(scene, spp=1)
+            integrator.render(beside_spots(*angles), spp=1)
         return list(warnings)
 
     assert said(0.3, 20) == []
     (text,) = said(0.1, 20)
-    assert "spot 'lamp 0' has cutoff_angle=0.1 (some 4%)" in text and "lamp 1" not in text
+    assert "spot 'lamp 0' has cutoff_angle=0.1 (up to 4% of its light)" in text and "lamp 1" not in text
+
+
+@pytest.mark.parametrize(
+    "angle, said",
+    [
+        (0.21, []),
+        (0.19, ["0.19 (up to 1% of its light)"]),
+        (0.02, ["0.02 (up to 98% of its light)"]),
+        (0.01, ["0.01 (up to all of its light)"]),
+        (1e-6, ["1e-06 (up to all of its light)"]),
+        (0.0, ["0 (up to all of its light)"]),
+        (-1.0, []),
+        (math.inf, []),
+        (math.nan, []),
+    ],
+)
+def test_no_more_than_all_light_is_lost(angle, said):
+    """Rationale: a step of the cosine over 1 - cos has no limit as the angle goes to 0. Expected: all of the
+    light where the quotient is 1 or more; no word here about angles that are not finite, which count among
+    such parameters; no warning of NumPy (an error in these tests) at any angle."""
+    found = suspects.narrow_spots(beside_spots(angle))
+    assert found == [f"spot 'lamp 0' has cutoff_angle={text}" for text in said]
 
 
 def test_coefficients_of_spectra_are_no_reflectances():

@@ -9,6 +9,7 @@ SECTIONS = (
     "place",
     "geometry",
     "transport",
+    "spots",
     "weights",
     "fireflies",
     "non_finite",
