@@ -111,7 +111,8 @@ def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     is_area = paths.kind == AREA
 
     # Densities of x_i when sampled from x_{i-1}. A delta event has the same (discrete) probability both ways,
-    # so that any number serves; here 1.
+    # so that any number serves; here 1. (The solid angles on the two sides of a refraction are not the same:
+    # their ratio is left out, as by the weights under test, see `mis.scatter`.)
     light = np.zeros((n, k + 1))
     light[:, 0] = log["first"]
     # The emission density of x_1: over directions, or already over an area perpendicular to the edge.

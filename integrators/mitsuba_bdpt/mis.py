@@ -174,10 +174,11 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
         heuristic.scale(partial.d_vcm, coefficient),
         heuristic.scale(partial.d_vc, step.pdf_rev_w),
     )
-    # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its forward and
-    # reverse probabilities cancel. Both solid angles of a refraction count as equal: strategies on its two
-    # sides are compared up to the ratio of these, which is the same in every strategy's weight, so that
-    # weights sum to 1.
+    # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its probabilities from either
+    # side are the same for Mitsuba's BSDFs and left out. So is the ratio of the solid angles on the two sides
+    # of a refraction, (eta_l/eta_c)^2 cos_l/cos_c: weights are those of densities that leave it out, the same
+    # ones whichever strategy asks, so they sum to 1 and nothing is biased; they are exactly the balance
+    # heuristic's for reflections and where these ratios multiply to 1.
     kept = 0
     if not is_absent(older):
         kept = dr.select(
