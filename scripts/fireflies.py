@@ -40,7 +40,7 @@ from tables import table
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
-# Estimates and weights are the same up to this. (Roulette comes on top, see `_found_anew`.)
+# Estimates and weights are the same up to this.
 AGREE = 1e-2
 
 
