@@ -349,7 +349,7 @@ WHITE = {
         "box": {
             "type": "cube",
             "bsdf": diffuse(1),
-            "to_world": T().translate([0.9, -0.4, 0.3]).rotate([1, 1, 0], 30).scale(0.5),
+            "to_world": T().translate([0.9, -0.4, 0.3]).rotate([0.70710678, 0.70710678, 0], 30).scale(0.5),
         },
         "floor": {
             "type": "rectangle",

@@ -1287,7 +1287,8 @@ def test_negative_radiance_is_that_of_path():
 
 @pytest.mark.parametrize("edit", ["scale", "axis"])
 def test_an_envmap_that_is_not_rotated_is_refused(edit):
-    """Rationale: with any other matrix Mitsuba's own calls disagree with each other. Expected: named."""
+    """Rationale: with any other matrix Mitsuba's own calls disagree with each other; `rotate` about an axis
+    that is not of length 1 shears. Expected: named."""
     to_world = T().scale(2) if edit == "scale" else T().rotate([1, 2, 3], 77)
     sky = {"type": "envmap", "to_world": to_world, "bitmap": mi.Bitmap(np.ones((4, 8, 3), dtype=np.float32))}
     scene = mi.load_dict({"type": "scene", "sensor": sensor(), "sky": sky})
