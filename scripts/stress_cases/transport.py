@@ -20,8 +20,12 @@ SEEDS = range(8)
 # With this ``rr_depth``, what roulette makes noisy is 0.99^1200 of the light.
 LATE = 1200
 
-# Of the steepest ray in the corridor of mirrors, over both directions: 31 reflections each.
-SLOPE = 0.31
+# Of the steepest ray in the corridor of mirrors, in both directions across it: 32 reflections each.
+SLOPE = 0.323
+
+# Relative error of a tile of the corridor's end. Rays start 32 * 2^-24 of the largest coordinate, 100, off a
+# mirror, which is a corridor narrower by 2e-4: 2e-4 of light after 64 bounces. There is noise of 1e-4.
+OFF = 5e-4
 
 WELCH = "Welch's test over tiles (level 1e-3, 8 seeds each)"
 STUDENT = "Student's test over tiles (level 1e-3, 8 seeds)"
@@ -171,7 +175,7 @@ def _black() -> Outcome:
 
 
 def corridor(reflectance: float, end: dict):
-    """A square tube of mirrors, 100 wide-lengths long, seen from one end; no camera ray meets more than 64 of
+    """A square tube of mirrors, 100 times as long as wide, seen from one end; the steepest rays meet 64 of
     them before the ``end``."""
     mirror = {"type": "conductor", "material": "none", "specular_reflectance": reflectance}
     sides = {
@@ -199,11 +203,13 @@ def _corridor(reflectance: float) -> Outcome:
     along = (reflectance ** np.floor(100 * SLOPE * np.abs(slopes) + 0.5)).mean(axis=1)
     known = np.outer(along, along).ravel()
     known = np.append(known, known.mean())
+    text = f"mean {means[:, -1].mean():.6g}, "
     if reflectance < 1:
-        return against_known(means, known, 0.002)
+        off = np.abs(means.mean(axis=0) / known - 1).max()
+        return Outcome(off <= OFF, f"{text}known {known[-1]:.6g}; tiles off by {off:.2g} at most")
     # Without noise but for the lamp seen directly, where one sample of 64 more or less counts for s = 0.
     off = np.abs(means - known).max()
-    return Outcome(off <= 2 / (64 * 16), f"mean {means[:, -1].mean():.6g}, tiles off by {off:.2g} at most")
+    return Outcome(off <= 2 / (64 * 16), f"{text}tiles off by {off:.2g} at most")
 
 
 def glass(inside=None, **keys):
@@ -236,7 +242,7 @@ def _total_reflection(parameters: dict) -> Judged:
     parts = {
         "cube": {
             "type": "cube",
-            "to_world": place().rotate([1, 1, 0], 30).scale(0.5),
+            "to_world": place().rotate([0.70710678, 0.70710678, 0], 30).scale(0.5),
             "bsdf": {"type": "dielectric", "int_ior": 1.8},
         },
         "lamp": {
@@ -373,14 +379,18 @@ def glass_cases():
         *(
             _case(
                 f"corridor-{reflectance:g}",
-                f"up to 62 bounces in a corridor of mirrors of reflectance {reflectance:g}, a lamp behind",
+                f"up to 64 bounces in a corridor of mirrors of reflectance {reflectance:g}, a lamp behind",
                 f"that reflectance to the number of bounces; {tolerance}",
                 lambda r=reflectance: _corridor(r),
                 reflectance == 1,
             )
             for reflectance, tolerance in (
                 (1.0, "tiles of 16 pixels to 2e-3, two samples of 64 in one of these"),
-                (0.98, f"{STUDENT}, which sees errors of 0.2 %"),
+                (
+                    0.98,
+                    f"means of tiles over 8 seeds to {OFF:g}, since rays start 2e-4 of the width off "
+                    "a mirror and so bounce the sooner (under `path` tiles are off by 4e-3)",
+                ),
             )
         ),
         _case(
