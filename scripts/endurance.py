@@ -250,6 +250,10 @@ def text(record: dict) -> str:
         f"{lost['pixels_not_finite']} pixels not finite, {lost['non_finite_in_pilot']} values of pilots, "
         f"{lost['failed']} renders failed."
     )
+    by_source = record.get("samples_by_source", {})  # older records do not say
+    if by_source:
+        parts = [f"{in_words(count)} of `{source}`" for source, count in by_source.items()]
+        words += f" By digest of the plugin's source: {', '.join(parts)}."
     out = left_out(record, reference.source_digest())
     if out:
         words += f" Left out after {MOST_FAILURES} failures with this version of the source: "
