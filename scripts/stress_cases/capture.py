@@ -57,7 +57,8 @@ class Walked:
 class Made:
     """Paths that the kernel made with ``s`` light vertices: the ``weights`` it gave them; ``unsure`` counts
     those left out, where rounding decides which disk light from infinity has started on, whether a point
-    lies on a lamp, or what the cosines of a short edge are (`MOST_TURNED`)."""
+    lies on a lamp, what the density of an environment map is at its poles, or what the cosines of a short
+    edge are (`MOST_TURNED`)."""
 
     s: int
     weights: np.ndarray
@@ -213,8 +214,9 @@ class Capture:
         for (s, t), c in sorted(self.found.items()):
             if s + t <= self.depth + 1:
                 yield self._made(s, t, c)
-        if self.plan.connections != "all":
+        if self.plan.connections == "none":
             return
+        # Of "one" too: all are weighed, whichever is then drawn.
         for s in range(2, self.depth):
             for t in range(2, self.depth + 2 - s):
                 yield self._inner(s, t)
@@ -257,7 +259,7 @@ class Capture:
         if self.disks is not None:
             sure &= ~(infinite & self.disks.unsure(x[:, 1], d[:, 0]))
         for number, lamp in enumerate(self.lamps):
-            sure &= ~((index == number) & lamp.unsure(x[:, 1]))
+            sure &= ~((index == number) & lamp.unsure(x[:, 1], d[:, 0]))
         return Paths(dist2, cos_light, cos_camera, *pdfs, kind, *ends, *camera), sure
 
     def _ends(self, index, x, d, dist2, cos_light):

@@ -24,6 +24,10 @@ KINDS = {
 }
 
 
+# Sine of the angle to a pole of an environment map below which `Lamp.unsure` is true.
+NEAR_POLE = 0.01
+
+
 def dot(a, b):
     """Of the rows of two arrays."""
     return (a * b).sum(-1)
@@ -38,7 +42,7 @@ def length2(a):
 class Lamp:
     """An emitter: its ``kind`` and ``probability`` of being chosen, ``area`` of its shape, ``center`` and
     ``radius`` of a sphere that shines outwards (0 of other shapes), solid angle ``cone`` into which it shines
-    from a point."""
+    from a point, direction of an environment map's ``pole``."""
 
     emitter: object
     kind: int
@@ -47,6 +51,7 @@ class Lamp:
     center: object = None
     radius: float = 0.0
     cone: float = 4 * np.pi
+    pole: object = None
 
     def of_direction(self, towards):
         """Density of the direction ``towards`` an environment, without the choice."""
@@ -91,8 +96,11 @@ class Lamp:
         """Squared sine of half the angle under which a sphere is seen."""
         return self.radius**2 / length2(x1 - self.center)
 
-    def unsure(self, x1):
-        """Where rounding decides whether a sphere is seen from outside."""
+    def unsure(self, x1, d):
+        """Where rounding decides whether a sphere is seen from outside, or where an environment map has its
+        poles: the angle to one comes from its cosine, and the density is off by 6e-8 over its square."""
+        if self.pole is not None:
+            return 1 - np.square(d @ self.pole) < NEAR_POLE**2
         return self._sin2(x1) > 1 - 1e-4 if self.radius else np.zeros(len(x1), dtype=bool)
 
 
@@ -153,6 +161,9 @@ def _lamp(emitter, probability) -> Lamp:
     if name == "SpotLight":
         cutoff = np.deg2rad(float(np.array(mi.traverse(emitter)["cutoff_angle"]).ravel()[0]))
         lamp.cone = 2 * np.pi * (1 - np.cos(cutoff))
+    if name == "EnvironmentMapEmitter":
+        to_world = np.array(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        lamp.pole = to_world[:3, 1]
     if shape is not None:
         lamp.area = float(np.array(shape.surface_area()).ravel()[0])
         if shape.class_name() == "Sphere":
