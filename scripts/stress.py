@@ -16,6 +16,7 @@ import json
 import subprocess
 import sys
 import time
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
 import reference
@@ -32,6 +33,9 @@ PAGE = reference.ROOT / "docs" / "stress.md"
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.
 LIMIT = 1800
+
+# Cases at a time.
+JOBS = 2
 
 # What is put before that which happened, by `Outcome.ok`.
 MARKS = {True: "", False: "**no**: ", None: "**not tried**: "}
@@ -58,9 +62,22 @@ def apart(name: str, limit: float = LIMIT) -> Outcome:
         return Outcome(False, f"ends with status {done.returncode}: {tail[0]}")
 
 
+def made_with(record: list[dict]) -> str:
+    """Of which versions of the plugin's source the rows are, and how long they took, in words."""
+    seconds = sum(row["seconds"] for row in record)
+    counts = Counter(row.get("source") for row in record)  # rows of older versions of this script do not say
+    sources = [f"`{name}`" if name else "an earlier one, not kept" for name in counts]
+    if len(counts) > 1:
+        sources = [f"{of} ({n} cases)" for of, n in zip(sources, counts.values(), strict=True)]
+    text = (
+        f"{len(record)} cases in {seconds / 60 / JOBS:.0f} minutes, {JOBS} at a time, {seconds / 60:.0f} one "
+    )
+    return text + f"after the other; digest of the plugin's source: {', '.join(sources)}."
+
+
 def page(record: list[dict]) -> str:
     """The tables of all sections, as Markdown."""
-    texts = []
+    texts = [made_with(record)]
     for section in dict.fromkeys(row["section"] for row in record):
         rows = [
             [
@@ -84,13 +101,13 @@ def write(record: list[dict]) -> None:
 
 def tried(case: Case) -> dict:
     """Run a case, say so, and return its row."""
-    started = time.perf_counter()
+    started, source = time.perf_counter(), reference.source_digest()
     outcome = apart(case.name)
     seconds = round(time.perf_counter() - started, 1)
     mark = {True: "ok", False: "NO", None: "--"}[outcome.ok]
     print(f"{mark} {case.name} ({seconds} s): {outcome.happened}", flush=True)
     words = {name: getattr(case, name) for name in ("name", "section", "tried", "expected")}
-    return words | {"ok": outcome.ok, "happened": outcome.happened, "seconds": seconds}
+    return words | {"ok": outcome.ok, "happened": outcome.happened, "seconds": seconds, "source": source}
 
 
 def run(chosen: list[Case], jobs: int) -> list[dict]:
@@ -113,7 +130,7 @@ def main(arguments=None) -> int:
         "names", nargs="*", metavar="NAME", help="cases; default: all, and the page is written"
     )
     text = "cases at a time; much of one is compiling kernels, on one core (default: %(default)s)"
-    parser.add_argument("--jobs", type=number(int, 1), default=2, help=text)
+    parser.add_argument("--jobs", type=number(int, 1), default=JOBS, help=text)
     parser.add_argument("--list", action="store_true", help="print the names of all cases")
     parser.add_argument("--here", metavar="NAME", help=argparse.SUPPRESS)
     args = parser.parse_args(arguments)

@@ -43,6 +43,21 @@ def test_what_was_not_tried_is_not_called_well(ok, mark, monkeypatch, capsys):
     assert mark in stress.page([stress.tried(case)])
 
 
+def test_the_source_of_the_rows_is_told(monkeypatch, capsys):
+    """Rationale: rows of several versions of the plugin may stand in one table. Expected: a row keeps the
+    digest of the source that was tried; the page says how many rows are of which, those of older records
+    included, which do not tell, and how long all took."""
+    monkeypatch.setattr(stress, "apart", lambda name: stress.Outcome(True, "done"))
+    (case,) = [case for case in cases() if case.name == "black"]
+    row = stress.tried(case) | {"seconds": 120.0}
+    assert row["source"] == stress.reference.source_digest()
+    text = "cases in 1 minutes, 2 at a time, 2 one after the other; digest of the plugin's source: "
+    assert f"{text}`{row['source']}`." in stress.page([row])
+    older = {key: value for key, value in row.items() if key != "source"}
+    several = stress.page([row, older, older])
+    assert f"`{row['source']}` (1 cases), an earlier one, not kept (2 cases)." in several
+
+
 def test_the_worst_of_several_is_told():
     """Expected: of tests that all pass, the one with the smallest p and how many there were; of others, those
     that do not pass."""
