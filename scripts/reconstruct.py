@@ -2,13 +2,15 @@
 
 A check of what `recording` says of a path, and the answer to whether another strategy would find it: rays are
 aimed at the next vertex where a strategy may join vertices, and go where the BSDF sends them at delta events.
-Densities are written out one by one, by `oracle`.
+Densities are written out one by one, by `oracle`; those of emitters are the plugin's, but of directional ones
+the closed form of `endpoints`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import endpoints
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import oracle
@@ -30,9 +32,11 @@ class Lost(ValueError):
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """``f`` of a path, three colours; of its k + 2 strategies, s = 0 first, ``log_p`` as the weights compare
-    them, and ``log_turned``, the logarithm of what their delta events on the light side add to f / p: `f` and
-    ``log_p`` count those in solid angle on the light's side, a light subpath has them on the camera's."""
+    """``f`` of a path, three colours, without the factors that change directions to areas; of its k + 2
+    strategies, s = 0 first, ``log_p`` over these factors (alone they leave floating point in long paths) as
+    the weights compare them, and ``log_turned``, the logarithm of what their delta events on
+    the light side add to f / p: these count in solid angle on the light's side, a light subpath has them on
+    the camera's."""
 
     f: np.ndarray
     log_p: np.ndarray
@@ -70,13 +74,29 @@ class _Event:
     turned: float
 
 
+@dataclass(frozen=True)
+class _Source:
+    """The emitter's end of a path: ``radiance`` (irradiance of a directional one), ``kind`` as in `oracle`,
+    cosine with the geometric normal, and densities: ``first`` and ``second`` of x_0 and x_1 in emission,
+    ``direct`` of x_0 in next-event estimation, as in `oracle.Paths`."""
+
+    radiance: np.ndarray
+    kind: int
+    cos: float
+    first: float
+    second: float
+    direct: float
+
+
 def rebuild(scene, emitters, path) -> Rebuilt:
     """The `recording.Path` found anew; ``emitters`` of the render know their densities. Raises `Lost`."""
     events, end = _follow(scene, path)
-    radiance = np.array(end.emitter(scene).eval(end), dtype=float).ravel()
+    hit = int(dr.reinterpret_array(mi.UInt32, end.emitter(scene))[0]) != 0
+    source = _hit_source(scene, emitters, path, end) if hit else _directional_source(scene, emitters, path)
+    radiance = source.radiance
     if not radiance.any():
         raise Lost("the last vertex emits nothing")
-    paths, sensor = _densities(scene, emitters, path, events, end)
+    paths, sensor = _densities(scene, path, events, source)
     log_p = oracle.log_densities(paths)[0]
     to_area = np.log(paths.cos_light[0]) - np.log(paths.dist2[0])
     if path.infinite:
@@ -84,7 +104,7 @@ def rebuild(scene, emitters, path) -> Rebuilt:
     log_f = to_area.sum() + sensor
     # Of the events at x_1 ... x_{s-1}: where a strategy joins vertices they are 1.
     log_turned = np.cumsum([0, 0, *(np.log(e.turned) for e in events[::-1]), 0])
-    return Rebuilt(radiance * np.prod([e.value for e in events], axis=0) * np.exp(log_f), log_p, log_turned)
+    return Rebuilt(radiance * np.prod([e.value for e in events], axis=0), log_p - log_f, log_turned)
 
 
 def _follow(scene, path):
@@ -107,9 +127,39 @@ def _follow(scene, path):
         _check_place(end, path, k)
     elif bool(end.is_valid()[0]):
         raise Lost("a shape is in the way of light from infinity")
-    if int(dr.reinterpret_array(mi.UInt32, end.emitter(scene))[0]) == 0:
-        raise Lost("the last vertex is not on an emitter that can be hit")
     return events, end
+
+
+def _hit_source(scene, emitters, path, end) -> _Source:
+    """Of an emitter that the last ray has met."""
+    radiance = np.array(end.emitter(scene).eval(end), dtype=float).ravel()
+    cos = 1.0 if path.infinite else float(dr.abs(dr.dot(end.n, end.to_world(end.wi)))[0])
+    densities = emitters.hit_densities(end, _point(path.p[-2]), mi.Bool(True))
+    dr.eval(densities)
+    connect, first, second = (float(x[0]) for x in densities)
+    dist2 = np.sum((path.p[-1] - path.p[-2]) ** 2)
+    direct = connect if path.infinite else connect * dist2 / cos
+    kind = oracle.ENVIRONMENT if path.infinite else oracle.AREA
+    return _Source(radiance, kind, cos, first, second, direct)
+
+
+def _directional_source(scene, emitters, path) -> _Source:
+    """Of a directional emitter, which no ray can meet: by its direction."""
+    it = dr.zeros(mi.Interaction3f)
+    it.p = _point(path.p[-2])
+    for lamp in endpoints.lamps_of(scene) if path.infinite else ():
+        if lamp.kind != oracle.DIRECTIONAL:
+            continue
+        ds, irradiance = lamp.emitter.sample_direction(it, mi.Point2f(0.5))
+        dr.eval(ds.d, irradiance)
+        if np.array(ds.d).ravel() @ _direction(path, len(path.p) - 2) < SAME_DIRECTION:
+            continue
+        x1, d = path.p[-2][None].astype(float), -path.p[-1][None].astype(float)
+        disks = endpoints.disks_of(emitters.disks)
+        one = np.ones(1)
+        densities = lamp.first(d), lamp.second(one, x1, d, disks), lamp.direct(one, one, x1, d)
+        return _Source(np.array(irradiance, dtype=float).ravel(), lamp.kind, 1.0, *(x[0] for x in densities))
+    raise Lost("the last vertex is on no emitter that can be hit, nor in the direction of one")
 
 
 def _direction(path, i: int):
@@ -171,7 +221,7 @@ def _turned(si, bs):
     return dr.select(refracted, ratio, 1)
 
 
-def _densities(scene, emitters, path, events, end):
+def _densities(scene, path, events, source):
     """What the oracle asks for, with the first vertex on the emitter, and log of the sensor's importance, its
     cosine and the density of its point included."""
     sensor = scene.sensors()[0]
@@ -180,15 +230,10 @@ def _densities(scene, emitters, path, events, end):
         lens_pdf = 1 / (np.pi * float(mi.traverse(sensor)["aperture_radius"][0]) ** 2)
     axis = np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4)[:3, 2]
     cos_sensor = abs(axis @ _direction(path, 0)) / np.linalg.norm(axis)
-    k, infinite = len(path.p) - 1, path.infinite
+    k = len(path.p) - 1
     dist2 = [np.sum((path.p[i + 1] - path.p[i]) ** 2) for i in range(k)]
-    if infinite:
+    if path.infinite:
         dist2[-1] = 1.0
-    cos_end = 1.0 if infinite else float(dr.abs(dr.dot(end.n, end.to_world(end.wi)))[0])
-    densities = emitters.hit_densities(end, _point(path.p[-2]), mi.Bool(True))
-    dr.eval(densities)
-    connect, first, second = (float(x[0]) for x in densities)
-    direct = connect if infinite else connect * dist2[-1] / cos_end
     events = events[::-1]  # x_1 first
 
     def row(*values):
@@ -196,15 +241,15 @@ def _densities(scene, emitters, path, events, end):
 
     paths = oracle.Paths(
         dist2=row(*dist2[::-1]),
-        cos_light=row(cos_end, *(e.cos_camera for e in events)),
+        cos_light=row(source.cos, *(e.cos_camera for e in events)),
         cos_camera=row(*(e.cos_light for e in events), cos_sensor),
         to_camera=row(1, *(e.to_camera for e in events), 1),
         to_light=row(1, *(e.to_light for e in events), 1),
         delta=np.array([path.delta[::-1]]),
-        kind=np.array([oracle.ENVIRONMENT if infinite else oracle.AREA]),
-        first=np.array([first]),
-        second=np.array([second]),
-        direct=np.array([direct]),
+        kind=np.array([source.kind]),
+        first=np.array([source.first]),
+        second=np.array([source.second]),
+        direct=np.array([source.direct]),
         lens=np.array([lens]),
         lens_pdf=np.array([lens_pdf]),
         sensor_pdf=np.array([path.pdf_w]),

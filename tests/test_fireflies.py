@@ -161,7 +161,7 @@ def test_wrong_paths_are_not_found():
     assert "no delta lobe at vertex 2" in doubt(delta=[False, True, True, True, False])
     assert "weight is 0.5, that of the path 1" in doubt(weight=0.5)
     assert "estimate is 2 times" in doubt(estimate=2 * path.estimate)
-    with pytest.raises(reconstruct.Lost, match="not on an emitter"):
+    with pytest.raises(reconstruct.Lost, match="on no emitter"):
         reconstruct.rebuild(scene, kernel.emitters, replace(path, p=path.p[:4], delta=path.delta[:4]))
 
 

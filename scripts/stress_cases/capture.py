@@ -18,9 +18,8 @@ from mitsuba_bdpt.points import Points
 
 import mitsuba as mi  # isort: skip
 
+from endpoints import Camera, disks_of, dot, lamps_of, length2
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
-
-from .endpoints import Camera, disks_of, dot, lamps_of, length2
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.
