@@ -63,4 +63,9 @@ def _case(name: str, quick: bool = False) -> Case:
     )
 
 
-CASES = (_case("glass_caustics", quick=True), _case("cornell_box"), _case("smallvcm_cornell_lamp"))
+CASES = (
+    _case("glass_caustics", quick=True),
+    _case("cornell_box"),
+    _case("smallvcm_cornell_lamp"),
+    _case("smallvcm_cornell_sun"),
+)
