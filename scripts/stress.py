@@ -69,10 +69,8 @@ def made_with(record: list[dict]) -> str:
     sources = [f"`{name}`" if name else "an earlier one, not kept" for name in counts]
     if len(counts) > 1:
         sources = [f"{of} ({n} cases)" for of, n in zip(sources, counts.values(), strict=True)]
-    text = (
-        f"{len(record)} cases in {seconds / 60 / JOBS:.0f} minutes, {JOBS} at a time, {seconds / 60:.0f} one "
-    )
-    return text + f"after the other; digest of the plugin's source: {', '.join(sources)}."
+    text = f"{len(record)} cases, whose times add up to {seconds / 60:.0f} minutes ({JOBS} run at a time)"
+    return f"{text}; digest of the plugin's source: {', '.join(sources)}."
 
 
 def page(record: list[dict]) -> str:

@@ -51,7 +51,7 @@ def test_the_source_of_the_rows_is_told(monkeypatch, capsys):
     (case,) = [case for case in cases() if case.name == "black"]
     row = stress.tried(case) | {"seconds": 120.0}
     assert row["source"] == stress.reference.source_digest()
-    text = "cases in 1 minutes, 2 at a time, 2 one after the other; digest of the plugin's source: "
+    text = "cases, whose times add up to 2 minutes (2 run at a time); digest of the plugin's source: "
     assert f"{text}`{row['source']}`." in stress.page([row])
     older = {key: value for key, value in row.items() if key != "source"}
     several = stress.page([row, older, older])

@@ -196,7 +196,9 @@ def check_angles(emitter):
     Scaled by one factor or mirrored, it keeps them."""
     columns = _columns(emitter)
     scale = np.linalg.norm(columns, axis=0).mean()
-    if not np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2):
+    with np.errstate(invalid="ignore"):  # what is not finite is not close
+        keeps = np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2)
+    if not keeps:
         plugin, angle = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}[
             emitter.class_name()
         ]

@@ -68,6 +68,11 @@ def children(owner) -> dict:
     return _collector(mi.variant())().of(owner)
 
 
+def is_instance(shape) -> bool:
+    """Whether ``shape`` is an instance of a shape group."""
+    return shape.class_name() == "Instance"
+
+
 def grouped_shapes(scene) -> list:
     """The shapes in the scene's shape groups. (An instance does not tell of which group it is: groups are
     found among what the scene holds.)"""

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import grouped_shapes, number, own_parameters
+from .objects import grouped_shapes, is_instance, number, own_parameters
 
 # Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
 # cylinders), whether they are as large as the distances to them or 10^6 times larger.
@@ -87,9 +87,12 @@ class ShapeErrors:
     def __init__(self, scene):
         shapes = scene.shapes()
         extent = 2 * scene.bbox().bounding_sphere().radius
-        # An instance does not tell of which group it is: it has the largest curvature of all of them.
-        grouped = max((_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene)), key=abs, default=0.0)
-        rows = [Errors(*_curvatures(s, grouped, extent), 0.0) for s in shapes]
+        with np.errstate(all="ignore"):  # numbers that are not finite are somebody else's business
+            # An instance does not tell of which group it is: it has the largest curvature of all of them.
+            within = (_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene))
+            grouped = max(within, key=abs, default=0.0)
+            rows = [Errors(*_curvatures(s, grouped, extent), 0.0) for s in shapes]
+            all_reaches = [reaches(s) for s in shapes]
         self.any = any(row.ends for row in rows)
         # Not `>`: the extent may be NaN.
         self.small = any(row.ends and not abs(row.ends) * extent <= SMALL for row in rows)
@@ -97,8 +100,7 @@ class ShapeErrors:
         self._size = max(ids, default=0) + 1
         table, first = [Errors(0.0, 0.0, 0.0)] * self._size, [0] * self._size
         triangles, count = [np.zeros(1)], 1  # entry 0 stands for shapes without
-        for index, row, shape in zip(ids, rows, shapes, strict=True):
-            reach = reaches(shape)
+        for index, row, reach in zip(ids, rows, all_reaches, strict=True):
             row.reach = float(reach.max(initial=0))
             if len(reach) > 1 and reach.min() < row.reach:
                 first[index], count = count, count + len(reach)
@@ -145,9 +147,9 @@ def _curvatures(shape, grouped, extent) -> tuple[float, float]:
         # Across the axis of a cylinder, and of a sphere whatever the axis.
         inverse = 1 / max(float(np.linalg.norm(matrix[:3, 0])), 1e-30)
         far = not inverse * extent <= FAR  # the extent may be NaN
-        sign = _outward(shape, matrix) if far else 1.0
+        sign = _outward(shape, matrix) if far and 0 < inverse < 1e30 and np.isfinite(matrix).all() else 1.0
         return sign * inverse, inverse if kind == mi.ShapeType.Cylinder.value else 0.0
-    if _is_instance(shape):
+    if is_instance(shape):
         within = grouped / max(_stretch(shape)[-1], 1e-30)
         return within, abs(within)
     return 0.0, 0.0
@@ -168,10 +170,6 @@ def _outward(shape, matrix) -> float:
     return 1.0 if number(dr.dot(si.n, d)) >= 0 else -1.0
 
 
-def _is_instance(shape) -> bool:
-    return shape.class_name() == "Instance"
-
-
 def _matrix(shape) -> np.ndarray:
     return np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
 
@@ -190,18 +188,22 @@ def reaches(shape) -> np.ndarray:
     edges of triangles weigh |n_i| / max |n|, so that a floor along the axes has 0, however large. Of spheres,
     cylinders and grids all coordinates count, of instances all within them. 0 for others: disks and curves
     are as exact near by as far away."""
-    if _is_instance(shape):
+    kind = shape.shape_type()
+    if is_instance(shape):
         return np.array([_reach_within(shape)])
-    if shape.shape_type() == mi.ShapeType.Rectangle.value:
+    if kind == mi.ShapeType.Rectangle.value:
         matrix = _matrix(shape)
         corner = np.abs(matrix[:3, 3]) + np.abs(matrix[:3, :2]).sum(1)
-        return _along(np.cross(matrix[:3, 0], matrix[:3, 1])[None], corner[None])
-    if shape.shape_type() in _WHOLE:
+        n = np.abs(np.cross(matrix[:3, 0], matrix[:3, 1]))
+        return np.array([_finite((n / n.max() * corner).max())])
+    if kind in _WHOLE:
         return np.array([_finite(np.abs([shape.bbox().min, shape.bbox().max]).max())])
     params = own_parameters(shape) if shape.is_mesh() else {}
     if "vertex_positions" not in params or not len(params["faces"]):
         return np.zeros(1)
-    return _reaches_of_triangles(params["vertex_positions"], params["faces"])
+    found = _reaches_of_triangles(params["vertex_positions"], params["faces"])
+    # Hits on ellipsoids tell the number of the ellipsoid, not that of the triangle.
+    return found.max(keepdims=True) if kind == mi.ShapeType.EllipsoidsMesh.value else found
 
 
 _WHOLE = {*_ROUND, mi.ShapeType.SDFGrid.value}
@@ -212,17 +214,8 @@ def _reaches_of_triangles(positions, faces) -> np.ndarray:
     a, b, c = (dr.gather(mi.Point3f, p, index) for index in dr.unravel(mi.Vector3u, mi.UInt32(faces)))
     edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
     n = dr.abs(dr.cross(b - a, c - a))
-    found = dr.max(n * edges) / dr.max(n)
+    found = dr.max(n / dr.max(n) * edges)
     return dr.select(dr.isfinite(found), found, 0).numpy().astype(np.float64)
-
-
-def _along(n, coordinates) -> np.ndarray:
-    """Coordinates, one row each, weighted by normals of any length; 0 where one of them is not finite."""
-    n = np.abs(n)
-    largest = n.max(-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        found = (n * coordinates).max(-1) / largest
-    return np.where(np.isfinite(found), found, 0)
 
 
 def _finite(x) -> float:
@@ -278,15 +271,16 @@ def end_point(a: Anchor, b: Anchor):
 
 def _early(back, b: Anchor):
     """The share of a ray's length, against the direction ``back``, in which it may meet the sphere or
-    cylinder of its end ``b`` already. 0 if it ends at the back of one so small that it would pass the front:
-    this is in its way."""
+    cylinder of its end ``b`` already. On the far side of one so small that the ray would pass its front this
+    is half the chord at most: the front is in the way, the open end of a cylinder is not."""
     dist = dr.norm(back)
     along = dr.dot(b.n, back)
+    curvature = dr.abs(b.curvature)
     # The error of t grows towards the outline, as 1 / cos.
     cos = dr.maximum(dr.abs(along) / dist, LEAST_COSINE)
-    early = (QUADRIC_ULPS * 2.0**-24) * dist * dr.abs(b.curvature) / cos
-    behind = (along * b.curvature < -2) & (dist * dr.abs(b.curvature) > FAR)
-    return dr.select(behind, 0, early)
+    early = (QUADRIC_ULPS * 2.0**-24) * dist * curvature / cos
+    behind = (along * b.curvature < -2) & (dist * curvature > FAR)
+    return dr.select(behind, dr.minimum(early, dr.abs(along) / (dist * dist * curvature)), early)
 
 
 def segment_to(a: Anchor, end, like) -> mi.Ray3f:

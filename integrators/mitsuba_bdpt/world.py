@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from . import bsdf
 from .emitters import Emitters
-from .objects import all_shapes
+from .objects import all_shapes, is_instance
 from .sensors import prepare
 
 
@@ -31,5 +31,5 @@ class World:
 
 def bsdfs(scene):
     """The BSDFs of all shapes, those of shape groups included; that of an instance is never met."""
-    found = [s.bsdf() for s in all_shapes(scene) if s.class_name() != "Instance"]
+    found = [s.bsdf() for s in all_shapes(scene) if not is_instance(s)]
     return [b for b in found if b is not None]
