@@ -482,15 +482,15 @@ def test_spheres_are_small_in_scenes_without_bounds(extent):
 
 
 def test_reach_of_triangles():
-    """Rationale: each triangle has its own; one vertex at infinity or of NaN spoils its triangles, not the
-    offset of rays on the others. Expected: the largest coordinate of an edge weighted by the normal, here 7
-    along x and z; 0 for triangles along the axes and those that are not finite."""
+    """Rationale: each triangle has its own; one vertex at infinity or of NaN, or one that does not exist,
+    spoils its triangles, not the offset of rays on the others. Expected: the largest coordinate of an edge
+    weighted by the normal, here 7 along x and z; 0 for triangles along the axes and those that are broken."""
 
-    def reach(*rows):
+    def reach(*rows, last=3):
         mesh = mi.Mesh("mesh", len(rows), 2)
         params = mi.traverse(mesh)
         params["vertex_positions"] = mi.Float(np.array(rows, np.float32).ravel())
-        params["faces"] = mi.UInt32([0, 1, 2, 0, 2, 3])
+        params["faces"] = mi.UInt32([0, 1, 2, 0, 2, last])
         params.update()
         return rays.reaches(mesh).tolist()
 
@@ -498,6 +498,7 @@ def test_reach_of_triangles():
     assert reach(*triangle, [97, 9, 0]) == [7, 0]
     assert reach(*triangle, [np.inf, 2, 0]) == [7, 0]
     assert reach(*triangle, [np.nan, 2, 0]) == [7, 0]
+    assert reach(*triangle, last=2_000_000_000) == [7, 0]
     assert reach([90, 0, 0], [97, 0, 0], [90, 3, 0], [80, 8, 0]) == [0, 0]
 
 

@@ -211,7 +211,10 @@ _WHOLE = {*_ROUND, mi.ShapeType.SDFGrid.value}
 
 def _reaches_of_triangles(positions, faces) -> np.ndarray:
     p = dr.unravel(mi.Point3f, mi.Float(positions))
-    a, b, c = (dr.gather(mi.Point3f, p, index) for index in dr.unravel(mi.Vector3u, mi.UInt32(faces)))
+    faces = dr.unravel(mi.Vector3u, mi.UInt32(faces))
+    # Some may name vertices that do not exist.
+    known = dr.all(faces < dr.width(p))
+    a, b, c = (dr.gather(mi.Point3f, p, index, known) for index in faces)
     edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
     n = dr.abs(dr.cross(b - a, c - a))
     found = dr.max(n / dr.max(n) * edges)
