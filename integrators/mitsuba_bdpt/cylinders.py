@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .objects import own_parameters
+from .objects import matrix_of
 
 
 def check_not_mirrored(shape, owner: str):
@@ -14,8 +14,7 @@ def check_not_mirrored(shape, owner: str):
     call lets the light out and the other in."""
     if shape.shape_type() != mi.ShapeType.Cylinder.value:
         return
-    matrix = np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-    if np.linalg.det(matrix[:3, :3]) < 0:
+    if np.linalg.det(matrix_of(shape)[:3, :3]) < 0:
         raise ValueError(
             f"bdpt: {owner} is on a cylinder ('{shape.id()}') whose to_world mirrors it, which turns the "
             "normals of half of Mitsuba's calls; leave out the negative scale (flip_normals turns normals)"

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .cylinders import check_not_mirrored
-from .objects import all_shapes, children, number, own_parameters
+from .objects import all_shapes, children, matrix_of, number, own_parameters
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
 # direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
@@ -209,8 +209,7 @@ def check_angles(emitter):
 
 
 def _columns(emitter):
-    matrix = own_parameters(emitter)["to_world"].matrix
-    return np.array(matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+    return matrix_of(emitter)[:3, :3]
 
 
 def _lengths(columns) -> str:

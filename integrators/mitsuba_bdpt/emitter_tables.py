@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_angles, is_textured
-from .objects import children, own_parameters
+from .objects import children, matrix_of, own_parameters
 from .spheres import Sphere, is_small
 
 
@@ -134,8 +134,7 @@ class _Projector:
 
     def __init__(self, emitter):
         check_angles(emitter)
-        to_world = own_parameters(emitter)["to_world"]
-        matrix = np.array(to_world.matrix, dtype=np.float64).reshape(4, 4)
+        matrix = matrix_of(emitter)
         probes = matrix @ np.array([[0, 0, 1, 1], [1, 0, 1, 1], [0, 1, 1, 1]], dtype=np.float64).T
         it = dr.zeros(mi.Interaction3f, 3)
         it.p = mi.Point3f(*(mi.Float(row.tolist()) for row in probes[:3]))

@@ -8,6 +8,7 @@ from functools import cache
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 
 def number(x) -> float:
@@ -96,6 +97,11 @@ def own_parameters(owner) -> dict:
         for name, value in found.items()
         if value is not None and not isinstance(value, mi.Object)
     }
+
+
+def matrix_of(owner) -> np.ndarray:
+    """The matrix of the parameter ``to_world`` of ``owner``: (4, 4), in double precision."""
+    return np.array(own_parameters(owner)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
 
 
 def share_functions(owners):

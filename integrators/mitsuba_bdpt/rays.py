@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import grouped_shapes, is_instance, number, own_parameters
+from .objects import grouped_shapes, is_instance, matrix_of, number, own_parameters
 
 # Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
 # cylinders), whether they are as large as the distances to them or 10^6 times larger.
@@ -143,7 +143,7 @@ def _curvatures(shape, grouped, extent) -> tuple[float, float]:
     ``ends`` of shapes in groups."""
     kind = shape.shape_type()
     if kind in _ROUND:
-        matrix = _matrix(shape)
+        matrix = matrix_of(shape)
         # Across the axis of a cylinder, and of a sphere whatever the axis.
         inverse = 1 / max(float(np.linalg.norm(matrix[:3, 0])), 1e-30)
         far = not inverse * extent <= FAR  # the extent may be NaN
@@ -170,13 +170,9 @@ def _outward(shape, matrix) -> float:
     return 1.0 if number(dr.dot(si.n, d)) >= 0 else -1.0
 
 
-def _matrix(shape) -> np.ndarray:
-    return np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-
-
 def _stretch(shape) -> np.ndarray:
     """By how much ``to_world`` stretches lengths, the largest first; zeros if it is not finite."""
-    linear = _matrix(shape)[:3, :3]
+    linear = matrix_of(shape)[:3, :3]
     return np.linalg.svd(linear, compute_uv=False) if np.isfinite(linear).all() else np.zeros(3)
 
 
@@ -192,7 +188,7 @@ def reaches(shape) -> np.ndarray:
     if is_instance(shape):
         return np.array([_reach_within(shape)])
     if kind == mi.ShapeType.Rectangle.value:
-        matrix = _matrix(shape)
+        matrix = matrix_of(shape)
         corner = np.abs(matrix[:3, 3]) + np.abs(matrix[:3, :2]).sum(1)
         n = np.abs(np.cross(matrix[:3, 0], matrix[:3, 1]))
         return np.array([_finite((n / n.max() * corner).max())])
@@ -227,7 +223,7 @@ def _finite(x) -> float:
 
 
 def _reach_within(instance) -> float:
-    matrix, box = _matrix(instance), instance.bbox()
+    matrix, box = matrix_of(instance), instance.bbox()
     corners = np.array([[x, y, z, 1] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
     low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
     corners[:, :3] = low + corners[:, :3] * (high - low)

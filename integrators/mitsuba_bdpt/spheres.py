@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import number, own_parameters
+from .objects import matrix_of, number
 
 # Square of the sine of the half angle of cones below which `cone_density` is asked. Above, the rounding of
 # the cosine, 2^-24, puts Mitsuba's own density off by 1.2e-4 at most.
@@ -31,7 +31,7 @@ class Sphere:
         """Of a shape of Mitsuba's; None if it is not a sphere."""
         if shape.shape_type() != mi.ShapeType.Sphere.value:
             return None
-        matrix = np.array(own_parameters(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        matrix = matrix_of(shape)
         radius = float(np.sqrt(number(shape.surface_area()) / (4 * np.pi)))
         # The point may be rounded to the center, and Mitsuba's normal is not turned with it: it is the local
         # one, or its opposite.
