@@ -60,6 +60,11 @@ POOL_WAVES = np.array(
 RING_INNER, RING_OUTER, RING_HEIGHT = 0.88, 1.0, 0.34  # the ring of ring_caustic
 MIRROR_RIM = 3.0  # radius of the headlight's mirror, in focal lengths
 
+# The pebble of small_casters: rows and sides (9,900 triangles), and its bumps: amplitude, waves from pole to
+# pole, waves around the axis.
+PEBBLE_ROWS, PEBBLE_SIDES = 50, 101
+PEBBLE_BUMPS = ((0.10, 2, 3), (0.06, 5, 2), (0.03, 7, 6))
+
 
 def egg_profile(rows):
     """Height, radius and outward normal (in the profile's plane) of the egg at `rows` + 1 angles.
@@ -215,6 +220,37 @@ def headlight_mirror():
     return revolve(0.25 * radius**2, radius, -slope / size, 1.0 / size, sides=64)
 
 
+def pebble():
+    """A bumpy ball of radius about 1: rho(theta, phi) with analytic normals."""
+    theta = np.linspace(0.0, np.pi, PEBBLE_ROWS + 1)[1:-1, None]
+    phi = np.linspace(0.0, 2.0 * np.pi, PEBBLE_SIDES, endpoint=False)[None]
+    sin, cos = np.sin(theta), np.cos(theta)
+    rho, d_theta, d_phi = np.ones(np.broadcast(theta, phi).shape), 0.0, 0.0
+    for amplitude, down, around in PEBBLE_BUMPS:
+        # sin^2 theta: smooth at the poles, where all phi meet.
+        wave, angle = np.cos(down * theta + around * phi), down * theta + around * phi
+        rho = rho + amplitude * sin**2 * wave
+        d_theta = d_theta + amplitude * (2 * sin * cos * wave - down * sin**2 * np.sin(angle))
+        d_phi = d_phi - amplitude * around * sin**2 * np.sin(angle)
+    radial = np.stack(np.broadcast_arrays(sin * np.sin(phi), cos, sin * np.cos(phi)), axis=-1)
+    along = np.stack(np.broadcast_arrays(cos * np.sin(phi), -sin, cos * np.cos(phi)), axis=-1)
+    across = np.stack(np.broadcast_arrays(np.cos(phi), 0.0, -np.sin(phi)), axis=-1)
+    normals = rho[..., None] * radial - d_theta[..., None] * along - (d_phi / sin)[..., None] * across
+    poles = np.array([(0.0, 1.0, 0.0), (0.0, -1.0, 0.0)])
+    vertices = np.vstack([(rho[..., None] * radial).reshape(-1, 3), poles])
+    normals = np.vstack([normals.reshape(-1, 3), poles])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    rows, sides = PEBBLE_ROWS - 1, PEBBLE_SIDES
+    row, column = np.divmod(np.arange((rows - 1) * sides), sides)
+    a, b = row * sides + column, row * sides + (column + 1) % sides
+    i, j = np.arange(sides), (np.arange(sides) + 1) % sides
+    top, bottom, last = np.full(sides, rows * sides), np.full(sides, rows * sides + 1), (rows - 1) * sides
+    parts = [(a, a + sides, b + sides), (a, b + sides, b), (top, i, j), (bottom, last + j, last + i)]
+    faces = np.concatenate([np.stack(part, axis=1) for part in parts])
+    return vertices, normals, faces.astype(np.int32)
+
+
 def write_ply(path, vertices, normals, faces):
     """Binary little-endian PLY with float32 vertices and, unless None, normals."""
     names = ["x", "y", "z"] + ([] if normals is None else ["nx", "ny", "nz"])
@@ -238,6 +274,7 @@ MESHES = {
     "pool_water": pool_water,
     "ring": ring,
     "headlight_mirror": headlight_mirror,
+    "pebble": pebble,
 }
 
 

@@ -56,7 +56,25 @@ def slide():
     return image
 
 
-TEXTURES = {"sky_with_sun": sky_with_sun, "slide": slide}
+# The floor of small_casters: planks in rows, each of a brown of its own, with grain.
+FLOOR_SIZE, PLANK = 128, (8, 32)  # texels; rows and columns of a plank
+PALE, DARK = np.array((0.62, 0.45, 0.28)), np.array((0.22, 0.13, 0.07))
+
+
+def planks():
+    """A wooden floor: planks in shifted rows, with grain along them."""
+    random = np.random.Generator(np.random.PCG64(7))
+    rows, columns = np.indices((FLOOR_SIZE, FLOOR_SIZE))
+    row = rows // PLANK[0]
+    plank = (columns + 13 * row) % FLOOR_SIZE // PLANK[1]
+    shade = random.random((FLOOR_SIZE // PLANK[0], FLOOR_SIZE // PLANK[1]))[row, plank]
+    grain = np.repeat(random.random((FLOOR_SIZE, FLOOR_SIZE // 8)), 8, axis=1)
+    part = 0.75 * shade + 0.25 * grain
+    part[(rows % PLANK[0] == 0) | ((columns + 13 * row) % PLANK[1] == 0)] = 1.0
+    return PALE + (DARK - PALE) * part[..., None]
+
+
+TEXTURES = {"sky_with_sun": sky_with_sun, "slide": slide, "planks": planks}
 
 
 def make_all(folder=FOLDER):

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .pilot import WEIGHTINGS, Moments
+from .moments import Moments
+from .pilot import WEIGHTINGS
 from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
@@ -332,8 +333,8 @@ def cost(candidate: Candidate, rays: dict) -> float:
 def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> list[Choice]:
     """The ``possible`` candidates, the best first; ``stratified``: whether points will be better than
     independent ones, see `STRATIFIED_SPLATS` and `DIRECT_GAIN`."""
-    factor = STRATIFIED_SPLATS if stratified else 1.0
-    drawn, every = moments.variance(_trimmed_mean(moments.draw), factor), moments.variance(0, factor)
+    drawn = moments.variance(_trimmed_mean(moments.draw), stratified)
+    every = moments.variance(0, stratified)
     parts = np.stack(
         [(drawn if c.connections == "one" else every)[:, :, c.weighting] for c in possible], axis=1
     )
@@ -366,16 +367,19 @@ def _trimmed_mean(draw):
 
 
 def _robust_mean(values):
-    """Mean over the groups (rows) without the quarter of them that is worst even for the candidate (column)
-    that suffers least there: an outlier that no candidate does anything about hides how they differ. (What
-    only some suffer from, such as path tracing from a caustic, has to count.)"""
+    """Mean over the groups (rows), of which the worst quarter counts as much as the next one: each is scaled
+    down until the candidate (column) that suffers least there does so. An outlier that no candidate does
+    anything about would hide how they differ; what only some suffer from, such as path tracing from a caustic,
+    has to count."""
     finite = np.isfinite(values).all(axis=0)
     if not finite.any():
         return values.mean(axis=0)
     values = np.where(finite, values, np.inf)  # losing light in one group is losing light
     usual = values[:, finite] / np.maximum(np.median(values[:, finite], axis=0), LEAST_VARIANCE)
-    order = np.argsort(usual.min(axis=1), kind="stable")
-    return values[order[: len(order) * 3 // 4]].mean(axis=0)
+    least = usual.min(axis=1)
+    most = np.sort(least)[len(least) * 3 // 4 - 1]
+    scale = np.where(least > most, most / np.where(least > most, least, 1), 1)
+    return (values * scale[:, None]).mean(axis=0)
 
 
 def replayed(decision: Decision) -> list[dict]:

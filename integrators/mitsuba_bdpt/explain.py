@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from .choice import STRATIFIED_SPLATS
 from .plan import Plan, Settings, lost_paths
 
 
@@ -54,8 +53,8 @@ def _pilot(settings: Settings, table) -> list[str]:
     if not table:
         return []
     lines = [
-        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, that "
-        f"of splats times {STRATIFIED_SPLATS:g} where the points are stratified):"
+        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, with what "
+        "points take off it):"
     ]
     shown = set()
     for row in table:

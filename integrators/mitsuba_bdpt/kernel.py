@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import bsdf, connect, mis, rays, sobol
+from .moments import NET, NETS
 from .plan import MAX_STORED, UNLIMITED
 from .points import Points, Purpose
 from .subpath import Side, Walk, random_walk
@@ -67,14 +68,30 @@ class Shared:
 @dataclass(frozen=True)
 class Batch:
     """The samples of one pass: pixels ``first_pixel`` and on, ``pixels`` of them (row by row in
-    the film region), samples ``first_sample`` and on, ``samples`` of each pixel. With ``spread`` the pixels
-    are not neighbours, but one by chance in each of equal parts of the first so many."""
+    the film region), samples ``first_sample`` and on, ``samples`` of each pixel.
+
+    With ``spread``, for pilots, the pixels are not neighbours, but one by chance in each of equal parts of the
+    first so many, and samples are independent of each other. Then come those of ``nets`` other pixels chosen
+    like that, `moments.NETS` of `moments.NET` samples each, which are points of a sequence of their own; and so
+    many times ``light`` as there are camera samples light subpaths."""
 
     first_pixel: int
     pixels: int
     first_sample: int
     samples: int
     spread: int = 0
+    nets: int = 0
+    light: int = 1
+
+    @property
+    def lanes(self) -> int:
+        """Number of light subpaths of a pilot."""
+        return self.size * self.light
+
+    @property
+    def size(self) -> int:
+        """Number of camera samples."""
+        return self.pixels * self.samples + self.nets * NETS * NET
 
 
 class Kernel:
@@ -125,7 +142,8 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
     after the other); nothing is evaluated yet."""
     total, lanes = _size(kernel, batch)
-    kernel = kernel.bound(points, lanes / total)  # exact also where S does not divide the batch
+    # Exact also where S does not divide the batch; a pilot's estimates are those of one light subpath.
+    kernel = kernel.bound(points, 1.0 if batch.spread else lanes / total)
     lane = dr.arange(mi.UInt32, lanes)
     common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), lane)
 
@@ -160,8 +178,7 @@ def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
 
 def _size(kernel, batch: Batch) -> tuple[int, int]:
     """Number of camera samples in a batch, and of lanes."""
-    total = batch.pixels * batch.samples
-    return total, -(-total // kernel.plan.served)
+    return batch.size, -(-batch.lanes // kernel.plan.served)
 
 
 def _begin(kernel, sink, place: _Places, lane):
@@ -200,24 +217,38 @@ class _Places:
     def __init__(self, kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
-        spread = batch.spread > batch.pixels
-        self._spread = dr.opaque(mi.UInt64, batch.spread) if spread else None
+        self._pilot = batch.spread > 0
+        if self._pilot:
+            self._spread = dr.opaque(mi.UInt64, batch.spread)
+            self._first_net = dr.opaque(mi.UInt32, batch.pixels * batch.samples)
+            self._nets = dr.opaque(mi.UInt64, max(batch.nets, 1))
         self._pixels = dr.opaque(mi.UInt64, batch.pixels)
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
         self._spp = dr.opaque(mi.UInt64, spp)
 
     def _split(self, slot):
+        if self._pilot:
+            return self._split_of_pilot(slot)
         pixel = slot // self._samples
-        sample = slot - pixel * self._samples + self._first_sample
-        if self._spread is not None:  # by chance: one in so many would miss columns of films that wide
-            within = mi.UInt64(sobol.mix(pixel + 1)) % self._spread
-            pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // self._pixels)
+        return pixel + self._first_pixel, slot - pixel * self._samples + self._first_sample
+
+    def _split_of_pilot(self, slot):
+        in_net = slot >= self._first_net
+        after = slot - self._first_net
+        pixel = dr.select(in_net, after // (NETS * NET), slot // self._samples)
+        sample = dr.select(in_net, after % (NETS * NET), slot % self._samples)
+        parts = dr.select(in_net, self._nets, self._pixels)
+        # By chance: one in so many would miss columns of films that wide.
+        hashed = sobol.mix(dr.select(in_net, ~pixel, pixel + 1))
+        within = mi.UInt64(hashed) % self._spread
+        pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // parts)
         return pixel + self._first_pixel, sample
 
     def index(self, slot):
-        if self._spread is not None:  # two parts may meet in a pixel
-            return mi.UInt64(slot)
+        if self._pilot:  # each sample, or net, is of a sequence of its own
+            within = dr.select(slot >= self._first_net, (slot - self._first_net) % NET, 0)
+            return (mi.UInt64(slot - within) << 32) | mi.UInt64(within)
         pixel, sample = self._split(slot)
         return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)
 

@@ -15,8 +15,14 @@ all densities, and a candidate with counts n_i and coefficients kappa_i (E. Veac
 To the second moments come the products of different contributions within a camera sample, and off goes the
 squared mean of the pixel, estimated without bias from two independent samples of it. The samples use
 neither roulette on connections nor the draw of one connection; what the draw adds to the variance is known
-from the unshadowed contributions. Points that are better than independent ones lower the variance of all
-candidates; see `choice.STRATIFIED_SPLATS` for what that leaves to ask.
+from the unshadowed contributions.
+
+Points that are better than independent ones take off most of the variance of camera samples in smooth regions
+(to a hundredth under a sky), hardly any where a path is rarely found, and little of that of splats, which land
+in pixels by chance. How much is measured: a third of the samples lie in pairs of nets of one pixel, which give
+the variance of a net's mean beside that of its samples (`moments.Moments.gain`).
+
+All is relative to the brightness of the place: a splat in a shadow weighs as much as that pixel is dark.
 """
 
 from __future__ import annotations
@@ -27,15 +33,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import connect, mis
+from . import connect, mis, moments
 from .kernel import COUNTERS, Batch, Kernel, trace
+from .moments import FINE, GROUPS, NET, NETS, PER_PIXEL, Moments
 from .points import Points
-
-# Tiles of the image over which brightness and variance are averaged, in each direction.
-TILES = 8
-
-# Independent parts of the pilot, among which outliers are looked for.
-GROUPS = 16
 
 # A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
 # many as a sample of the pilot stands for: what a render is not likely to meet is missing from its image, not
@@ -44,13 +45,21 @@ GROUPS = 16
 RAREST = 1024
 
 # The square of what a weighting cannot make counts so many times in its moments, and one whose relative
-# variance comes out beyond the other number is ruled out: it misses a millionth of a pixel or more. (Any
+# variance comes out beyond `moments.RULED_OUT` is ruled out: it misses a millionth of a pixel or more. (Any
 # miss must not do so: between points of one plane rounding leaves cosines of 1e-20, contributions of 1e-40,
 # and densities that single precision takes for 0.)
-LOST, RULED_OUT = 1e30, 1e15
+LOST = 1e30
 
-# Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
-PER_PIXEL = 2
+# A pilot's samples in nets are one in so many.
+NET_SHARE = 3
+
+# Light subpaths for each camera sample of a pilot, most of them without one: they are cheap, and few of them meet
+# a small thing that casts a caustic (of 4,096 from a lamp over a small glass cube, about six).
+LIGHT_TIMES = 4
+
+# Paths of light tracing that camera subpaths make less than once in so many times as the pilot are too rare for
+# points to help: fewer than one falls into a net.
+SELDOM = 16
 
 
 @dataclass(frozen=True)
@@ -81,6 +90,10 @@ WEIGHTINGS = (
 _USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
 
 
+# Of `kernel.COUNTERS`, what light subpaths count alone.
+_OF_LIGHT = ("light", "shadow_t1")
+
+
 def _even(n: int) -> int:
     return n + n % 2
 
@@ -95,59 +108,29 @@ _PARTS = {
     "draw": _USERS["inner"],
 }
 _COLUMNS = _even(sum(_PARTS.values()) + 2)
-# The size of splats, and their second moments without and by t <= 1.
-_SPLAT_COLUMNS = _even(1 + _PARTS["moment"] + _PARTS["light"])
-
-
-@dataclass(frozen=True)
-class Moments:
-    """What a pilot found, in units of the image's relative squared error per sample and pixel.
-
-    ``base``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): variance is ``base`` + S
-    ``light``, plus ``draw`` where one inner connection is drawn. ``mean`` of the image (mean of the
-    colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
-    ``rays`` and connections per camera sample and kind, with one light subpath each; ``lanes``: number of
-    camera samples.
-    """
-
-    base: np.ndarray
-    light: np.ndarray
-    draw: np.ndarray
-    mean: float
-    rays: dict
-    lanes: int
-
-    def variance(self, draw, factor: float = 1.0) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, ``draw``
-        (`Moments.draw`, or 0 for all connections) included, and what grows with it, that of splats. This
-        counts by ``factor``, for points that lower it less."""
-        return np.stack([self.base + draw, factor * self.light], axis=1)
-
-    def joined(self, other: Moments) -> Moments:
-        """This pilot and another, of which each counts by its number of ``lanes``."""
-        share = self.lanes / (self.lanes + other.lanes)
-
-        def mean(a, b):
-            return share * a + (1 - share) * b
-
-        return Moments(
-            **{n: mean(getattr(self, n), getattr(other, n)) for n in ("base", "light", "draw", "mean")},
-            rays={n: mean(self.rays[n], other.rays[n]) for n in self.rays},
-            lanes=self.lanes + other.lanes,
-        )
+# The size of splats, their second moments without t <= 1, those of them that are rare (see `SELDOM`), and
+# their second moments by t <= 1.
+_SPLAT_PARTS = {
+    "size": 1,
+    "moment": len(WEIGHTINGS),
+    "rare": len(WEIGHTINGS),
+    "light": _USERS["light"],
+}
+_SPLAT_COLUMNS = _even(sum(_SPLAT_PARTS.values()))
 
 
 class Pilot:
-    """Sink (see `sinks`) of a pilot's contributions: ``lanes`` samples, of which each `PER_PIXEL` that follow
-    one another are of the same pixel."""
+    """Sink (see `sinks`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
+    follow one another each `PER_PIXEL` are of the same pixel, in nets each `moments.NETS` times `moments.NET`."""
 
     alpha = False
 
-    def __init__(self, region, lanes: int, rarest: float):
-        self._region, self._lanes = region, lanes
+    def __init__(self, region, batch: Batch, rarest: float):
+        self._region, self._lanes = region, batch.lanes
+        self._first_net = batch.pixels * batch.samples
         self._least = dr.opaque(mi.Float64, 1 / rarest)
-        self._samples = dr.zeros(mi.Float64, lanes * _COLUMNS)
-        self._splats = dr.zeros(mi.Float64, GROUPS * TILES**2 * _SPLAT_COLUMNS)
+        self._samples = dr.zeros(mi.Float64, batch.size * _COLUMNS)
+        self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * _SPLAT_COLUMNS)
         dr.make_opaque(self._samples, self._splats)
 
     def begin(self):
@@ -156,16 +139,16 @@ class Pilot:
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2."""
-        own, moments = self._parts(self._size(c), c)
-        new = {"estimate": own, **moments}
+        own, squares = self._parts(self._size(c), c)
+        new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
     def connect(self, kernel, z, lane, stream, counters, total, start):
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c, visible, total):
-            own, moments = self._parts(self._size(c), c)
-            seen = {"visible": own, **moments}
+            own, squares = self._parts(self._size(c), c)
+            seen = {"visible": own, **squares}
             new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
             return {name: _sums(total[name], more) for name, more in new.items()}
 
@@ -184,9 +167,11 @@ class Pilot:
     def splat(self, kernel, c, position, shared, counters):
         """Add a contribution with t <= 1."""
         size = self._size(c)
-        row = self._group(dr.arange(mi.UInt32, self._lanes)) * TILES**2 + self._tile(position)
-        _, moments = self._parts(size, c)
-        _add(self._splats, _SPLAT_COLUMNS, [size, *moments["moment"], *moments["light"]], row, size > 0)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(position)
+        _, found = self._parts(size, c)
+        found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
+        columns = [x for name in _SPLAT_PARTS for x in found[name]]
+        _add(self._splats, _SPLAT_COLUMNS, columns, row, size > 0)
 
     def end(self, kernel, lane, sample, total, seen, counters):
         """Add a camera sample."""
@@ -201,51 +186,28 @@ class Pilot:
 
     def moments(self, counts: dict) -> Moments:
         """What was found; ``counts`` what the lanes counted."""
-        lanes = self._lanes
-        samples = np.array(self._samples).reshape(lanes, _COLUMNS)
-        splats = np.array(self._splats).reshape(GROUPS, TILES**2, _SPLAT_COLUMNS)
+        rows = np.array(self._samples).reshape(-1, _COLUMNS)
         ends = np.cumsum([*_PARTS.values(), 2]).tolist()
-        estimate, moment, light, draw, rest = np.split(samples[:, : ends[-1]], ends[:-1], axis=1)
-        joined, tiles = rest[:, 0], rest[:, 1].astype(int)
-        other = estimate.reshape(-1, PER_PIXEL, len(WEIGHTINGS))[:, ::-1].reshape(lanes, -1)
-        group = self._group(np.arange(lanes))
-        # Camera samples over those of the tile, splats over the samples of an average tile.
-        in_tile = np.maximum(np.bincount(tiles, minlength=TILES**2), 1)
-        brightness = np.bincount(tiles, estimate[:, -1], TILES**2) / in_tile
-        brightness += splats[:, :, 0].sum(axis=0) * (TILES**2 / lanes)
-        by_group = np.bincount(group, estimate[:, -1], GROUPS) + splats[:, :, 0].sum(axis=1)
-        norm = brightness**2 + 0.01 * brightness.mean() ** 2
-        norm = np.where(norm > 0, norm, np.inf)
-
-        whole = -(-lanes // (GROUPS * PER_PIXEL)) * GROUPS * PER_PIXEL
-
-        def summed(values, of_splats=None):
-            """By group, one column per weighting: those that have no use for ``values`` come first."""
-            weighted = np.zeros((whole, values.shape[1]))
-            weighted[:lanes] = values / norm[tiles][:, None]
-            total = weighted.reshape(-1, GROUPS, PER_PIXEL, values.shape[1]).sum(axis=(0, 2))  # see `_group`
-            if of_splats is not None:
-                total += (of_splats / norm[:, None]).sum(axis=1)
-            return np.pad(total, ((0, 0), (len(WEIGHTINGS) - total.shape[1], 0))) * (GROUPS / lanes)
-
-        end = 1 + _PARTS["moment"]
-        base = summed(estimate**2 + moment - estimate * other, splats[:, :, 1:end])
-        return Moments(
-            base=np.where(base < RULED_OUT, base, np.inf),
-            light=summed(light, splats[:, :, end : end + _PARTS["light"]]),
-            draw=summed(draw),
-            mean=float(np.median(by_group) * GROUPS / lanes),
-            rays={name: count / lanes for name, count in counts.items()} | {"joined": joined.mean()},
-            lanes=lanes,
+        columns = np.split(rows[:, : ends[-1]], ends[:-1], axis=1)
+        joined, tiles = columns.pop().T
+        columns.append(tiles.astype(int))
+        independent, nets = (
+            moments.Samples(*(column[part] for column in columns))
+            for part in (slice(self._first_net), slice(self._first_net, None))
         )
+        splats = np.array(self._splats).reshape(GROUPS, FINE**2, _SPLAT_COLUMNS)
+        ends = np.cumsum(list(_SPLAT_PARTS.values())).tolist()
+        splats = moments.Splats(*np.split(splats[..., : ends[-1]] / self._lanes, ends[:-1], axis=2))
+        rays = {name: count / self._lanes if name in _OF_LIGHT else count / len(rows) for name, count in counts.items()}
+        rays["joined"] = joined.mean()
+        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
     def _parts(self, size, c):
         """A contribution ``c`` of this weighted ``size``: its estimates, of the weightings that have its
         class, and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
-        # Where there is nothing, shares may be 0 / 0.
-        shares = dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
+        shares = _shares(size, c)
         lost = LOST * dr.square(size)
-        own, moments, lights = [], [], []
+        own, squares, lights = [], [], []
         for w in WEIGHTINGS:
             total = _dot(w, shares, 1)
             # With inner connections every class is in use; what cannot make the path is ruled out.
@@ -260,10 +222,19 @@ class Pilot:
                 own.append(estimate)
                 if c.kind != "light":
                     moment -= dr.square(estimate)
-            moments.append(moment)
+            squares.append(moment)
             if w.light:
                 lights.append(dr.select(possible, square * (w.light**2 * shares["light"]), 0))
-        return own, {"moment": moments, "light": lights}
+        return own, {"moment": squares, "light": lights}
+
+    def _rare(self, size, c, squares) -> list:
+        """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that camera
+        subpaths make too rarely for points to help, see `SELDOM`."""
+        shares = _shares(size, c) | {"light": 0}
+        return [
+            square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 1)))
+            for w, square in zip(WEIGHTINGS, squares, strict=True)
+        ]
 
     def _size(self, c):
         """Weighted size of a contribution that counts, in double precision: its square, in any unit of
@@ -275,13 +246,10 @@ class Pilot:
         """
         return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
 
-    def _group(self, lane):
-        return lane // PER_PIXEL % GROUPS
-
     def _tile(self, position):
         uv = dr.clip(self._region.to_uv(position), 0, 1)
-        xy = dr.minimum(mi.Point2u(uv * TILES), TILES - 1)
-        return xy.y * TILES + xy.x
+        xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
+        return xy.y * FINE + xy.x
 
 
 def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
@@ -298,12 +266,16 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
     kernel = Kernel(world, everything, settings, mis.ByClass())
     region = world.camera.region
     pixels = int(region.size.prod())
+    stratified = settings.points != "independent"
+    nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
+    lanes -= nets * NETS * NET
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
-    batch = Batch(0, chosen, 0, samples, spread=pixels)
-    pilot = Pilot(region, chosen * samples, max(stands_for, RAREST))
-    # Independent numbers: the squared mean follows from products of samples.
-    counts = trace(kernel, pilot, batch, Points("independent", seed), samples)
+    batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
+    pilot = Pilot(region, batch, max(stands_for, RAREST))
+    # What is not in nets are independent numbers: the squared mean follows from products of samples.
+    points = Points("sobol" if stratified else "independent", seed)
+    counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     return pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
 
@@ -313,6 +285,11 @@ def _add(target, columns: int, values, row, active):
     would evaluate what was recorded so far.)"""
     packet = mi.ArrayXd(values + [mi.Float64(0)] * (columns - len(values)))
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
+
+
+def _shares(size, c) -> dict:
+    """Shares of the classes in the sum of all densities; where there is nothing they may be 0 / 0."""
+    return dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
 
 
 def _mean_colour(c):

@@ -19,6 +19,7 @@ from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
 from .objects import nothing_freed, step_by_step
+from .moments import Moments
 from .parameters import check_film, check_scene, check_variant, integer
 from .passes import REPLICATES, Step, batches, schedule
 from .plan import Settings, lost_paths, plan
@@ -29,6 +30,9 @@ from .world import World
 
 # Kinds of rays in the statistics, of what the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
+
+# The arrays of a pilot's `Moments`.
+MOMENTS = ("base", "rare", "light", "draw", "gain")
 
 # Pilots have the sequences that follow this number, see `sequence_seed`, and images, after changes of the
 # decision, those that follow the other one.
@@ -366,7 +370,7 @@ class Render:
         moments = None
         if self._moments is not None:
             moments = {name: getattr(self._moments, name) for name in ("mean", "rays", "lanes")}
-            arrays |= {f"moments.{name}": getattr(self._moments, name) for name in ("base", "light", "draw")}
+            arrays |= {f"moments.{name}": getattr(self._moments, name) for name in MOMENTS}
         progress = {
             "whole": True,
             "decisions": [decision.record() for decision in self.decisions],
@@ -407,8 +411,8 @@ class Render:
             self._adopt(decision, progress["left_out"])
         self.accumulator.restore(snapshot.passes, arrays, progress["replicates"])
         if progress["moments"] and "moments.base" in arrays:
-            parts = {name: arrays[f"moments.{name}"] for name in ("base", "light", "draw")}
-            self._moments = pilot.Moments(**parts, **progress["moments"])
+            parts = {name: arrays[f"moments.{name}"] for name in MOMENTS}
+            self._moments = Moments(**parts, **progress["moments"])
         self._pilots, self._next_pilot = progress["pilots"]
         self._small_first, self._no_pilot = progress["small_first"], progress["no_pilot"]
         self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))

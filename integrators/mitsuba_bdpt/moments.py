@@ -1,0 +1,200 @@
+"""Statistics of a pilot: variances of every way to render, and what points take off them.
+
+Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. The equations are those of
+`pilot`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+# Tiles of the image in each direction: of those whose brightness is known by itself, and of the larger ones
+# that stand in for them as far as it is noise. (A caustic and its shadow are smaller than the larger ones: in
+# small_casters/point_sphere splats would seem an eighth as noisy as they are.)
+FINE, TILES = 32, 8
+
+# Independent parts of the pilot, among which outliers are looked for.
+GROUPS = 16
+
+# Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
+PER_PIXEL = 2
+
+# Points of a net of one pixel, and nets of a pixel: their means differ by what points leave of the variance.
+NET, NETS = 16, 2
+
+# A weighting whose relative variance comes out beyond this is ruled out, see `pilot.LOST`.
+RULED_OUT = 1e15
+
+# What points leave of the variance of splats, which land in pixels by chance: 0.4 to 1 in sixteen scenes,
+# that of rare paths excepted.
+SPLAT_GAIN = 0.8
+
+@dataclass(frozen=True)
+class Moments:
+    """What a pilot found, in units of the image's relative squared error per sample and pixel.
+
+    ``base``, ``rare``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): with independent numbers
+    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn; ``rare`` is that part
+    of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each weighting, is
+    what points leave of the rest of ``base``. ``mean`` of the image (mean of the colours, emitters seen
+    directly left out; the median of the groups', so that no outlier sets it); ``rays`` and connections per
+    camera sample and kind, with one light subpath each; ``lanes``: number of camera samples.
+    """
+
+    base: np.ndarray
+    rare: np.ndarray
+    light: np.ndarray
+    draw: np.ndarray
+    gain: np.ndarray
+    mean: float
+    rays: dict
+    lanes: int
+
+    def variance(self, draw, stratified: bool = False) -> np.ndarray:
+        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, ``draw``
+        (`Moments.draw`, or 0 for all connections) included, and what grows with it, that of splats; with
+        independent numbers, or with what ``stratified`` points leave of it."""
+        base, light = self.base, self.light
+        if stratified:
+            base, light = self.rare + self.gain * (base - self.rare), SPLAT_GAIN * light
+        return np.stack([base + draw, light], axis=1)
+
+    def joined(self, other: Moments) -> Moments:
+        """This pilot and another, of which each counts by its number of ``lanes``."""
+        share = self.lanes / (self.lanes + other.lanes)
+
+        def mean(a, b):
+            return share * a + (1 - share) * b
+
+        rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
+        means = {f.name: mean(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)[:6]}
+        return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Camera samples, one row each: the ``estimate`` of each weighting, sums of second moments (``moment``
+    without t <= 1, less the squares that are in the estimate, ``light`` by t <= 1), what drawing one connection
+    adds (``draw``), the fine ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in nets each
+    `NETS` times `NET`."""
+
+    estimate: np.ndarray
+    moment: np.ndarray
+    light: np.ndarray
+    draw: np.ndarray
+    tile: np.ndarray
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Splats per light subpath, by the group of the subpath and fine tile, shape (`GROUPS`, fine tiles, ...):
+    their ``size``, and second moments by weighting, as in `Samples`; ``rare`` that of ``moment`` which points do
+    not help."""
+
+    size: np.ndarray
+    moment: np.ndarray
+    rare: np.ndarray
+    light: np.ndarray
+
+
+def group(lane):
+    """The independent part to which a sample belongs: of one pixel all are in the same."""
+    return lane // PER_PIXEL % GROUPS
+
+
+def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) -> Moments:
+    """The moments of a pilot of independent ``samples``, and ``nets``, with the ``splats`` of a light subpath
+    per camera sample; ``rays`` per camera sample."""
+    lanes = len(samples.tile)
+    norm = _norm(samples, splats.size[..., 0].sum(axis=0))
+    width = samples.estimate.shape[1]
+
+    def summed(values, of_splats=None):
+        """By group, one column per weighting: those that have no use for ``values`` come first."""
+        total = np.zeros((GROUPS, width))
+        if values is not None:
+            total = _by_group(values / norm[samples.tile][:, None]) * (GROUPS / lanes)
+        if of_splats is not None:
+            total = total + (of_splats / norm[:, None]).sum(axis=1) * GROUPS
+        return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
+
+    estimate = samples.estimate
+    base = summed(estimate**2 + samples.moment - estimate * _other(estimate), splats.moment)
+    by_group = _by_group(estimate[:, -1:])[:, 0] / lanes + splats.size.sum(axis=(1, 2))
+    return Moments(
+        base=np.where(base < RULED_OUT, base, np.inf),
+        rare=summed(None, splats.rare),
+        light=summed(samples.light, splats.light),
+        draw=summed(samples.draw),
+        gain=_gain(nets.estimate, norm[nets.tile]) if nets else np.ones(width),
+        mean=float(np.median(by_group) * GROUPS),
+        rays=rays,
+        lanes=lanes + (len(nets.tile) if nets else 0),
+    )
+
+
+def _other(estimate):
+    """For each sample another one of its pixel."""
+    return estimate.reshape(-1, PER_PIXEL, estimate.shape[1])[:, ::-1].reshape(estimate.shape)
+
+
+def _by_group(values):
+    """Sums of the samples' ``values`` by group, shape (`GROUPS`, columns)."""
+    whole = -(-len(values) // (GROUPS * PER_PIXEL)) * GROUPS * PER_PIXEL
+    padded = np.zeros((whole, values.shape[1]))
+    padded[: len(values)] = values
+    return padded.reshape(-1, GROUPS, PER_PIXEL, values.shape[1]).sum(axis=(0, 2))  # see `group`
+
+
+def _norm(samples: Samples, splats):
+    """What squared errors are divided by, of each fine tile: the squared brightness, and a hundredth of that of
+    the image, as relMSE has it. ``splats``: what they bring to each tile, as a share of a whole image's."""
+    last = samples.estimate[:, -1]
+    counts = np.bincount(samples.tile, minlength=FINE**2).reshape(FINE, FINE).astype(float)
+    sums = np.bincount(samples.tile, last, FINE**2).reshape(FINE, FINE)
+    splats = splats.reshape(FINE, FINE) * FINE**2  # radiance
+    many = FINE // TILES
+
+    def over_blocks(values):
+        blocks = values.reshape(TILES, many, TILES, many).sum(axis=(1, 3))
+        return np.kron(blocks, np.ones((many, many)))
+
+    coarse = over_blocks(sums) / np.maximum(over_blocks(counts), 1) + over_blocks(splats) / many**2
+    floor = 0.01 * coarse.mean() ** 2
+    # A tile's own brightness is worth as many samples of the larger one as it has noise.
+    square = last**2 + samples.moment[:, -1] - last * _other(samples.estimate)[:, -1]
+    first = (coarse**2 + floor).ravel()[samples.tile]
+    noise = np.sum(square / np.where(first > 0, first, np.inf)) / len(last)
+    near = _with_neighbours(counts)
+    own = _with_neighbours(sums) / np.maximum(near, 1)
+    own += _with_neighbours(splats) / _with_neighbours(np.ones_like(splats))
+    least = 2 * max(noise, 1e-3)
+    brightness = (near * own + least * coarse) / (near + least)
+    norm = brightness**2 + floor
+    return np.where(norm > 0, norm, np.inf).ravel()
+
+
+def _with_neighbours(values):
+    """Sums over squares of 3 x 3 tiles."""
+    padded = np.pad(values, 1)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+
+
+def _gain(estimate, norm):
+    """Variance of a sample among points of a net over that of an independent one, by weighting; 1 at most.
+
+    ``estimate`` of the samples in nets, ``norm`` of their places. The square of the difference of two nets'
+    means is twice the variance of such a mean, without bias; so is the mean square of the samples less the
+    product of the two means the variance of a sample.
+    """
+    width = estimate.shape[1]
+    nets = estimate.reshape(-1, NETS, NET, width)
+    first, second = nets.mean(axis=2).transpose(1, 0, 2)
+    norm = norm.reshape(len(nets), -1)[:, :1]
+    alone = ((nets**2).mean(axis=(1, 2)) - first * second) / norm
+    within = NET * (first - second) ** 2 / 2 / norm
+    alone, within = alone.sum(axis=0), within.sum(axis=0)
+    return np.minimum(np.where(alone > 0, within / np.where(alone > 0, alone, 1), 1), 1)
