@@ -28,7 +28,7 @@ ORDER = (
     ("emitter_kinds", "spheres"),
     ("bsdf", "cylinders", "rays", "mis", "sobol"),
     ("objects",),
-    ("llvm", "files", "spread", "_version"),
+    ("llvm", "files", "spread", "moments", "_version"),
 )
 
 

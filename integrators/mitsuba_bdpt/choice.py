@@ -369,8 +369,8 @@ def _trimmed_mean(draw):
 def _robust_mean(values):
     """Mean over the groups (rows), of which the worst quarter counts as much as the next one: each is scaled
     down until the candidate (column) that suffers least there does so. An outlier that no candidate does
-    anything about would hide how they differ; what only some suffer from, such as path tracing from a caustic,
-    has to count."""
+    anything about would hide how they differ; what only some suffer from, such as path tracing from a
+    caustic, has to count."""
     finite = np.isfinite(values).all(axis=0)
     if not finite.any():
         return values.mean(axis=0)

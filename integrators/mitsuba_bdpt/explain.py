@@ -53,8 +53,8 @@ def _pilot(settings: Settings, table) -> list[str]:
     if not table:
         return []
     lines = [
-        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, with what "
-        "points take off it):"
+        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, with "
+        "what points take off it):"
     ]
     shown = set()
     for row in table:

@@ -31,16 +31,17 @@ RULED_OUT = 1e15
 # that of rare paths excepted.
 SPLAT_GAIN = 0.8
 
+
 @dataclass(frozen=True)
 class Moments:
     """What a pilot found, in units of the image's relative squared error per sample and pixel.
 
     ``base``, ``rare``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): with independent numbers
-    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn; ``rare`` is that part
-    of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each weighting, is
-    what points leave of the rest of ``base``. ``mean`` of the image (mean of the colours, emitters seen
-    directly left out; the median of the groups', so that no outlier sets it); ``rays`` and connections per
-    camera sample and kind, with one light subpath each; ``lanes``: number of camera samples.
+    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn; ``rare`` is that
+    part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
+    weighting, is what points leave of the rest of ``base``. ``mean`` of the image (mean of the colours,
+    emitters seen directly left out; the median of the groups', so that no outlier sets it); ``rays`` and
+    connections per camera sample and kind, with one light subpath each; ``lanes``: number of camera samples.
     """
 
     base: np.ndarray
@@ -76,9 +77,9 @@ class Moments:
 @dataclass(frozen=True)
 class Samples:
     """Camera samples, one row each: the ``estimate`` of each weighting, sums of second moments (``moment``
-    without t <= 1, less the squares that are in the estimate, ``light`` by t <= 1), what drawing one connection
-    adds (``draw``), the fine ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in nets each
-    `NETS` times `NET`."""
+    without t <= 1, less the squares that are in the estimate, ``light`` by t <= 1), what drawing one
+    connection adds (``draw``), the fine ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in
+    nets each `NETS` times `NET`."""
 
     estimate: np.ndarray
     moment: np.ndarray
@@ -86,17 +87,23 @@ class Samples:
     draw: np.ndarray
     tile: np.ndarray
 
+    def of(self, chosen) -> Samples:
+        """Those rows that the mask ``chosen`` says."""
+        return Samples(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
 
 @dataclass(frozen=True)
 class Splats:
-    """Splats per light subpath, by the group of the subpath and fine tile, shape (`GROUPS`, fine tiles, ...):
-    their ``size``, and second moments by weighting, as in `Samples`; ``rare`` that of ``moment`` which points do
-    not help."""
+    """Sums of the splats of so many ``lanes`` light subpaths, by the group of the subpath and fine tile,
+    shape (`GROUPS`, fine tiles, columns). Which columns are what: their ``size``, and second moments by
+    weighting, as in `Samples`; ``rare`` that of ``moment`` which points do not help."""
 
-    size: np.ndarray
-    moment: np.ndarray
-    rare: np.ndarray
-    light: np.ndarray
+    sums: np.ndarray
+    lanes: int
+    size: slice
+    moment: slice
+    rare: slice
+    light: slice
 
 
 def group(lane):
@@ -108,27 +115,36 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
     """The moments of a pilot of independent ``samples``, and ``nets``, with the ``splats`` of a light subpath
     per camera sample; ``rays`` per camera sample."""
     lanes = len(samples.tile)
-    norm = _norm(samples, splats.size[..., 0].sum(axis=0))
     width = samples.estimate.shape[1]
+    sizes = splats.sums[:, :, splats.size].sum(axis=2) / splats.lanes
+    groups = group(np.arange(lanes))
+    # Each half is judged by the brightness that the other has found: an outlier would hide itself.
+    halves = [
+        _norm(samples.of(groups % 2 != half), 2 * sizes[np.arange(GROUPS) % 2 != half].sum(axis=0))
+        for half in (0, 1)
+    ]
+    inverse = 1 / np.stack(halves)
+    of_group = inverse[np.arange(GROUPS) % 2][:, None]
+    weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
+    of_sample = inverse[groups % 2, samples.tile][:, None]
 
-    def summed(values, of_splats=None):
+    def summed(values, columns=slice(0)):
         """By group, one column per weighting: those that have no use for ``values`` come first."""
-        total = np.zeros((GROUPS, width))
+        total = weighted[:, columns]
         if values is not None:
-            total = _by_group(values / norm[samples.tile][:, None]) * (GROUPS / lanes)
-        if of_splats is not None:
-            total = total + (of_splats / norm[:, None]).sum(axis=1) * GROUPS
+            of_samples = _by_group(values * of_sample) * (GROUPS / lanes)
+            total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), splats.moment)
-    by_group = _by_group(estimate[:, -1:])[:, 0] / lanes + splats.size.sum(axis=(1, 2))
+    by_group = _by_group(estimate[:, -1:])[:, 0] / lanes + sizes.sum(axis=1)
     return Moments(
         base=np.where(base < RULED_OUT, base, np.inf),
         rare=summed(None, splats.rare),
         light=summed(samples.light, splats.light),
         draw=summed(samples.draw),
-        gain=_gain(nets.estimate, norm[nets.tile]) if nets else np.ones(width),
+        gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,
         lanes=lanes + (len(nets.tile) if nets else 0),
@@ -149,8 +165,9 @@ def _by_group(values):
 
 
 def _norm(samples: Samples, splats):
-    """What squared errors are divided by, of each fine tile: the squared brightness, and a hundredth of that of
-    the image, as relMSE has it. ``splats``: what they bring to each tile, as a share of a whole image's."""
+    """What squared errors are divided by, of each fine tile: the squared brightness, and a hundredth of that
+    of the image, as relMSE has it. ``splats``: what they bring to each tile, as a share of a whole
+    image's."""
     last = samples.estimate[:, -1]
     counts = np.bincount(samples.tile, minlength=FINE**2).reshape(FINE, FINE).astype(float)
     sums = np.bincount(samples.tile, last, FINE**2).reshape(FINE, FINE)
@@ -183,18 +200,18 @@ def _with_neighbours(values):
     return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
 
 
-def _gain(estimate, norm):
+def _gain(estimate, inverse):
     """Variance of a sample among points of a net over that of an independent one, by weighting; 1 at most.
 
-    ``estimate`` of the samples in nets, ``norm`` of their places. The square of the difference of two nets'
+    ``estimate`` of the samples in nets, ``inverse`` of the norm of their places. The square of the difference of two nets'
     means is twice the variance of such a mean, without bias; so is the mean square of the samples less the
     product of the two means the variance of a sample.
     """
     width = estimate.shape[1]
     nets = estimate.reshape(-1, NETS, NET, width)
     first, second = nets.mean(axis=2).transpose(1, 0, 2)
-    norm = norm.reshape(len(nets), -1)[:, :1]
-    alone = ((nets**2).mean(axis=(1, 2)) - first * second) / norm
-    within = NET * (first - second) ** 2 / 2 / norm
+    inverse = inverse.reshape(len(nets), -1)[:, :1]
+    alone = ((nets**2).mean(axis=(1, 2)) - first * second) * inverse
+    within = NET * (first - second) ** 2 / 2 * inverse
     alone, within = alone.sum(axis=0), within.sum(axis=0)
     return np.minimum(np.where(alone > 0, within / np.where(alone > 0, alone, 1), 1), 1)

@@ -18,9 +18,9 @@ neither roulette on connections nor the draw of one connection; what the draw ad
 from the unshadowed contributions.
 
 Points that are better than independent ones take off most of the variance of camera samples in smooth regions
-(to a hundredth under a sky), hardly any where a path is rarely found, and little of that of splats, which land
-in pixels by chance. How much is measured: a third of the samples lie in pairs of nets of one pixel, which give
-the variance of a net's mean beside that of its samples (`moments.Moments.gain`).
+(to a hundredth under a sky), hardly any where a path is rarely found, and little of that of splats, which
+land in pixels by chance. How much is measured: a third of the samples lie in pairs of nets of one pixel,
+which give the variance of a net's mean beside that of its samples (`moments.Moments.gain`).
 
 All is relative to the brightness of the place: a splat in a shadow weighs as much as that pixel is dark.
 """
@@ -53,12 +53,12 @@ LOST = 1e30
 # A pilot's samples in nets are one in so many.
 NET_SHARE = 3
 
-# Light subpaths for each camera sample of a pilot, most of them without one: they are cheap, and few of them meet
-# a small thing that casts a caustic (of 4,096 from a lamp over a small glass cube, about six).
+# Light subpaths for each camera sample of a pilot, most of them without one: they are cheap, and few of them
+# meet a small thing that casts a caustic (of 4,096 from a lamp over a small glass cube, about six).
 LIGHT_TIMES = 4
 
-# Paths of light tracing that camera subpaths make less than once in so many times as the pilot are too rare for
-# points to help: fewer than one falls into a net.
+# Paths of light tracing that camera subpaths make less than once in so many times as the pilot are too rare
+# for points to help: fewer than one falls into a net.
 SELDOM = 16
 
 
@@ -88,6 +88,12 @@ WEIGHTINGS = (
     *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
 )
 _USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
+
+
+def _slices(parts: dict) -> dict:
+    """Where the columns of each part are."""
+    ends = np.cumsum(list(parts.values())).tolist()
+    return {name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)}
 
 
 # Of `kernel.COUNTERS`, what light subpaths count alone.
@@ -121,7 +127,8 @@ _SPLAT_COLUMNS = _even(sum(_SPLAT_PARTS.values()))
 
 class Pilot:
     """Sink (see `sinks`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
-    follow one another each `PER_PIXEL` are of the same pixel, in nets each `moments.NETS` times `moments.NET`."""
+    follow one another each `PER_PIXEL` are of the same pixel, in nets each `moments.NETS` times
+    `moments.NET`."""
 
     alpha = False
 
@@ -187,18 +194,18 @@ class Pilot:
     def moments(self, counts: dict) -> Moments:
         """What was found; ``counts`` what the lanes counted."""
         rows = np.array(self._samples).reshape(-1, _COLUMNS)
-        ends = np.cumsum([*_PARTS.values(), 2]).tolist()
-        columns = np.split(rows[:, : ends[-1]], ends[:-1], axis=1)
-        joined, tiles = columns.pop().T
+        columns = [rows[:, part] for part in _slices(_PARTS).values()]
+        joined, tiles = rows[:, sum(_PARTS.values()) :][:, :2].T
         columns.append(tiles.astype(int))
         independent, nets = (
             moments.Samples(*(column[part] for column in columns))
             for part in (slice(self._first_net), slice(self._first_net, None))
         )
-        splats = np.array(self._splats).reshape(GROUPS, FINE**2, _SPLAT_COLUMNS)
-        ends = np.cumsum(list(_SPLAT_PARTS.values())).tolist()
-        splats = moments.Splats(*np.split(splats[..., : ends[-1]] / self._lanes, ends[:-1], axis=2))
-        rays = {name: count / self._lanes if name in _OF_LIGHT else count / len(rows) for name, count in counts.items()}
+        sums = np.array(self._splats).reshape(GROUPS, FINE**2, _SPLAT_COLUMNS)
+        splats = moments.Splats(sums, self._lanes, **_slices(_SPLAT_PARTS))
+        rays = {
+            name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
+        }
         rays["joined"] = joined.mean()
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
@@ -228,8 +235,8 @@ class Pilot:
         return own, {"moment": squares, "light": lights}
 
     def _rare(self, size, c, squares) -> list:
-        """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that camera
-        subpaths make too rarely for points to help, see `SELDOM`."""
+        """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that
+        camera subpaths make too rarely for points to help, see `SELDOM`."""
         shares = _shares(size, c) | {"light": 0}
         return [
             square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 1)))

@@ -18,8 +18,8 @@ from ._version import __version__
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
-from .objects import nothing_freed, step_by_step
 from .moments import Moments
+from .objects import nothing_freed, step_by_step
 from .parameters import check_film, check_scene, check_variant, integer
 from .passes import REPLICATES, Step, batches, schedule
 from .plan import Settings, lost_paths, plan
