@@ -152,10 +152,22 @@ def is_sampled_by_texture(emitter, kind: int) -> bool:
     finite all densities are NaN.)"""
     if not is_textured(emitter, kind) or emitter.get_shape().shape_type() not in _TEXTURE_SAMPLED:
         return False
+    if _is_sampled_from_behind(emitter):
+        return False
     try:
         return math.isfinite(number(children(emitter)["radiance"].mean()))
     except RuntimeError:  # a texture that knows no mean
         return True
+
+
+def _is_sampled_from_behind(emitter) -> bool:
+    """Whether the points that Mitsuba samples by the texture of an emitter have normals opposite to those of
+    its shape: ``eval_parameterization`` of a rectangle knows nothing of ``flip_normals``."""
+    if not emitter.get_shape().has_flipped_normals():  # of nearly all lamps: no kernel runs for them
+        return False
+    u = mi.Point2f(0.4, 0.6)
+    by_texture, _ = emitter.sample_position(0, u)
+    return number(dr.dot(by_texture.n, emitter.get_shape().sample_position(0, u).n)) < 0
 
 
 def check_coordinates(emitter):

@@ -17,9 +17,10 @@ from .spheres import Sphere, is_small
 class Placement:
     """Where an emitter is: axes ``x``, ``y``, ``z`` and ``position`` of point and spot lights, their
     constant density of emission ``density_w`` (solid angle) within ``cos_cutoff``; ``position`` of
-    projectors. Of spheres ``position``; the ``radius`` up to which one that emits inwards samples as from
-    inside, ``outward`` of a rotated one (see `Sphere`), the radius ``far`` of one that may be so small, as
-    seen from the scene, that Mitsuba's density is wrong (see `spheres.cone_density`); 0 for all others.
+    projectors. Of spheres ``position``; the ``radius`` up to which one that emits inwards, and everywhere
+    the same, samples as from inside, ``outward`` of a rotated one (see `Sphere`), the radius ``far`` of one
+    that may be so small, as seen from the scene, that Mitsuba's density is wrong (see
+    `spheres.cone_density`); 0 for all others.
     Scalars for one emitter, Dr.Jit arrays for a table of them."""
 
     x: object = (1, 0, 0)
@@ -83,11 +84,13 @@ def placement(emitter, kind, extent) -> Placement:
         return Placement(position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))))
     sphere = Sphere.of(emitter.get_shape()) if kind in (AREA, DIRECTIONAL_AREA) else None
     if sphere is not None:
-        small = kind == AREA and not is_textured(emitter, kind) and is_small(sphere, extent)
+        # By direction, unless it has a texture: then Mitsuba samples that, wherever the lit point is.
+        by_direction = not is_textured(emitter, kind)
+        small = kind == AREA and by_direction and is_small(sphere, extent)
         return Placement(
             position=sphere.center,
             # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
-            radius=sphere.radius * (1 + 1500 * 2.0**-24) if sphere.outward < 0 else 0.0,
+            radius=sphere.radius * (1 + 1500 * 2.0**-24) if by_direction and sphere.outward < 0 else 0.0,
             outward=sphere.outward if sphere.turned else 0.0,
             far=sphere.radius if small else 0.0,
         )
