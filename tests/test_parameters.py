@@ -905,6 +905,7 @@ STRETCHED = mi.ScalarTransform4f().scale([1, 2, 1])
 MIRRORED = mi.ScalarTransform4f().scale([1, 1, -1])
 # The columns are of length 1.
 SHEARED = mi.ScalarTransform4f([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+LONG_AXIS = mi.ScalarTransform4f().rotate([1, 1, 1], 40)  # shears, and its inverse is wrong
 REFUSED_PARTS = {
     "curve lamp": (
         lambda folder: {"lamp": curve(folder) | {"emitter": AREA_LIGHT}},
@@ -935,6 +936,25 @@ REFUSED_PARTS = {
     "meter on a mirrored cylinder": (
         lambda _: {"meter": meter_on({"type": "cylinder", "to_world": MIRRORED})},
         "irradiance meter '.*' is on a cylinder .*'meter'.* mirrors it.*flip_normals turns normals",
+    ),
+    **{
+        f"{kind} turned about a long axis": (
+            lambda _, kind=kind: {"lamp": {"type": kind, "to_world": LONG_AXIS, "emitter": AREA_LIGHT}},
+            f"emitter '.*' is on a {kind} .*'lamp'.* whose to_world .*give rotate an axis of length 1",
+        )
+        for kind in ("rectangle", "disk", "sphere", "cylinder")
+    },
+    "squashed cylinder": (
+        lambda _: {"lamp": {"type": "cylinder", "to_world": STRETCHED, "emitter": AREA_LIGHT}},
+        "is on a cylinder .*'lamp'.* squashes or shears it .*1, 2, 1.* or use a mesh",
+    ),
+    "ellipsoid": (
+        lambda _: {"lamp": {"type": "sphere", "to_world": STRETCHED, "emitter": AREA_LIGHT}},
+        "is on a sphere .*'lamp'.* stretches or shears it .*1, 2, 1.* or use a mesh",
+    ),
+    "meter on a sheared disk": (
+        lambda _: {"meter": meter_on({"type": "disk", "to_world": LONG_AXIS})},
+        "irradiance meter '.*' is on a disk .*'meter'.* give rotate an axis of length 1",
     ),
     "projector": (
         lambda _: {"lamp": {"type": "projector", "to_world": STRETCHED}},

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .cylinders import check_not_mirrored
 from .objects import all_shapes, children, matrix_of, number, own_parameters
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
@@ -55,8 +54,6 @@ def kind_of(emitter) -> int:
     kind = _KINDS.get(emitter.class_name(), UNKNOWN)
     if kind == INFINITE and "to_world" in own_parameters(emitter):
         _check_rotation(emitter)
-    if kind in (AREA, DIRECTIONAL_AREA):
-        check_not_mirrored(emitter.get_shape(), f"emitter '{emitter.id()}'")
     if kind == AREA and not _tells_its_points(emitter):
         return UNSAMPLED
     return kind

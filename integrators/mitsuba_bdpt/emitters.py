@@ -57,6 +57,7 @@ from .emitter_tables import (
 from .infinity import Disks
 from .objects import children, living_emitters, number, share_functions
 from .spheres import cone_density, is_turned_sphere, may_light_itself, sphere_normal
+from .to_world import check_to_world
 
 
 @dataclass
@@ -172,6 +173,9 @@ class Emitters:
         """Areas of the emitting shapes, how their points are chosen, and their geometric normals."""
         pairs = list(zip(emitters, kinds, strict=True))
         sampled = [k in (AREA, DIRECTIONAL_AREA) for k in kinds]
+        for e, s in zip(emitters, sampled, strict=True):
+            if s:
+                check_to_world(e.get_shape(), f"emitter '{e.id()}'")
         areas = [
             dr.slice(e.get_shape().surface_area()) if s else 1.0
             for e, s in zip(emitters, sampled, strict=True)

@@ -101,7 +101,18 @@ def own_parameters(owner) -> dict:
 
 def matrix_of(owner) -> np.ndarray:
     """The matrix of the parameter ``to_world`` of ``owner``: (4, 4), in double precision."""
-    return np.array(own_parameters(owner)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    return _entries(own_parameters(owner)["to_world"].matrix)
+
+
+def inverse_of(owner) -> np.ndarray:
+    """What Mitsuba takes to be the inverse of `matrix_of`, kept beside it: wrong after ``rotate`` about an
+    axis that is not of length 1, which is taken for a rotation."""
+    return _entries(own_parameters(owner)["to_world"].inverse().matrix)
+
+
+def _entries(matrix) -> np.ndarray:
+    """A matrix of Dr.Jit, in double precision. (One by one: no kernel runs, as for the matrix as a whole.)"""
+    return np.array([[number(matrix[i, j]) for j in range(4)] for i in range(4)], dtype=np.float64)
 
 
 def share_functions(owners):

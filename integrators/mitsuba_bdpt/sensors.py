@@ -5,10 +5,10 @@ from __future__ import annotations
 import mitsuba as mi
 
 from . import cameras
-from .cylinders import check_not_mirrored
 from .objects import children, number
 from .other_sensors import Distant, IrradianceMeter, Opaque, Orthographic
 from .sensor_records import Sensor
+from .to_world import check_to_world
 
 UNTARGETED = "target = none"
 
@@ -69,7 +69,7 @@ def _meter(sensor, shape_errors) -> Sensor:
             f"bdpt: irradiance meter '{sensor.id()}' is on a {shape.class_name()} ('{shape.id()}'), of which "
             "Mitsuba samples no points; put it on another shape"
         )
-    check_not_mirrored(shape, f"irradiance meter '{sensor.id()}'")
+    check_to_world(shape, f"irradiance meter '{sensor.id()}'")
     if tuple(film.size()) != (1, 1):
         return Opaque(sensor, "the film has more than one pixel: which of them a point belongs to is unknown")
     return IrradianceMeter(sensor, shape_errors)
