@@ -425,6 +425,17 @@ CASES = [
         equal=lambda: scene(lamp=round_lamp(turned=False)),
     ),
     Case(
+        "bitmap on a `rectangle` lamp with `flip_normals`: it shines from its back; `path` is wrong too",
+        lambda: scene(
+            lamp=lamp(
+                bitmap(np.full((4, 4, 3), 8.0)),
+                flip_normals=True,
+                to_world=transform().translate([0.4, 2.5, 0]).rotate([1, 0, 0], -90).scale(0.5),
+            )
+        ),
+        equal=lambda: scene(lamp=lamp()),
+    ),
+    Case(
         "a scene 0.4 mm wide (scaled by 1e-4): offsets of rays swallow it; of `path` too",
         lambda: tiny(1e-4),
         equal=lambda: tiny(1.0),

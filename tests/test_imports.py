@@ -26,7 +26,7 @@ ORDER = (
     ("cameras", "other_sensors"),
     ("emitter_tables", "infinity", "sensor_records"),
     ("emitter_kinds", "spheres"),
-    ("bsdf", "to_world", "rays", "mis", "sobol"),
+    ("agreement", "bsdf", "to_world", "rays", "mis", "sobol"),
     ("objects",),
     ("llvm", "files", "spread", "moments", "_version"),
 )

@@ -11,6 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_bdpt import emitter_kinds, emitter_tables
+from mitsuba_bdpt import emitters as emitters_module
 from mitsuba_bdpt.emitters import Emitters
 from scene_parts import T, grey
 from scipy import stats
@@ -211,3 +213,104 @@ def test_a_fine_mesh_shines_like_any():
     """Rationale: as above; such a lamp over a floor was 10 % too dark. Expected, tolerance, statistic: those
     of `check_sums`."""
     check_sums(gap(lamp=ball_of_triangles((0, 1.5, 0), 0.6)), width=0.01)
+
+
+def dome(radiance, **keys):
+    """A flipped sphere that surrounds all."""
+    emitter = {"type": "area", "radiance": radiance}
+    to_world = T().translate([0, 1.5, 0]).scale(8)
+    return {"type": "sphere", "flip_normals": True, "to_world": to_world, "emitter": emitter} | keys
+
+
+# What was once taken for Mitsuba's choice: the lamp, where, and what is said in its place.
+MISTAKEN = {
+    "inside of a textured sphere": (
+        lambda: dome(peaked(50)),
+        (emitter_tables, "is_textured", lambda *_: False),
+        "% of the directions that Mitsuba .* samples of emitter",
+    ),
+    "texture of a turned sphere": (
+        lambda: dome(peaked(50), flip_normals=False, to_world=T().rotate([1, 0, 0], 130).scale(0.3)),
+        (emitters_module, "is_turned_sphere", lambda *_: False),
+        "% of the points that Mitsuba .* samples of emitter",
+    ),
+    "texture of a flipped rectangle": (
+        lambda: dome(peaked(50), type="rectangle"),
+        (emitter_kinds, "_is_sampled_from_behind", lambda *_: False),
+        "% of the points that Mitsuba .* samples of emitter",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKEN)
+def test_a_choice_that_is_not_mitsubas_is_noticed(name, monkeypatch):
+    """Rationale: what is known of Mitsuba's samplers is true of one version, and was wrong before; the images
+    were, without a word. Expected: with the mistake planted an error that names the emitter and says what to
+    do, and none without."""
+    lamp, (module, attribute, wrong), message = MISTAKEN[name]
+    scene = gap(lamp=lamp())
+    Emitters(scene)
+    monkeypatch.setattr(module, attribute, wrong)
+    with pytest.raises(NotImplementedError, match=f"bdpt: .*{message}.*use integrator type 'path'"):
+        Emitters(scene)
+
+
+def test_another_table_of_faces_is_noticed(monkeypatch):
+    """Rationale: as above, for the faces of a mesh. Expected: an error with sums in double precision, and
+    after an edit of the faces alone, after which Mitsuba keeps its areas; none once it has made them anew."""
+    mesh = ball_of_triangles((0, 1.5, 0), 0.5)
+    scene = gap(lamp=mesh)
+    Emitters(scene)
+    right = emitter_tables._Faces.of
+
+    def in_double(shape):
+        faces = right(shape)
+        if faces is not None:
+            p = np.array(mi.traverse(shape)["vertex_positions"], dtype=float).reshape(-1, 3)
+            a, b, c = p[np.array(mi.traverse(shape)["faces"]).reshape(-1, 3)].transpose(1, 0, 2)
+            faces.sums = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1)) / 2
+            faces.area = faces.sums[-1]
+        return faces
+
+    with monkeypatch.context() as planted:
+        planted.setattr(emitter_tables._Faces, "of", in_double)
+        with pytest.raises(ValueError, match="bdpt: .*% of the points that Mitsuba samples on the mesh"):
+            Emitters(scene)
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith(".faces"))
+    params[key] = np.roll(np.array(params[key]).reshape(-1, 3), 100, axis=0).ravel().tolist()
+    params.update()
+    with pytest.raises(ValueError, match="update vertex_positions with them, or load the scene anew"):
+        Emitters(scene)
+    positions = key.replace("faces", "vertex_positions")
+    params[positions] = np.array(params[positions]).tolist()
+    params.update()
+    Emitters(scene)
+
+
+def test_nothing_is_sampled_where_nothing_is_repeated(monkeypatch):
+    """Expected: the comparison with Mitsuba does not run for 64 rectangles, spheres that shine outwards or a
+    cube; it runs once for each lamp that its texture samples."""
+    seen = []
+    monkeypatch.setattr(emitters_module, "check_densities", lambda emitters, index: seen.append(index))
+    light = {"emitter": {"type": "area", "radiance": 2.0}}
+    lamps = {
+        f"lamp{i}": {"type": "rectangle", "to_world": T().translate([i, 0, 0])} | light for i in range(64)
+    }
+    Emitters(gap(**lamps, ball={"type": "sphere"} | light, box={"type": "cube"} | light))
+    assert not seen
+    screen = {"type": "rectangle", "emitter": {"type": "area", "radiance": peaked(2)}}
+    Emitters(gap(**lamps, screen=screen))
+    assert len(seen) == 1
+
+
+@pytest.mark.parametrize("placed", PLACED)
+@pytest.mark.parametrize("shape", ["rectangle", "disk", "sphere"])
+def test_fine_textures_far_away_are_no_mistake(shape, placed):
+    """Rationale: rounding is not what the comparison with Mitsuba is for. Expected: lamps of noise of 1024 x
+    2048 texels, bilinear or not, flipped or not, near the origin and far from it, raise nothing."""
+    noise = mi.Bitmap(np.random.default_rng(0).random((1024, 2048, 3), dtype=np.float32) ** 8)
+    for filter_type, flip, at in itertools.product(("nearest", "bilinear"), (False, True), (0, 1000)):
+        radiance = {"type": "bitmap", "bitmap": noise, "raw": True, "filter_type": filter_type}
+        lamp = {"type": shape, "flip_normals": flip, "to_world": T().translate([at, 0, 0]) @ PLACED[placed]}
+        Emitters(gap(lamp=lamp | {"emitter": {"type": "area", "radiance": radiance}}))

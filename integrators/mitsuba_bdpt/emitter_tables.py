@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .agreement import CHECKED, OFF, spread_points
 from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_angles, is_textured
 from .objects import children, matrix_of, own_parameters
 from .spheres import Sphere, is_small
@@ -199,7 +200,13 @@ class SmoothMeshes:
     def of(emitters):
         """Tables for those of ``emitters`` that need them, or None. An emitter may be None."""
         faces = [e and _Faces.of(e.get_shape()) for e in emitters]
-        return SmoothMeshes(faces) if any(f is not None for f in faces) else None
+        if all(f is None for f in faces):
+            return None
+        tables = SmoothMeshes(faces)
+        for index, (e, f) in enumerate(zip(emitters, faces, strict=True)):
+            if f is not None:
+                tables._check(index, e, f)
+        return tables
 
     def __init__(self, faces):
         normals, sums, first, count, area = [], [], [], [], []
@@ -215,6 +222,22 @@ class SmoothMeshes:
         self._first, self._count = mi.UInt32(first), mi.UInt32(count)
         self._steps = max(count).bit_length()
         dr.make_opaque(self._normals, self._sums, self._area, self._first, self._count)
+
+    def _check(self, index, owner, faces):
+        """Raise ``ValueError`` unless the points that Mitsuba samples are in the planes of the faces here."""
+        u, shape = spread_points(CHECKED), owner.get_shape()
+        p = np.array(shape.sample_position(0, u).p, dtype=np.float64).T
+        face = np.array(self._face(mi.UInt32(index), u.y, mi.Bool(True))) - int(self._first[index])
+        with np.errstate(invalid="ignore"):  # vertices that are not finite
+            height = np.abs(np.einsum("ij,ij->i", p - faces.corners[face], faces.normals[face]))
+        # Rounding of the points is some 2e-7. A neighbour's plane is further away up to 10^7 faces.
+        off = np.mean(height > 2e-6 * np.abs(faces.corners).max())
+        if off > OFF:
+            raise ValueError(
+                f"bdpt: {off:.1%} of the points that Mitsuba samples on the mesh '{shape.id()}', which emits "
+                "or measures, are not on the faces that its areas tell: after an edit of faces Mitsuba keeps "
+                "its table of areas; update vertex_positions with them, or load the scene anew"
+            )
 
     def normal(self, n, index, u, active):
         """Normal of the face chosen by ``u``; ``n`` for emitters that are no such mesh."""
@@ -238,10 +261,11 @@ class SmoothMeshes:
 
 @dataclass
 class _Faces:
-    """The faces of a mesh: unit ``normals`` (faces, 3), the running ``sums`` of their areas as Mitsuba has
-    them, and the whole ``area``."""
+    """The faces of a mesh: unit ``normals`` and first ``corners`` (faces, 3), the running ``sums`` of their
+    areas as Mitsuba has them, and the whole ``area``."""
 
     normals: np.ndarray
+    corners: np.ndarray
     sums: np.ndarray
     area: float
 
@@ -254,12 +278,13 @@ class _Faces:
         length = np.linalg.norm(cross, axis=1)
         params = own_parameters(shape)
         faces, positions = mi.UInt32(params["faces"]), mi.Float(params["vertex_positions"])
-        corners = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, len(cross)))
-        a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in corners)
+        index = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, len(cross)))
+        a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in index)
         # As Mesh::build_pmf of Mitsuba, rounding included.
         chosen = mi.DiscreteDistribution(dr.detach(0.5 * dr.norm(dr.cross(b - a, c - a))))
         normals = cross / np.maximum(length, 1e-300)[:, None]
-        return _Faces(normals, np.array(chosen.cdf), dr.slice(chosen.sum()))
+        corners = np.array(a, dtype=np.float64).T
+        return _Faces(normals, corners, np.array(chosen.cdf), dr.slice(chosen.sum()))
 
 
 def _curved_faces(shape):

@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import rays
+from .agreement import check_densities
 from .emitter_kinds import (
     AREA,
     DIRECTIONAL,
@@ -162,6 +163,9 @@ class Emitters:
         self._inverse = inverse_table(self._pointers)
         self.disks = Disks(scene) if self.at_infinity else None
         dr.make_opaque(self._kind, self._pmf, self._inv_area, self._placements, self._inverse)
+        for index, row in enumerate(placements):
+            if self._by_texture[index] or row.radius > 0:
+                check_densities(self, index)
 
     @cached_property
     def even_surroundings(self) -> bool:
