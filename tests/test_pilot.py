@@ -27,7 +27,7 @@ def cornell(size=32, **more):
     return mi.load_dict(scene | more)
 
 
-def caustic(size=32):
+def caustic(size=32, **more):
     """A glass ball under a small lamp: path tracing alone hardly finds the light behind it."""
     return mi.load_dict(
         {
@@ -41,8 +41,15 @@ def caustic(size=32):
                 "emitter": {"type": "area", "radiance": 400.0},
             },
             "sensor": camera(size),
+            **more,
         }
     )
+
+
+def lit_caustic():
+    """`caustic` where shadows are not black: a splat in a black pixel is an error without a bound, and the
+    sum of such errors no number to compare (renders show 0.4 to 0.9)."""
+    return caustic(sky={"type": "constant", "radiance": 0.2})
 
 
 def sky(size=32):
@@ -125,7 +132,7 @@ def relative_variance(images, reference):
     return (images.var(axis=0, ddof=1) / (around**2 + 0.01 * reference.mean() ** 2)).mean()
 
 
-@pytest.mark.parametrize("make", [cornell, caustic, sky])
+@pytest.mark.parametrize("make", [cornell, lit_caustic, sky])
 @pytest.mark.parametrize("name", CANDIDATES)
 def test_predicted_variance(make, name):
     """Rationale: everything chosen rests on it, and it comes from samples that were made in another way.
@@ -147,7 +154,7 @@ def test_predicted_variance(make, name):
         [np.array(integrator.render(target, seed=s, spp=8))[..., :3].mean(-1) for s in range(64)]
     )
     measured = 8 * relative_variance(images.astype(float), images.mean(axis=0))
-    if make is caustic and weighting.light == 0:
+    if make is lit_caustic and weighting.light == 0:
         assert 0.5 * measured < predicted < 20 * measured
     else:
         assert predicted == pytest.approx(measured, rel=0.15)
@@ -789,11 +796,13 @@ def test_loops_are_recorded_once(parameters, capfd):
     assert "created a loop" in log and "re-recording" not in log
 
 
-@pytest.mark.parametrize(("gain", "stratified", "kappa"), [(2, True, 1), (4, True, 1 / 4), (2, False, 1 / 4)])
+@pytest.mark.parametrize(
+    ("gain", "stratified", "kappa"), [(1.2, True, 1), (1.5, True, 1 / 4), (1.2, False, 1 / 4)]
+)
 def test_coefficients_of_direct_light_have_to_gain_much(gain, stratified, kappa):
-    """Rationale: what kappa of s = 1 gains with independent points, good ones take off anyway (`open_sky`: a
-    predicted factor of 2 is lost, `furnace_white`: 4.3 stay). Expected: with stratified points a gain of 2 is
-    not taken, one of 4 is; with independent ones that of 2 is. Its figures are printed as they are."""
+    """Rationale: what points leave of two strategies' variances is known to a fifth. Expected: with
+    stratified points a gain of 1.2 is not taken, one of 1.5 is; with independent ones that of 1.2 is. Its
+    figures are printed as they are."""
     base = np.ones((pilot.GROUPS, len(pilot.WEIGHTINGS)))
     base[:, 1] = 1 / gain
     rays = {"camera": 1.0, "shadow_s1": 1.0}

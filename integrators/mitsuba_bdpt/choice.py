@@ -1,5 +1,5 @@
-"""What pays: the candidate with the least cost times variance, from a pilot's moments (splats count more
-where points are good, and some candidates less: `STRATIFIED_SPLATS`, `DIRECT_GAIN`).
+"""What pays: the candidate with the least cost times variance, from a pilot's moments, less what points take
+off them.
 
 Costs are counted, not timed: what the pilot's subpaths did times what that takes (`COSTS`), so that the same
 seed leads to the same decision on every machine.
@@ -48,16 +48,10 @@ COSTS = {
 }
 
 
-# Stratified points lower the variance of camera samples more than that of splats, by this factor: padded ones
-# to 0.31 to 0.54 of that with independent points against 0.57 to 1.05, ratios of 1.8 to 2.0 in five scenes;
-# joint ones 0.26 against 0.55 in a Cornell box, 0.44 against 1.03 in `uplight_room`, 2.1 and 2.3. This is why
-# t = 1 with its nominal coefficient raises the error: its variance is what the points leave.
-STRATIFIED_SPLATS = 2.0
-
 # With stratified points a coefficient of s = 1 other than 1 has to gain this factor over path tracing alone:
-# it evens out two strategies whose noise good points may take off anyway. Predicted factors of 2.0
-# (`open_sky`) and 4.3 (`furnace_white`) became 0.95 and 4.3.
-DIRECT_GAIN = 3.0
+# it evens out two strategies whose noise good points may take off anyway, and what a pilot of 4,096 samples
+# finds of that is off by a fifth.
+DIRECT_GAIN = 1.3
 
 # Light subpaths have to gain this factor over path tracing alone: predicted costs are off by 17 %, and who
 # renders a plain scene should not notice that they were an option.
@@ -332,7 +326,7 @@ def cost(candidate: Candidate, rays: dict) -> float:
 
 def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> list[Choice]:
     """The ``possible`` candidates, the best first; ``stratified``: whether points will be better than
-    independent ones, see `STRATIFIED_SPLATS` and `DIRECT_GAIN`."""
+    independent ones, see `moments.Moments.variance` and `DIRECT_GAIN`."""
     drawn = moments.variance(_trimmed_mean(moments.draw), stratified)
     every = moments.variance(0, stratified)
     parts = np.stack(

@@ -203,10 +203,9 @@ def _with_neighbours(values):
 def _gain(estimate, inverse):
     """Variance of a sample among points of a net over that of an independent one, by weighting; 1 at most.
 
-    ``estimate`` of the samples in nets, ``inverse`` of the norm of their places. The square of the difference of two nets'
-    means is twice the variance of such a mean, without bias; so is the mean square of the samples less the
-    product of the two means the variance of a sample.
-    """
+    ``estimate`` of the samples in nets, ``inverse`` of the norm of their places. The square of the difference
+    of two nets' means is twice the variance of such a mean, without bias; so is the mean square of the
+    samples less the product of the two means the variance of a sample."""
     width = estimate.shape[1]
     nets = estimate.reshape(-1, NETS, NET, width)
     first, second = nets.mean(axis=2).transpose(1, 0, 2)
