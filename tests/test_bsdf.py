@@ -122,12 +122,6 @@ EXACT = [
 NOT_COVERED = {"measured", "measured_polarized", "circular", "polarizer", "retarder"}
 
 
-@pytest.fixture
-def direct_calls(monkeypatch):
-    """Ask a plugin itself instead of a pointer to it: no virtual calls, a tenth of the time."""
-    monkeypatch.setattr(bsdf.dr, "dispatch", lambda plugin, ask, *args: ask(plugin, *args))
-
-
 class Draw:
     """Independent numbers for ``n`` lanes."""
 
@@ -265,7 +259,7 @@ def test_every_plugin_is_covered():
 
 
 @pytest.mark.parametrize("name", EXACT)
-def test_step_is_evaluation_over_density(name, direct_calls):
+def test_step_is_evaluation_over_density(name):
     """A sampled step's weight and densities are those of an evaluation of the same directions.
 
     Rationale: pbrt-v3 #73, where the walk carried the adjoint factor and the connection did
@@ -281,7 +275,7 @@ def test_step_is_evaluation_over_density(name, direct_calls):
     active = mi.Bool(True)
     for take, evaluate in ((bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)):
         step = take_step(take, plugin, draw, si)
-        ev = evaluate(plugin, si, step.wo, active)
+        ev = evaluate(plugin, si, step.wo, active, bsdf.Traits.of([plugin]))
         use = ~step.delta & (dr.max(step.weight) > 0)
         use, weight, value, fwd, rev, ev_fwd, ev_rev, cos = in_numpy(
             n,
@@ -311,7 +305,7 @@ def test_step_is_evaluation_over_density(name, direct_calls):
 
 
 @pytest.mark.parametrize("name", PLUGINS)
-def test_evaluation_beside_a_step(name, direct_calls):
+def test_evaluation_beside_a_step(name):
     """Rationale: one call serves the sampled direction and the one in which an endpoint lies.
 
     Expected: the same step as without the endpoint where it is asked for, and the same evaluation as
@@ -328,7 +322,7 @@ def test_evaluation_beside_a_step(name, direct_calls):
         target = bsdf.Target(wo, joined, mi.Float(0.7))
         step, f = take(plugin, si, u1, u2, sampled, traits, target)
         alone, nothing = take(plugin, si, u1, u2, sampled, traits)
-        expected = evaluate(plugin, si, wo, joined, *([0.7] if take is bsdf.sample_adjoint else []))
+        expected = evaluate(plugin, si, wo, joined, traits, *([0.7] if take is bsdf.sample_adjoint else []))
         assert nothing is None
         for ours, theirs, where in (
             *((getattr(step, k), getattr(alone, k), sampled) for k in ("wo", "weight", "pdf_fwd_w")),
@@ -350,7 +344,7 @@ def _towards_light(w, cut):
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 @pytest.mark.parametrize("name", EXACT)
-def test_both_sides_carry_the_same(name, tilt, direct_calls):
+def test_both_sides_carry_the_same(name, tilt):
     """Light subpaths and camera subpaths carry the same through a surface, delta lobes included.
 
     Rationale: the form M = int int W(c) f(c, l) |n.c| L(l) dc dl of a surface, with the geometric
@@ -388,7 +382,7 @@ def test_both_sides_carry_the_same(name, tilt, direct_calls):
 
 
 @pytest.mark.parametrize("name", ["normalmap glass", "normalmap mirror", "bumpmap glass"])
-def test_mapped_delta_events_that_camera_subpaths_cannot_make(name, direct_calls):
+def test_mapped_delta_events_that_camera_subpaths_cannot_make(name):
     """Light subpaths carry nothing through a mapped delta surface that `path` does not (mitsuba3 #42, #45).
 
     Rationale: Mitsuba's bump and normal maps reject sampled directions on different sides of the

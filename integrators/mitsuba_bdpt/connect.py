@@ -332,8 +332,8 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     d = between * dr.sqrt(inverse)
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
     cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
-    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active)
-    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, cos_y / y.cos)
+    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active, kernel.traits)
+    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y / y.cos)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput) * inverse
     active &= ~bsdf.is_zero(value)
 

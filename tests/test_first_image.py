@@ -1,0 +1,71 @@
+"""What is compiled before the first image is seen: counted, since seconds depend on the machine."""
+
+import json
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import bsdf
+from room import KINDS, room
+
+ALL = [{"pass": 0, "light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, "mean": 0.5}]
+ALL[0]["coefficients"] = {"t<=1": 1.0, "s=1": 1.0}
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """IR of the kernels that renders have run so far."""
+    found, history = [], dr.kernel_history
+
+    def watched(*args):
+        entries = history(*args)
+        found.extend(e["ir"].getvalue() for e in entries if e["type"] == dr.KernelType.JIT)
+        return entries
+
+    monkeypatch.setattr(dr, "kernel_history", watched)
+    return found
+
+
+def render(scene, **parameters):
+    """An image of ``scene`` with all strategies, by one kernel."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": json.dumps(ALL), **parameters})
+    return np.array(integrator.render(scene, seed=3, spp=4), dtype=np.float64)[..., :3]
+
+
+def functions(kernel: str) -> int:
+    """Number of functions of BSDFs in a kernel."""
+    return len(re.findall(r"^define [^\n]*\n(?:[^\n]*\n)?[^\n]*; Call: (?:BSDF::|drjit)", kernel, re.M))
+
+
+def test_functions_of_materials(kernels):
+    """Rationale: compiling the functions of BSDFs is most of a room's first image; `path` has one for each
+    BSDF of the process. A kernel that had one for each place that asks, and those of BSDFs that no ray meets
+    (inside of others, in other scenes), took 4 to 7 times as long as `path`'s to compile.
+
+    Expected: one for samples and one for evaluations of each BSDF that rays may meet, the lamp's included,
+    at most, also beside another scene; some differ in numbers only and share theirs.
+    """
+    other = mi.load_dict(room(len(KINDS), 16))
+    scene = mi.load_dict(room(len(KINDS), 16))
+    render(scene)
+    kernel = max(kernels, key=len)
+    materials = len(KINDS) + 1
+    assert len(KINDS) < functions(kernel) <= 2 * materials
+    assert other.shapes()
+
+
+def test_calls_of_few_questions_and_of_all(monkeypatch):
+    """Rationale: few BSDFs are asked everything in one call, many in several, see `bsdf.MANY`. Expected: the
+    same image, up to rounding: where it decides otherwise about a path, a pixel differs; two in a hundred
+    may.
+    """
+    scene = mi.load_dict(room(len(KINDS), 24))
+    images = []
+    for many in (1, 1000):
+        monkeypatch.setattr(bsdf, "MANY", many)
+        images.append(render(scene))
+    several, one = images
+    assert several.mean() > 0.05
+    assert np.mean(np.abs(several - one).max(-1) > 1e-3 * (one.mean(-1) + one.mean())) <= 0.02
