@@ -68,17 +68,20 @@ class Traits:
 
 # From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands
 # over the interaction once, which saves 6 % of the time in a Cornell box; but each place that makes one has
-# functions of its own, one per BSDF, where the same few questions, asked anywhere, are compiled once.
-MANY = 8
+# functions of its own, one per BSDF, where the same few questions, asked anywhere, are compiled once. (Rooms
+# of 10 and of 27 materials take the same time either way.)
+MANY = 10
 
 
 class Asked:
-    """Virtual calls of these BSDFs alone. (Mitsuba's visit all of the process, and a kernel holds a function
-    for each of them: those inside of others, which no ray meets, and those of other scenes.)"""
+    """Virtual calls of these BSDFs alone, which are `MANY` or not. (Mitsuba's visit all of the process, and a
+    kernel holds a function for each of them: those inside of others, which no ray meets, and those of other
+    scenes.)"""
 
     def __init__(self, bsdfs):
         by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
         self._bsdfs = list(by_id.values())
+        self.many = len(by_id) >= MANY
         numbers = [0] * (max(by_id, default=0) + 1)
         for number, index in enumerate(by_id):
             numbers[index] = number
@@ -96,7 +99,7 @@ class Asked:
     def together(self, bsdf, questions, *args):
         """Answers of ``questions(bsdf, *args)``, which asks through this object: in one call, or where there
         are `MANY` BSDFs in one for each question."""
-        return questions(bsdf, *args) if len(self._bsdfs) >= MANY else self(bsdf, questions, *args)
+        return questions(bsdf, *args) if self.many else self(bsdf, questions, *args)
 
 
 def _registry_id(bsdf) -> int:
