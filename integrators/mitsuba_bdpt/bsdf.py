@@ -87,6 +87,11 @@ class Asked:
             numbers[index] = number
         self._numbers = mi.UInt32(numbers)
 
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._bsdfs)
+
     def __call__(self, bsdf, question, *args):
         """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask. A BSDF itself, in
         place of a pointer, answers without a call."""

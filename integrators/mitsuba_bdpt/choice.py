@@ -36,16 +36,20 @@ SKY_DIRECT = 1 / 2
 
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
-# What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs
-# to it). Fitted to ten scenes on two cores: off by 17 % (root mean square) for the ratio of a candidate's
-# time to that of path tracing alone, which scripts/candidates.py shows.
+# What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
+# it). Fitted to 28 scenes on two cores: off by 20 % (root mean square) for the ratio of a candidate's time to
+# that of path tracing alone, which scripts/candidates.py shows.
 COSTS = {
-    "light_path": 1.0,  # to start a light subpath
-    "light": 0.95,  # each of its rays
+    "light_path": 1.4,  # to start a light subpath
+    "light": 0.9,  # each of its rays
     "inner": 0.2,  # to look for connections at all, per sample
     "joined": 1.15,  # a connection that is drawn and tested
     "shadow_inner": 1.1,  # each that is tested, where all are
+    "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }
+
+# Numbers of BSDFs from which on, and up to which, the lanes of a packet take turns in evaluating theirs.
+FEW_BSDFS, MANY_BSDFS = 4, 16
 
 
 # With stratified points a coefficient of s = 1 other than 1 has to gain this factor over path tracing alone:
@@ -313,7 +317,7 @@ def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
 
 
 def cost(candidate: Candidate, rays: dict) -> float:
-    """Cost of a sample; path tracing alone is 1. ``rays`` per sample of the pilot, see `pilot.Moments`."""
+    """Cost of a sample; path tracing alone is 1. ``rays`` per sample of the pilot, see `moments.Moments`."""
     total = camera = rays["camera"] + rays["shadow_s1"]
     if candidate.light_paths:
         light = COSTS["light_path"] + COSTS["light"] * (rays["light"] + rays["shadow_t1"])
@@ -321,6 +325,8 @@ def cost(candidate: Candidate, rays: dict) -> float:
     if candidate.connections != "none":
         kind = "joined" if candidate.connections == "one" else "shadow_inner"
         total += COSTS["inner"] + COSTS[kind] * rays[kind]
+        part = (rays["bsdfs"] - FEW_BSDFS) / (MANY_BSDFS - FEW_BSDFS)
+        total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
     return total / camera
 
 

@@ -41,8 +41,8 @@ class Moments:
     part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
     weighting, is what points leave of the rest of ``base``. ``mean`` of the image (mean of the colours,
     emitters seen directly left out; the median of the groups', so that no outlier sets it); ``rays`` and
-    connections per camera sample and kind, with one light subpath each; ``lanes``: number of camera samples.
-    """
+    connections per camera sample and kind, with one light subpath each, and the number of ``bsdfs``;
+    ``lanes``: number of camera samples."""
 
     base: np.ndarray
     rare: np.ndarray
@@ -118,12 +118,7 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
     width = samples.estimate.shape[1]
     sizes = splats.sums[:, :, splats.size].sum(axis=2) / splats.lanes
     groups = group(np.arange(lanes))
-    # Each half is judged by the brightness that the other has found: an outlier would hide itself.
-    halves = [
-        _norm(samples.of(groups % 2 != half), 2 * sizes[np.arange(GROUPS) % 2 != half].sum(axis=0))
-        for half in (0, 1)
-    ]
-    inverse = 1 / np.stack(halves)
+    inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
     weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
     of_sample = inverse[groups % 2, samples.tile][:, None]
@@ -164,33 +159,43 @@ def _by_group(values):
     return padded.reshape(-1, GROUPS, PER_PIXEL, values.shape[1]).sum(axis=(0, 2))  # see `group`
 
 
-def _norm(samples: Samples, splats):
+def _norms(samples: Samples, half, splats):
     """What squared errors are divided by, of each fine tile: the squared brightness, and a hundredth of that
-    of the image, as relMSE has it. ``splats``: what they bring to each tile, as a share of a whole
-    image's."""
+    of the image, as relMSE has it.
+
+    Shape (2, tiles): for each half of the samples, told by ``half`` (0 or 1 each), fine tiles have the
+    brightness that the other half has found: an outlier would hide itself. ``splats`` of the halves, shape
+    (2, tiles): their shares of a whole image's.
+    """
     last = samples.estimate[:, -1]
-    counts = np.bincount(samples.tile, minlength=FINE**2).reshape(FINE, FINE).astype(float)
-    sums = np.bincount(samples.tile, last, FINE**2).reshape(FINE, FINE)
-    splats = splats.reshape(FINE, FINE) * FINE**2  # radiance
-    many = FINE // TILES
-
-    def over_blocks(values):
-        blocks = values.reshape(TILES, many, TILES, many).sum(axis=(1, 3))
-        return np.kron(blocks, np.ones((many, many)))
-
-    coarse = over_blocks(sums) / np.maximum(over_blocks(counts), 1) + over_blocks(splats) / many**2
+    place = half * FINE**2 + samples.tile
+    counts = np.bincount(place, minlength=2 * FINE**2).reshape(2, FINE, FINE).astype(float)
+    sums = np.bincount(place, last, 2 * FINE**2).reshape(2, FINE, FINE)
+    splats = splats.reshape(2, FINE, FINE) * FINE**2  # radiance, of which each half has a part
+    coarse = _over_blocks(sums.sum(axis=0)) / np.maximum(_over_blocks(counts.sum(axis=0)), 1)
+    coarse += _over_blocks(splats.sum(axis=0)) / (FINE // TILES) ** 2
     floor = 0.01 * coarse.mean() ** 2
     # A tile's own brightness is worth as many samples of the larger one as it has noise.
     square = last**2 + samples.moment[:, -1] - last * _other(samples.estimate)[:, -1]
     first = (coarse**2 + floor).ravel()[samples.tile]
     noise = np.sum(square / np.where(first > 0, first, np.inf)) / len(last)
-    near = _with_neighbours(counts)
-    own = _with_neighbours(sums) / np.maximum(near, 1)
-    own += _with_neighbours(splats) / _with_neighbours(np.ones_like(splats))
     least = 2 * max(noise, 1e-3)
-    brightness = (near * own + least * coarse) / (near + least)
-    norm = brightness**2 + floor
-    return np.where(norm > 0, norm, np.inf).ravel()
+    norms = []
+    for other in (1, 0):
+        near = _with_neighbours(counts[other])
+        own = _with_neighbours(sums[other]) / np.maximum(near, 1)
+        own += 2 * _with_neighbours(splats[other]) / _with_neighbours(np.ones_like(coarse))
+        brightness = (near * own + least * coarse) / (near + least)
+        norms.append(brightness**2 + floor)
+    norms = np.stack(norms).reshape(2, -1)
+    return np.where(norms > 0, norms, np.inf)
+
+
+def _over_blocks(values):
+    """Sums over the larger tiles, in place of each fine one."""
+    many = FINE // TILES
+    blocks = values.reshape(TILES, many, TILES, many).sum(axis=(1, 3))
+    return np.kron(blocks, np.ones((many, many)))
 
 
 def _with_neighbours(values):

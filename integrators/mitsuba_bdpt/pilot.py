@@ -284,7 +284,8 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
     points = Points("sobol" if stratified else "independent", seed)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
-    return pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
+    found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
+    return replace(found, rays=found.rays | {"bsdfs": world.traits.asked.count})
 
 
 def _add(target, columns: int, values, row, active):
