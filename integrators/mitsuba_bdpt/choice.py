@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .moments import Moments
+from .moments import GROUPS, Moments
 from .pilot import WEIGHTINGS
 from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
@@ -60,6 +60,14 @@ DIRECT_GAIN = 1.3
 # Light subpaths have to gain this factor over path tracing alone: predicted costs are off by 17 %, and who
 # renders a plain scene should not notice that they were an option.
 LIGHT_GAIN = 1.15
+
+# Among candidates whose times are within this factor of the best, that comes first whose kernel is the first
+# of these: with other seeds the same kernel is taken, which need not be compiled again.
+KERNEL_TIE = 1.1
+KERNELS = ("one", "none", "all")
+
+# Bootstrap samples of a pilot's groups, see `certainty`.
+RESAMPLINGS = 100
 
 # Films of fewer pixels ask no pilot, which takes splats for as noisy as those of an image of many pixels, and
 # have a light subpath for each camera subpath, since those that share one are correlated.
@@ -350,12 +358,32 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
         most = min(alone, default=math.inf) / DIRECT_GAIN
         table = [row for row in table if row.candidate.direct == 1 or row.variance <= most]
     table.sort(key=lambda row: row.time)
+    tied = [row for row in table if row.candidate.light_paths and row.time <= KERNEL_TIE * table[0].time]
+    if tied:
+        _put_first(table, min(tied, key=lambda row: KERNELS.index(row.candidate.connections)))
     # Path tracing alone before what is hardly better.
     alone = next((row for row in table if not row.candidate.light_paths), None)
-    if alone is not None and alone.time <= LIGHT_GAIN * table[0].time:
-        table.remove(alone)
-        table.insert(0, alone)
+    if alone is not None and alone.time <= LIGHT_GAIN * min(row.time for row in table):
+        _put_first(table, alone)
     return table
+
+
+def _put_first(table: list, row):
+    table.remove(row)
+    table.insert(0, row)
+
+
+def certainty(moments: Moments, possible: list[Candidate], stratified: bool) -> float:
+    """In what share of `RESAMPLINGS` of the pilot's independent groups the candidate that `choose` puts first
+    is within `LIGHT_GAIN` of the best."""
+    best = choose(moments, possible, stratified)[0].candidate
+    random = np.random.default_rng(len(possible))
+    agree = 0
+    for _ in range(RESAMPLINGS):
+        table = choose(moments.of(random.integers(0, GROUPS, GROUPS)), possible, stratified)
+        times = {row.candidate: row.time for row in table}
+        agree += times.get(best, math.inf) <= LIGHT_GAIN * min(times.values())
+    return agree / RESAMPLINGS
 
 
 def _trimmed_mean(draw):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from .choice import LIGHT_GAIN
 from .plan import Plan, Settings, lost_paths
 
 
@@ -10,12 +11,11 @@ def subpaths(count: int) -> str:
     return f"{count} camera subpaths" if count > 1 else "camera subpath"
 
 
-def explain(world, p: Plan, settings: Settings, table, lost_by_pilot: int = 0) -> str:
+def explain(world, p: Plan, settings: Settings, table, certainty: float = 0.0, lost_by_pilot: int = 0) -> str:
     """Text about the strategies in use and those that are skipped.
 
-    ``table`` is a pilot's, see `choice.choose`; empty without one. ``lost_by_pilot``: how many of its values
-    were not finite.
-    """
+    ``table`` is a pilot's, see `choice.choose`, and `choice.certainty`; empty without one. ``lost_by_pilot``:
+    how many of its values were not finite."""
     used = [
         name
         for name, on in (
@@ -45,10 +45,10 @@ def explain(world, p: Plan, settings: Settings, table, lost_by_pilot: int = 0) -
         )
     if lost_by_pilot:
         lines.append(f"not finite: {lost_by_pilot} values of the pilot, which decided from the rest")
-    return "\n".join(lines + _pilot(settings, table))
+    return "\n".join(lines + _pilot(settings, table, certainty))
 
 
-def _pilot(settings: Settings, table) -> list[str]:
+def _pilot(settings: Settings, table, certainty: float) -> list[str]:
     """What the pilot found: the best of each combination and number of light subpaths."""
     if not table:
         return []
@@ -68,6 +68,10 @@ def _pilot(settings: Settings, table) -> list[str]:
             f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections} "
             f"({row.cost:.2f}, {row.variance:.3g})"
         )
+    lines.append(
+        f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
+        f"most {LIGHT_GAIN:g} times as long as the best"
+    )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
     return lines

@@ -235,7 +235,8 @@ def _make_class():
             table = render.decide() if spp else []
             if self.settings.decisions:
                 render.replay(0)
-            text = explain(render.world, render.plan, self.settings, table, render.lost_by_pilot())
+            certainty = render.certainty() if table else 0.0
+            text = explain(render.world, render.plan, self.settings, table, certainty, render.lost_by_pilot())
             if spp is None and choice.is_open(render.plan, self.settings):
                 return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
             return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"

@@ -6,7 +6,7 @@ Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. T
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -22,7 +22,9 @@ GROUPS = 16
 PER_PIXEL = 2
 
 # Points of a net of one pixel, and nets of a pixel: their means differ by what points leave of the variance.
-NET, NETS = 16, 2
+# (Longer nets gain more, and there are fewer of them: with 16 points in half as many pixels what is found in
+# a Cornell box is off by 31 % instead of 24 %.)
+NET, NETS = 8, 2
 
 # A weighting whose relative variance comes out beyond this is ruled out, see `pilot.LOST`.
 RULED_OUT = 1e15
@@ -61,6 +63,11 @@ class Moments:
         if stratified:
             base, light = self.rare + self.gain * (base - self.rare), SPLAT_GAIN * light
         return np.stack([base + draw, light], axis=1)
+
+    def of(self, groups) -> Moments:
+        """The moments of these of its groups, by number."""
+        rows = {n: getattr(self, n)[groups] for n in ("base", "rare", "light", "draw")}
+        return replace(self, **rows)
 
     def joined(self, other: Moments) -> Moments:
         """This pilot and another, of which each counts by its number of ``lanes``."""

@@ -19,7 +19,7 @@ from the unshadowed contributions.
 
 Points that are better than independent ones take off most of the variance of camera samples in smooth regions
 (to a hundredth under a sky), hardly any where a path is rarely found, and little of that of splats, which
-land in pixels by chance. How much is measured: a third of the samples lie in pairs of nets of one pixel,
+land in pixels by chance. How much is measured: half of the samples lie in pairs of nets of one pixel,
 which give the variance of a net's mean beside that of its samples (`moments.Moments.gain`).
 
 All is relative to the brightness of the place: a splat in a shadow weighs as much as that pixel is dark.
@@ -50,8 +50,8 @@ RAREST = 1024
 # and densities that single precision takes for 0.)
 LOST = 1e30
 
-# A pilot's samples in nets are one in so many.
-NET_SHARE = 3
+# Of a pilot's camera samples one in so many is in a net.
+NET_SHARE = 2
 
 # Light subpaths for each camera sample of a pilot, most of them without one: they are cheap, and few of them
 # meet a small thing that casts a caustic (of 4,096 from a lamp over a small glass cube, about six).

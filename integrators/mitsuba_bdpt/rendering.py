@@ -138,6 +138,11 @@ class Render:
         self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
         return table
 
+    def certainty(self) -> float:
+        """`choice.certainty` of what the pilots decided."""
+        possible = choice.candidates(self.world, self._full, self.settings)
+        return choice.certainty(self._moments, possible, self._has_stratified_points())
+
     def lost_by_pilot(self) -> int:
         """Values of the pilots that were not finite, and counted as zero."""
         return 0 if self._moments is None else round(self._moments.rays["non_finite"] * self._moments.lanes)
