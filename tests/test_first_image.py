@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import bsdf
+from mitsuba_bdpt import bsdf, choice
 from room import KINDS, room
 
 ALL = [{"pass": 0, "light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, "mean": 0.5}]
@@ -69,3 +69,15 @@ def test_calls_of_few_questions_and_of_all(monkeypatch):
     several, one = images
     assert several.mean() > 0.05
     assert np.mean(np.abs(several - one).max(-1) > 1e-3 * (one.mean(-1) + one.mean())) <= 0.02
+
+
+def test_pilots_of_rooms():
+    """Rationale: in scenes of many BSDFs the pilot's kernel takes a second to compile, longer than a short
+    render. Expected: none is asked where 2^17 samples would be enough with fewer BSDFs, and it is said why;
+    from 2^20 on one is, also there."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
+    few, many = (mi.load_dict(room(n, 128)) for n in (bsdf.MANY - 2, bsdf.MANY))  # the lamp has one more
+    assert len(integrator.decide(few, spp=8)) == 1
+    assert integrator.decide(many, spp=63) == []
+    assert str(choice.LEAST_OF_MANY) in integrator.statistics["no_pilot"]
+    assert len(integrator.decide(many, spp=64)) == 1

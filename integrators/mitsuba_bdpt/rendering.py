@@ -164,8 +164,8 @@ class Render:
         whole = sum(self.accumulator.passes) * self._pixels + samples
         if decision := choice.by_scene(self.world, self._full, self.settings, whole):
             return "the scene alone decides in a render as short as this", decision
-        if not choice.lanes(samples):
-            return f"{samples} samples are too few, it takes {choice.LEAST_SAMPLES}", None
+        if samples < (least := choice.least_samples(self.world.traits)):
+            return f"{samples} samples are too few, it takes {least}", None
         return "", None
 
     def _expected(self) -> int:
