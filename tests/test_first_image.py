@@ -81,3 +81,16 @@ def test_pilots_of_rooms():
     assert integrator.decide(many, spp=63) == []
     assert str(choice.LEAST_OF_MANY) in integrator.statistics["no_pilot"]
     assert len(integrator.decide(many, spp=64)) == 1
+
+
+def test_bitmaps_do_not_cut_kernels(kernels):
+    """Rationale: what a bitmap is turned into when it is first asked was computed while the first pass was
+    being recorded; that ran what there was of it, and the rest and the next pass were two kernels to compile,
+    in rooms two seconds of a short render's four. Expected: of a scene that was just loaded all passes run
+    the same kernel."""
+    scene = mi.load_dict(room(2, 16))
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "decisions": "[]"})
+    integrator.render(scene, spp=4)
+    assert len(integrator.statistics["passes"]) == 2
+    large = [kernel for kernel in kernels if "Symbolic loop" in kernel]
+    assert len(large) == 2 and large[0] == large[1]

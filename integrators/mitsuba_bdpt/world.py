@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from . import bsdf
 from .emitters import Emitters
-from .objects import all_shapes, is_instance
+from .objects import all_shapes, children, is_instance
 from .sensors import prepare
 
 
@@ -23,10 +24,28 @@ class World:
         self.emitters = Emitters(scene)
         self.camera = prepare(sensor, self.emitters.shape_errors, self.surfaces)
         found = bsdfs(scene)
+        _prepare_bitmaps(found)
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
         self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         self.traits = bsdf.Traits.of(found)
+
+
+def _prepare_bitmaps(found):
+    """Ask the bitmaps of BSDFs something.
+
+    Mitsuba makes of them what kernels read when they are first asked, and that runs what was recorded so far:
+    the first pass would be two kernels, and the second one a third.
+    """
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    held = (v for owner in bsdf.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
+    for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
+        for ask in (texture.eval, texture.eval_1, texture.eval_3):
+            try:
+                ask(si)
+                break
+            except RuntimeError:  # what it is asked depends on its channels, on ``raw`` and on the variant
+                continue
 
 
 def bsdfs(scene):
