@@ -68,8 +68,8 @@ LIGHT_GAIN = 1.15
 
 # Among candidates whose times are within this factor of the best, that comes first whose kernel is the first
 # of these: with other seeds the same kernel is taken, which need not be compiled again.
-KERNEL_TIE = 1.1
-KERNELS = ("one", "none", "all")
+KERNEL_TIE = 1.05
+KERNELS = ("none", "one", "all")
 
 # Bootstrap samples of a pilot's groups, see `certainty`.
 RESAMPLINGS = 100
