@@ -1,15 +1,20 @@
-"""First and second render of scenes with many emitters or BSDFs, for `path` and `bdpt`.
+"""First and second render of scenes with many emitters or BSDFs, and of rooms, for `path` and `bdpt`.
 
     python scripts/startup.py
+    python scripts/startup.py --rooms 10 27 --spp 8 64 --rounds 5
 
-A process for each row, with an empty kernel cache: seconds to the first image of 128^2 pixels (compilation
-included), then of a second render (seed and samples changed: nothing is compiled, kernels are only recorded).
+A process for each row and round, with an empty kernel cache: seconds to the first image of 128^2 pixels
+(compilation included), then of a second render (seed and samples changed: nothing is compiled, kernels are
+only recorded, unless the pilot decides otherwise). With ``--rooms`` the materials of `room` instead, both
+integrators by turns: medians over the rounds of seconds, of the CPU seconds of the thread that compiles
+beyond those of the same render again, which other processes disturb less, and of the ratio of these.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import statistics
 import sys
 import tempfile
 
@@ -51,22 +56,73 @@ for seed, spp in ((0, 8), (1, 16)):  # long enough for a pilot
     print(time.perf_counter() - start)
 """
 
+# Of materials 0 the Cornell box.
+ROOM = """
+import sys, time
+import mitsuba_bdpt, room, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+kind, materials, spp = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+box = mi.cornell_box()
+box["sensor"]["film"].update(width=128, height=128)
+scene = mi.load_dict(room.room(materials) if materials else box)
+integrator = mi.load_dict({"type": kind, "max_depth": 8})
+clocks = time.perf_counter, time.thread_time
+taken = []
+for _ in range(2):
+    start = [clock() for clock in clocks]
+    dr.eval(integrator.render(scene, spp=spp))
+    dr.sync_thread()
+    taken.append([clock() - begun for clock, begun in zip(clocks, start)])
+print(taken[0][0], taken[0][1] - taken[1][1])
+"""
+
 
 def main(arguments=None) -> int:
     """Print the table."""
-    argparse.ArgumentParser(description=__doc__.split("\n\n")[0]).parse_args(arguments)
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--rooms", type=int, nargs="+", help="numbers of materials; 0: the Cornell box")
+    parser.add_argument("--spp", type=int, nargs="+", default=[8], help="samples per pixel, of rooms")
+    parser.add_argument("--rounds", type=int, default=3, help="renders of each room")
+    asked = parser.parse_args(arguments)
+    if asked.rooms is not None:
+        print(table(*_rooms(asked.rooms, asked.spp, asked.rounds)))
+        return 0
     rows = []
     for lamps, bsdfs in COUNTS:
         row = [str(lamps), str(bsdfs)]
         for kind in ("path", "bdpt"):
-            with tempfile.TemporaryDirectory() as cache:
-                empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
-                first, second = numbers(CODE, kind, str(lamps), str(bsdfs), environment=empty)[-2:]
+            first, second = _cold(CODE, kind, str(lamps), str(bsdfs))
             row += [f"{first:.2f}", f"{second:.3f}"]
         rows.append(row)
     head = ["emitters", "BSDFs", "path: first", "second", "bdpt: first", "second"]
     print(table(head, rows))
     return 0
+
+
+def _rooms(rooms, counts, rounds: int) -> tuple[list, list]:
+    """Head and rows of the table of first images of rooms."""
+    rows = []
+    for materials in rooms:
+        for spp in counts:
+            times = [
+                [_cold(ROOM, kind, str(materials), str(spp)) for kind in ("path", "bdpt")]
+                for _ in range(rounds)
+            ]
+            (path, path_cpu), (bdpt, bdpt_cpu) = (
+                [statistics.median(time) for time in zip(*of_kind, strict=True)]
+                for of_kind in zip(*times, strict=True)
+            )
+            ratio = statistics.median(ours[1] / theirs[1] for theirs, ours in times)
+            row = [f"{x:.2f}" for x in (path, bdpt, path_cpu, bdpt_cpu, ratio)]
+            rows.append([str(materials), str(spp), *row])
+    return ["materials", "spp", "path", "bdpt", "path: compiling", "bdpt: compiling", "ratio"], rows
+
+
+def _cold(code, *arguments) -> list[float]:
+    """The last two numbers that a process with an empty kernel cache prints."""
+    with tempfile.TemporaryDirectory() as cache:
+        empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
+        return numbers(code, *arguments, environment=empty)[-2:]
 
 
 if __name__ == "__main__":
