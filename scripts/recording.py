@@ -98,19 +98,31 @@ class Collector(sinks.Image):
             if count > CAPACITY:
                 raise ValueError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
             numbers = np.array(rows, dtype=float).reshape(-1, COLUMNS)[:count]
-            found += [_outlier(launch, row, self._lanes) for row in numbers]
+            slots = _slots(launch, numbers)
+            found += [_outlier(launch, row, slot) for row, slot in zip(numbers, slots, strict=True)]
         return found
 
 
-def _outlier(launch: Launch, row, lanes: int) -> Outlier:
+def _slots(launch: Launch, rows) -> list[int]:
+    """The camera samples that outliers are of: of those that share a lane, which lie in different pixels,
+    that in the outlier's; for splats that of the first part, whose slot is the lane."""
+    if not len(rows):
+        return []
+    batch = launch.batch
+    lane, x, y, splat = (rows[:, i].astype(int) for i in (0, 1, 2, 6))
+    pixel = y * launch.width + x - batch.first_pixel
+    sharing = kernel.shared_by(launch.kernel, batch, launch.points)
+    seat, slot = sharing.seat(mi.UInt32(lane)), mi.UInt32(lane)
+    for part in range(launch.kernel.plan.served):
+        served = sharing.slot(seat, mi.UInt32(part))
+        here = (served // batch.samples == mi.UInt32(pixel)) & mi.Mask(splat == 0)
+        slot = dr.select(here, served, slot)
+    return np.broadcast_to(np.array(slot), len(rows)).tolist()
+
+
+def _outlier(launch: Launch, row, slot: int) -> Outlier:
     """An outlier from what was kept of it."""
-    lane, x, y, s, t = (int(row[i]) for i in (0, 1, 2, 6, 7))
-    slot = lane
-    if not s:  # of the camera samples of a lane, which lie in different pixels, that in this one
-        batch = launch.batch
-        pixel = y * launch.width + x - batch.first_pixel
-        slots = range(lane, batch.pixels * batch.samples, lanes)
-        slot = next(i for i in slots if i // batch.samples == pixel)
+    x, y, s, t = (int(row[i]) for i in (1, 2, 6, 7))
     return Outlier(launch, slot, x, y, row[3:6], s, t)
 
 
@@ -124,8 +136,7 @@ def render(scene, integrator, least, spp: int, seed: int):
 
     def trace(traced, image, batch, points, of):
         launch = Launch(copy(traced), batch, points, of, int(film.crop_size()[0]))
-        lanes = -(-batch.pixels * batch.samples // traced.plan.served)
-        collector = Collector(image._film, least, lanes)
+        collector = Collector(image._film, least, kernel.shared_by(traced, batch, points).lanes)
         counts = kernel.trace(traced, collector, batch, points, of)
         image._film.evaluate(counts, collector.kept)
         outliers.extend(collector.found(launch))

@@ -22,7 +22,7 @@ ORDER = (
     ("subpath",),
     ("colour", "features"),
     ("world",),
-    ("plan", "emitters", "sensors", "points", "strategies", "suspects"),
+    ("plan", "emitters", "sensors", "points", "sharing", "strategies", "suspects"),
     ("cameras", "other_sensors"),
     ("emitter_tables", "infinity", "sensor_records"),
     ("emitter_kinds", "spheres"),

@@ -1,8 +1,8 @@
 """One batch (a pass, or a band of its rows) as one kernel.
 
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
-subpaths that it serves, in S distant pixels; all strategies of a pair are evaluated by that lane.
-Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples
+subpaths that it serves, in S different pixels (see `sharing`); all strategies of a pair are evaluated by that
+lane. Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples
 or image size.
 """
 
@@ -18,6 +18,7 @@ from . import bsdf, connect, mis, rays, sobol
 from .moments import NET, NETS
 from .plan import MAX_STORED, UNLIMITED
 from .points import Points, Purpose
+from .sharing import Sharing
 from .subpath import Side, Walk, random_walk
 
 # Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
@@ -141,26 +142,25 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     """Trace one batch and put its contributions into ``sink`` (see `sinks`); ``spp`` is the render's total,
     which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
     after the other); nothing is evaluated yet."""
-    total, lanes = _size(kernel, batch)
+    sharing = shared_by(kernel, batch, points)
     # Exact also where S does not divide the batch; a pilot's estimates are those of one light subpath.
-    kernel = kernel.bound(points, 1.0 if batch.spread else lanes / total)
-    lane = dr.arange(mi.UInt32, lanes)
+    kernel = kernel.bound(points, 1.0 if batch.spread else sharing.lanes / batch.size)
+    lane = dr.arange(mi.UInt32, sharing.lanes)
     common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), lane)
 
-    def body(served, counters):
-        slot = lane + served * dr.opaque(mi.UInt32, lanes)
-        active = slot < dr.opaque(mi.UInt32, total)
-        counters = _camera_subpath(kernel, sink, common, slot, counters, active)
-        return served + 1, counters
+    def serve(slot, counters):
+        active = slot < dr.opaque(mi.UInt32, batch.size)
+        return _camera_subpath(kernel, sink, common, slot, counters, active)
 
     counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
     if not kernel.plan.light:
-        _, counters = body(mi.UInt32(0), counters)
+        counters = serve(lane, counters)
     else:
+        seat = sharing.seat(lane)
         _, counters = dr.while_loop(
             (mi.UInt32(0), counters),
             lambda served, counters: served < kernel.served,
-            body,
+            lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
             label="camera subpaths of one light subpath",
         )
     return _sum(of_light, counters)
@@ -169,16 +169,19 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
 def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
     """Trace some camera samples of a batch again, as `trace` does: those of these ``slot``s (``UInt32``) with
     the light subpath of the lane that each is in. (For whoever looks at single samples; no render does.)"""
-    total, lanes = _size(kernel, batch)
-    kernel = kernel.bound(points, lanes / total)
-    common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), slot % lanes)
+    sharing = shared_by(kernel, batch, points)
+    kernel = kernel.bound(points, sharing.lanes / batch.size)
+    common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), sharing.lane(slot))
     counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
     return _sum(of_light, _camera_subpath(kernel, sink, common, slot, counters, mi.Bool(True)))
 
 
-def _size(kernel, batch: Batch) -> tuple[int, int]:
-    """Number of camera samples in a batch, and of lanes."""
-    return batch.size, -(-batch.lanes // kernel.plan.served)
+def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
+    """Which camera samples of a batch share a light subpath. Those of a pilot do not, and some of its light
+    subpaths have none."""
+    if batch.spread:
+        return Sharing(batch.lanes, 1, 1, points.seed)
+    return Sharing(batch.pixels, batch.samples, kernel.plan.served, points.seed)
 
 
 def _begin(kernel, sink, place: _Places, lane):
