@@ -3,12 +3,12 @@
     python scripts/candidates.py cornell_box uplight_room glass_caustics
     python scripts/candidates.py --seeds 12 cornell_box ajar_door   # what the pilots of 12 renders choose
 
-For each scene (128^2, as in the benchmark) and a selection of candidates: the predicted variance of a sample,
-split into that of camera samples and that of splats, and cost; the relMSE of renders of 64 samples per pixel
-times 64, trimmed of its worst 0.1 %, with the default points, and their time over that of path tracing alone.
-Renders of a given candidate come from the parameter ``decisions``. The ratio of the variances is what points
-gain. With ``--seeds``, instead: how far the cost times variance of what renders' own pilots choose is above
-the least of all candidates, both judged by 2^17 samples.
+For each scene (128^2, as in the benchmark) and a selection of candidates: the predicted variance of a sample
+with what points leave of it, split into that of camera samples and that of splats, and cost; the relMSE of
+renders of 64 samples per pixel times 64, trimmed of its worst 0.1 %, with the default points, and their time
+over that of path tracing alone. Renders of a given candidate come from the parameter ``decisions``. With
+``--seeds``, instead: how far the cost times variance of what renders' own pilots choose is above the least of
+all candidates, both judged by 2^17 samples. (scripts/choices.py judges by renders.)
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def lines(name: str, depth: int) -> list:
         share, connections, splat = entry
         way = candidate(*entry)
         draw = moments.draw if connections == "one" else 0
-        base, light = moments.variance(draw)[:, :, way.weighting].mean(axis=0)
+        base, light = moments.variance(draw, stratified=True)[:, :, way.weighting].mean(axis=0)
         light *= way.served
         made = way.decided(0, choice.cost(way, moments.rays), base + light, moments.mean)
         error, seconds = rendered(scene, depth, made, expected)
