@@ -6,6 +6,7 @@ that paints the film one colour: what is tested is the command, not the light.
 
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -18,7 +19,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt import render
 from mitsuba_bdpt.__main__ import build_parser, main
-from mitsuba_bdpt.loading import in_proportion
+from mitsuba_bdpt.loading import in_proportion, load
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
 
@@ -189,6 +190,88 @@ def test_another_integrator_keeps_depth_and_takes_properties(scene):
     expected |= {"seed": 3, "spp": render.UNLIMITED_SPP}
     assert statistics["settings"] == expected
     assert statistics["spp"] == 5, "the passes that were made count, not those asked for"
+
+
+AROUND = """<integrator type="aov">
+    <string name="aovs" value="dd:depth, nn:sh_normal"/><float name="timeout" value="50"/>
+    <integrator type="aov" name="in">
+        <string name="aovs" value="uv:uv"/><float name="timeout" value="20"/>
+        <integrator name="img" type="$integrator">
+            <integer name="max_depth" value="3"/><integer name="rr_depth" value="2"/>
+            <boolean name="hide_emitters" value="true"/><float name="timeout" value="10"/>
+        </integrator>
+    </integrator>
+</integrator>"""
+
+
+@pytest.fixture
+def around(scene):
+    """The scene, its integrator inside of two of Mitsuba's `aov`."""
+    start, end = SCENE.index("<integrator"), SCENE.index("<sensor")
+    scene.write_text(SCENE.replace(SCENE[start:end], AROUND))
+    return scene
+
+
+def loaded(scene, *arguments):
+    """The integrator that the command would render with."""
+    return load(build_parser().parse_args(["render", str(scene), *arguments]))[1]
+
+
+def test_bdpt_in_place_of_integrators_around_others_keeps_their_layers(around):
+    """Expected: the layers of the film are Mitsuba's of these names (depth 0 and normal 0 of an empty scene;
+    the inner image apart, which is the image), depth and roulette are those of the inner integrator, the
+    timeout is the outermost, which Mitsuba's integrators have too; what the command line says comes first."""
+    settings = loaded(around, "--integrator", "bdpt").settings
+    assert (settings.max_depth, settings.rr_depth, settings.hide_emitters) == (3, 2, True)
+    assert (settings.timeout, settings.aovs) == (50, "dd:depth,nn:sh_normal,in.uv:uv")
+    inner = loaded(around, "--integrator", "bdpt", "-Dintegrator=bdpt").settings
+    assert inner == settings
+    ours = loaded(around, "--integrator", "bdpt", "-P", "aovs=al:albedo", "-P", "max_depth=7").settings
+    assert (ours.max_depth, ours.aovs) == (7, "al:albedo")
+    layers = []
+    for kind in ("path", "bdpt"):
+        assert main(["render", str(around), "--integrator", kind, "-o", f"{kind}.exr"]) == 0
+        layers.append(OpenEXR.File(f"{kind}.exr", separate_channels=True).channels())
+    image = {f"in.{part}{c}" for part in ("", "img.") for c in "RGBA"}
+    assert set(layers[0]) - image == set(layers[1]) >= {"dd.T", "nn.X", "in.uv.V"}
+
+
+def test_layers_of_bdpt_inside_of_aov_are_kept_too(around):
+    around.write_text(
+        around.read_text()
+        .replace("$integrator", "bdpt")
+        .replace(
+            '<integer name="max_depth" value="3"/>',
+            '<integer name="max_depth" value="3"/><string name="aovs" value="al:albedo"/>'
+            '<string name="skip" value="none"/>',
+        )
+        .replace('<default name="integrator" value="path"/>', "")
+    )
+    settings = loaded(around, "--integrator", "bdpt").settings
+    assert settings.aovs == "dd:depth,nn:sh_normal,in.uv:uv,al:albedo"
+    assert (settings.skip, settings.max_depth) == ("none", 3)
+
+
+def test_other_integrators_take_the_place_inside(around):
+    """Expected: the integrators around stay; only the innermost is another, with its depth."""
+    integrator = loaded(around, "--integrator", "volpath")
+    assert {"dd.T", "in.uv.V", "in.img.R"} <= set(integrator.aov_names())
+    assert re.search(r"Volumetric\w+\[\s+max_depth = 3,\s+rr_depth = 2", str(integrator))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (('type="aov" name="in"', 'type="moment" name="in"'), "integrator moment.*second moments.*variance"),
+        (('type="aov">', 'type="stokes">'), "integrator stokes.*Stokes vectors.*write the inner"),
+        (('<integrator name="img"', '<integrator type="path"/><integrator name="img"'), "'img'.*just one"),
+    ],
+)
+def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
+    assert change[0] in around.read_text()
+    around.write_text(around.read_text().replace(*change))
+    assert main(["render", str(around), "--integrator", "bdpt"]) == 1
+    assert re.search(words, capsys.readouterr().err)
 
 
 def test_an_integrator_without_max_depth_can_replace_one_with_it(scene):

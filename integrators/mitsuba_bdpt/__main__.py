@@ -71,7 +71,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scheduler", metavar="ADDRESS", help=text)
     text = "number of parts of a render on a cluster; default: 4 for each worker"
     add("--parts", type=number(int, 1), metavar="N", help=text)
-    text = "replace the scene's integrator, keeping max_depth, rr_depth and hide_emitters"
+    text = "replace the scene's integrator, keeping depth, hide_emitters, timeout, layers of aov"
     add("--integrator", metavar="TYPE", help=text)
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
     text = "value of a parameter $KEY of the scene; may be repeated"

@@ -40,7 +40,7 @@ KINDS = (
 
 def check_syntax(aovs: str):
     """Raise ``ValueError`` unless ``aovs`` consists of pairs ``name:kind``, as ``aov`` has them."""
-    for pair in _pairs(aovs):
+    for pair in pairs(aovs):
         name, colon, kind = pair.partition(":")
         if not (name and colon and kind):
             raise ValueError(
@@ -58,16 +58,17 @@ def check_syntax(aovs: str):
 
 def feature_names(aovs: str) -> list[str]:
     """Names of the layers that the parameter ``aovs`` asks for."""
-    return _plugin(aovs).aov_names() if _pairs(aovs) else []
+    return _plugin(aovs).aov_names() if pairs(aovs) else []
 
 
 def _may_be_undefined(aovs: str) -> list[bool]:
     """Whether each layer is one of uv derivatives, which are NaN where there are none."""
-    kinds = (pair.partition(":")[2] for pair in _pairs(aovs))
+    kinds = (pair.partition(":")[2] for pair in pairs(aovs))
     return [kind.startswith("duv_") for kind in kinds for _ in feature_names(f"x:{kind}")]
 
 
-def _pairs(aovs: str) -> list[str]:
+def pairs(aovs: str) -> list[str]:
+    """The pairs ``name:kind`` of a parameter ``aovs``, also of Mitsuba's."""
     return [pair for pair in re.split("[, ]+", aovs) if pair]
 
 

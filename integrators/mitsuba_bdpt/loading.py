@@ -5,14 +5,25 @@ from __future__ import annotations
 import codecs
 import re
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 import mitsuba as mi
 
-KEPT = ("max_depth", "rr_depth", "hide_emitters")
-"""What an integrator that replaces the scene's takes over: the same paths are to be found."""
+from . import features
+
+KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
+"""What an integrator that replaces the scene's takes over: the same paths, in the same time."""
+
+NOT_CARRIED = {
+    "moment": "second moments, which bdpt has not: its parameter variance adds the variance of each pixel",
+    "stokes": "Stokes vectors, which bdpt has not: it is not polarized",
+}
+"""Integrators around another whose layers `bdpt` cannot have."""
+
+AROUND = ("aov", *NOT_CARRIED)
+"""Mitsuba's integrators around another one."""
 
 # What files in other encodings than UTF-8 begin with: a byte order mark, or the first "<" of a file without.
 # Of two that fit the first counts.
@@ -96,12 +107,66 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
             )
         overrides |= {"until_error": options.until_error, "variance": True}
     if node is not None:
-        node.props = integrator_properties(node.props, options.integrator, overrides)
+        replace_integrator(state.nodes, node, options.integrator, overrides)
     mi.parser.transform_all(config, state)
     scene = mi.parser.instantiate(config, state)
     if node is not None:
         return scene, scene.integrator()
     return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+
+
+def replace_integrator(
+    nodes: Sequence, node, kind: str | None, overrides: Mapping[str, bool | int | float | str]
+) -> None:
+    """Make the integrator ``node``, one of ``nodes``, one of another ``kind`` if that is set, with
+    ``overrides``.
+
+    Of integrators around another one (`AROUND`), with their layers, `bdpt` takes the place of all of them,
+    for it has layers of its own; others take the place of the innermost. Raises ``ValueError`` for layers
+    that cannot be kept."""
+    given = node.props
+    if kind == "bdpt" and given.plugin_name() in AROUND:
+        given, layers = _layers(nodes, node)
+        overrides = layers | overrides
+    while kind not in (None, *AROUND) and given.plugin_name() in AROUND:
+        node = _nested(nodes, node)[1]
+        given = node.props
+    node.props = integrator_properties(given, kind, overrides)
+
+
+def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
+    """The properties of the innermost integrator of ``node``, which is around others, and what `bdpt` takes
+    over from those: layers, named as in Mitsuba's film, and the outermost ``timeout``, which counts there."""
+    aovs, carried, prefix = [], {}, ""
+    while (kind := node.props.plugin_name()) in AROUND:
+        if kind in NOT_CARRIED:
+            raise ValueError(
+                f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
+                f"adds {NOT_CARRIED[kind]}; in the scene file, write the inner integrator alone."
+            )
+        aovs += [prefix + pair for pair in features.pairs(node.props.get("aovs", ""))]
+        if "timeout" in node.props:
+            carried.setdefault("timeout", node.props["timeout"])
+        name, node = _nested(nodes, node)
+        prefix += f"{name}."
+    if kind == "bdpt":
+        aovs += features.pairs(node.props.get("aovs", ""))
+    return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})
+
+
+def _nested(nodes: Sequence, node) -> tuple[str, object]:
+    """Name and node of the one integrator inside of ``node``, which is around it."""
+    held = {key: node.props[key] for key in node.props.keys()}  # noqa: SIM118 (not a dict)
+    held = {key: value for key, value in held.items() if isinstance(value, mi.Properties.ResolvedReference)}
+    found = [(key, nodes[reference.index()]) for key, reference in held.items()]
+    found = [(key, inner) for key, inner in found if inner.type == mi.ObjectType.Integrator]
+    if len(found) != 1:
+        names = ", ".join(f"{key!r} ({inner.props.plugin_name()})" for key, inner in found)
+        raise ValueError(
+            f"integrator: the scene's integrator {node.props.plugin_name()} is around {names or 'none'}; to "
+            "replace the one inside, there has to be just one: in the scene file, leave out the others."
+        )
+    return found[0]
 
 
 def integrator_properties(
