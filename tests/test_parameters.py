@@ -113,6 +113,13 @@ def image(bdpt, scene, **keywords):
         ({"strategy_images": "yes"}, "strategy_images='yes'"),
         ({"max_deph": 3}, "max_deph=3 is not a parameter; did you mean max_depth.*rr_depth"),
         ({"samples_per_pass": 3}, "samples_per_pass=3.*use spp_per_pass"),
+        ({"lightImage": False}, "lightImage=False is not a parameter; it is of Mitsuba 0.6.*light_paths=0"),
+        ({"light_image": False}, "light_image=False is not a parameter; it is of Mitsuba 0.6.*light_paths=0"),
+        ({"sampleDirect": True}, "sampleDirect=True is not a parameter; it is of Mitsuba 0.6.*always.*leave"),
+        (
+            {"sample_direct": True},
+            "sample_direct=True is not a parameter; it is of Mitsuba 0.6.*always.*leave",
+        ),
         ({"light_paths": "1/"}, "light_paths='1/'.*1/16"),
         ({"light_paths": "nan"}, "light_paths='nan'"),
     ],
@@ -1177,6 +1184,14 @@ def test_xml():
 
 
 # -- what users try ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["lightImage", "sampleDirect"])
+def test_scene_files_of_mitsuba_06_are_told_what_became_of_parameters(name):
+    """Rationale: Mitsuba's upgrade of an old file writes their names with underscores."""
+    text = f'<boolean name="{name}" value="false"/>'
+    with pytest.raises(RuntimeError, match=r"is not a parameter; it is of Mitsuba 0\.6"):
+        mi.load_string(f'<scene version="0.6.0"><integrator type="bdpt">{text}</integrator></scene>')
 
 
 def test_numpy_integers_are_integers():

@@ -27,6 +27,24 @@ MEANING = {
     "seed": "any number from 0 to 2^32 - 1",
 }
 
+# Parameters that are not ours but could be taken for it, and what to do. Mitsuba's upgrade of old scene files
+# writes those of its version 0.6 with underscores.
+_LIGHT_IMAGE = (
+    "it is of Mitsuba 0.6's bdpt; here light subpaths always reach the camera, weighted with all other "
+    "strategies; leave it out, or set light_paths=0 to leave out light tracing"
+)
+_SAMPLE_DIRECT = (
+    "it is of Mitsuba 0.6's bdpt; here emitters and sensors are always sampled directly too, weighted with "
+    "all other strategies; leave it out"
+)
+REMEDIES = {
+    "samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass",
+    "lightImage": _LIGHT_IMAGE,
+    "light_image": _LIGHT_IMAGE,
+    "sampleDirect": _SAMPLE_DIRECT,
+    "sample_direct": _SAMPLE_DIRECT,
+}
+
 # Of one array.
 MOST_NUMBERS = 1 << 32
 
@@ -118,7 +136,7 @@ def _check_names(props):
     for name in props.keys():
         if name in known:
             continue
-        remedy = {"samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass"}.get(name)
+        remedy = REMEDIES.get(name)
         if remedy is None:
             near = difflib.get_close_matches(name, known, 1)
             remedy = (f"did you mean {near[0]}? " if near else "") + f"Parameters: {', '.join(known)}"
