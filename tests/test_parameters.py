@@ -1089,6 +1089,25 @@ def test_derivatives_are_refused():
 REFUSED = (NotImplementedError, RuntimeError)
 
 
+@pytest.mark.parametrize("method", ["render", "decide", "explain"])
+def test_frozen_functions_are_refused_in_words(method):
+    """Rationale: Dr.Jit's own words are "reading from evaluated variables while recording a frozen function",
+    of a number deep inside. Expected: a cause and a remedy, of which each is tried: outside of the function,
+    and where freezing is switched off, the render goes as ever."""
+    scene, bdpt = glowing_sphere(size=4), integrator(max_depth=2)
+
+    def call(number):
+        return getattr(bdpt, method)(scene, spp=1), number + 1
+
+    with pytest.raises(RuntimeError) as caught:
+        dr.freeze(call)(mi.Float(1, 2))
+    cause = caught.value.__cause__
+    assert isinstance(cause, NotImplementedError)
+    assert re.match("bdpt: .*dr.freeze is not supported.*call render outside", str(cause))
+    call(mi.Float(1, 2))
+    dr.freeze(call, enabled=False)(mi.Float(1, 2))
+
+
 def test_variants():
     """Expected: scalar and polarized variants are refused in words; the other ones of this machine, if
     compiled in, render the sphere (radiance 1 within 5 %)."""

@@ -113,7 +113,8 @@ that is called with a `rendering.PassReport` after each pass.
 
 Not supported, and refused in words: scalar and polarized variants, participating media (also in shape
 groups; a medium that an emitter lies in is ignored, as by ``volpath``), derivatives
-(all other methods of ``integrator`` ignore gradients), ``strategy_images`` on a ``specfilm``. Threads need a
+(all other methods of ``integrator`` ignore gradients), renders under ``dr.freeze``, ``strategy_images`` on a
+``specfilm``. Threads need a
 scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where one cannot
 have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and ``explain``
 says so.

@@ -8,6 +8,7 @@ import os
 from fractions import Fraction
 from numbers import Integral, Real
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -207,6 +208,16 @@ def check_variant():
         raise NotImplementedError(
             f"bdpt: the variant {variant} is polarized, which is not supported; use "
             f"{variant.replace('_polarized', '')}"
+        )
+
+
+def check_not_frozen():
+    """Raise ``NotImplementedError`` while a function is recorded by ``dr.freeze``."""
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise NotImplementedError(
+            "bdpt: a render inside of a function under dr.freeze is not supported: its passes are planned "
+            "from numbers that it reads; call render outside of the function, without dr.freeze (the kernels "
+            "of a second render are reused in any case)"
         )
 
 

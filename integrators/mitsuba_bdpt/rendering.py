@@ -20,7 +20,7 @@ from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
 from .moments import Moments
 from .objects import nothing_freed, step_by_step
-from .parameters import check_film, check_scene, check_variant, integer
+from .parameters import check_film, check_not_frozen, check_scene, check_variant, integer
 from .passes import REPLICATES, Step, batches, schedule
 from .plan import Settings, lost_paths, plan
 from .sinks import Image
@@ -78,6 +78,7 @@ class Render:
 
     def __init__(self, scene, sensor, settings: Settings, seed, spp: int):
         check_variant()
+        check_not_frozen()
         check_scene(scene, sensor)
         colour = check_film(sensor, settings)
         self.started = time.perf_counter()
