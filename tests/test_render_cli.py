@@ -369,9 +369,55 @@ def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
     assert " 24 spp " in capsys.readouterr().out
 
 
-def test_missing_scene_is_reported(scene, capsys):
-    assert main(["render", "missing.xml"]) == 1
-    assert "scene='missing.xml' is not a file" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("plian.xml", "the folder '.' has the scene files other.xml, plain.xml; did you mean plain.xml?"),
+        ("PLAIN.XML", "the folder '.' has the scene files other.xml, plain.xml; did you mean plain.xml?"),
+        ("xyzzy", "the folder '.' has the scene files other.xml, plain.xml"),
+        (".", "the folder '.' has the scene files other.xml, plain.xml"),
+        ("nowhere/plain.xml", "there is no folder 'nowhere'"),
+        ("empty/plain.xml", "the folder 'empty' has no scene files (.xml)"),
+    ],
+)
+def test_missing_scene_is_reported(scene, capsys, name, words):
+    Path("other.xml").write_text(SCENE)
+    Path("empty").mkdir()
+    assert main(["render", name]) == 1
+    assert f"scene={name!r} is not a file; {words}\n" in capsys.readouterr().err
+    assert not Path("renders").exists()
+
+
+MISTYPED = [
+    (["--integrator", "bdtp"], "integrator='bdtp' is not a plugin; did you mean bdpt?"),
+    (["--integrator", "Path"], "did you mean path?"),
+    (["--integrator", "prbvolpth"], "did you mean prbvolpath?"),
+    (["--integrator", "xyzzy"], "integrator='xyzzy' is not a plugin; use for example bdpt"),
+    (["-Dintegrator=pth"], 'Plugin "pth" not found! Did you mean path?'),
+    (["-Dlihgt=1"], "-D lihgt: no parameter of the scene; it has integrator=path, format=float32, light=2"),
+    (["-Dlihgt=1"], "; did you mean light?"),
+    (["-Dprat=1"], "it has integrator=path, format=float32, light=2, width, part=3; did you mean part?"),
+    (["-Dprat=1", "-Dxyzzy=2"], "-D prat, xyzzy: no parameter of the scene"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), MISTYPED)
+def test_mistyped_names_are_answered_with_those_that_exist(scene, capsys, arguments, words):
+    """Expected: of ``-D`` those of an included file too, with a default or without."""
+    if "prat" in arguments[0]:
+        Path("part.xml").write_text('<scene version="3.0.0"><default name="part" value="3"/></scene>')
+        text = SCENE.replace("<default", '<include filename="part.xml"/><default', 1)
+        scene.write_text(text.replace('name="width" value="6"', 'name="width" value="$width"'))
+        arguments = [*arguments, "-Dwidth=6"]
+    assert main(["render", str(scene), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and words in error and error.count("\n") == 1
+
+
+def test_a_parameter_without_a_value_is_reported(scene, capsys):
+    scene.write_text(SCENE.replace('<default name="light" value="2"/>', ""))
+    assert main(["render", str(scene)]) == 1
+    assert "undefined parameter: $light; give it a value: -D light=VALUE" in capsys.readouterr().err
 
 
 def test_scene_without_sensor_is_reported(scene, capsys):

@@ -12,7 +12,6 @@ not finite count as 0 too, and are counted.
 
 from __future__ import annotations
 
-import difflib
 import re
 
 import drjit as dr
@@ -20,6 +19,7 @@ import mitsuba as mi
 
 from .points import Purpose
 from .sensor_records import Region
+from .similar import did_you_mean
 
 # What ``aov`` of Mitsuba 3.9.1 knows.
 KINDS = (
@@ -48,11 +48,9 @@ def check_syntax(aovs: str):
                 "'albedo:albedo,nn:sh_normal'"
             )
         if kind not in KINDS:
-            near = difflib.get_close_matches(kind, KINDS, 1)
             raise ValueError(
                 f"bdpt: aovs={aovs!r}: {kind!r} is not a kind of feature; "
-                + (f"did you mean {near[0]}? " if near else "")
-                + f"Kinds: {', '.join(KINDS)}"
+                f"{did_you_mean(kind, KINDS)}Kinds: {', '.join(KINDS)}"
             )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import pkgutil
 import re
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from xml.etree import ElementTree
 import mitsuba as mi
 
 from . import features
+from .similar import did_you_mean
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
@@ -24,6 +26,9 @@ NOT_CARRIED = {
 
 AROUND = ("aov", *NOT_CARRIED)
 """Mitsuba's integrators around another one."""
+
+LISTED = 8
+"""Names that a message lists, at most."""
 
 # What files in other encodings than UTF-8 begin with: a byte order mark, or the first "<" of a file without.
 # Of two that fit the first counts.
@@ -80,8 +85,7 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if options.variant not in mi.variants():
         known = ", ".join(mi.variants())
         raise ValueError(f"variant={options.variant!r} is not one of Mitsuba's: {known}.")
-    if not options.scene.is_file():
-        raise ValueError(f"scene={str(options.scene)!r} is not a file.")
+    check_file(options.scene)
     try:
         mi.set_variant(options.variant)
     except ImportError as error:
@@ -90,6 +94,17 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
             "use an LLVM variant, for example llvm_ad_rgb."
         ) from error
     mi.file_resolver().prepend(str(options.scene.resolve().parent))
+    try:
+        return _load(options)
+    except RuntimeError as error:
+        better = _in_words(str(error), options)
+        if better is None:
+            raise
+        raise ValueError(better) from error
+
+
+def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+    """`load`, of a scene file that exists and with the variant set."""
     overrides = dict(options.properties)
     if options.time is not None:
         overrides["timeout"] = options.time
@@ -113,6 +128,77 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if node is not None:
         return scene, scene.integrator()
     return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+
+
+def check_file(scene: Path) -> None:
+    """Raise ``ValueError`` if the ``scene`` file does not exist."""
+    if not scene.is_file():
+        raise ValueError(f"scene={str(scene)!r} is not a file; {_scenes_near(scene)}")
+
+
+def _scenes_near(scene: Path) -> str:
+    """What there is in place of the ``scene`` file that does not exist."""
+    folder = scene if scene.is_dir() else scene.parent
+    if not folder.is_dir():
+        return f"there is no folder {str(folder)!r}"
+    there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() == ".xml")
+    if not there:
+        return f"the folder {str(folder)!r} has no scene files (.xml)"
+    more = f" and {len(there) - LISTED} more" if len(there) > LISTED else ""
+    listed = f"the folder {str(folder)!r} has the scene files {', '.join(there[:LISTED])}{more}"
+    return f"{listed}; {did_you_mean(scene.name, there)}".rstrip("; ")
+
+
+def _in_words(error: str, options: Namespace) -> str | None:
+    """What to say instead of Mitsuba's ``error`` about a name that it does not know, which is alike; None
+    for other errors."""
+    unused = [name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.M)]
+    if "unused parameters" in error and unused:
+        known = parameters(options.scene)
+        named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
+        text = f"-D {', '.join(unused)}: no parameter of the scene; it has {named or 'none'}; "
+        return (text + "".join(did_you_mean(name, known) for name in unused)).rstrip("; ")
+    missing = re.search(r"undefined parameter: \$(\w+)", error)
+    if missing:
+        return f"{error}; give it a value: -D {missing[1]}=VALUE"
+    missing = re.search(r'Plugin "([^"]*)" not found', error)
+    if not missing:
+        return None
+    question = did_you_mean(missing[1], plugins())
+    if missing[1] == options.integrator:
+        return f"integrator={missing[1]!r} is not a plugin; {question or 'use for example bdpt'}".rstrip()
+    return f"{error} {question.capitalize()}".rstrip() if question else None
+
+
+def parameters(scene: Path) -> dict[str, str]:
+    """The parameters that ``-D`` can set in a scene file and those that it includes, with their defaults,
+    empty if there are none."""
+    found, files, done = {}, [scene], set()
+    while files:
+        file = files.pop(0)
+        if file in done or not file.is_file():
+            continue
+        done.add(file)
+        try:
+            there = elements(file)
+        except ValueError:  # Mitsuba takes more for XML
+            continue
+        for element in there:
+            for value in element.attrib.values():
+                found |= {name: found.get(name, "") for name in re.findall(r"\$(\w+)", value)}
+            if element.tag == "default":
+                name = element.get("name", "")
+                found[name] = found.get(name) or element.get("value", "")
+            if element.tag == "include":
+                files.append(scene.parent / element.get("filename", ""))
+    return found
+
+
+def plugins() -> list[str]:
+    """Names of the plugins of Mitsuba and of this package; others may have been registered too."""
+    modules = [module.name for module in pkgutil.iter_modules(mi.ad.integrators.__path__)]
+    files = (Path(mi.__file__).parent / "plugins").iterdir()
+    return ["bdpt", *modules, *sorted(path.stem for path in files)]
 
 
 def replace_integrator(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import os
 from fractions import Fraction
@@ -16,6 +15,7 @@ from . import choice, features, mis, points
 from .colour import Bands, film_colours
 from .objects import all_shapes
 from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
+from .similar import did_you_mean
 from .strategies import layer_names
 
 # What numbers mean, for messages.
@@ -139,8 +139,7 @@ def _check_names(props):
             continue
         remedy = REMEDIES.get(name)
         if remedy is None:
-            near = difflib.get_close_matches(name, known, 1)
-            remedy = (f"did you mean {near[0]}? " if near else "") + f"Parameters: {', '.join(known)}"
+            remedy = f"{did_you_mean(name, known)}Parameters: {', '.join(known)}"
         raise ValueError(f"bdpt: {name}={props[name]!r} is not a parameter; {remedy}")
 
 

@@ -23,7 +23,7 @@ import mitsuba_bdpt
 
 from . import checkpoints, cluster
 from .files import check_format, check_writable, replacing
-from .loading import choose_sensor, load
+from .loading import check_file, choose_sensor, load
 
 UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""
@@ -51,6 +51,7 @@ class Outcome:
 def run(options: Namespace) -> int:
     """Render as the command line `options` say and return the exit status."""
     try:
+        check_file(options.scene)  # before a folder is made for its image
         output = options.output or Path("renders") / f"{options.scene.stem}.exr"
         prepare_output(output)
         check_options(options, output)
