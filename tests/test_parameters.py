@@ -17,6 +17,7 @@ import mitsuba_bdpt
 import numpy as np
 import pytest
 from mitsuba_bdpt import connect, passes, rendering
+from mitsuba_bdpt.parameters import check_variant
 from mitsuba_bdpt.world import World
 
 T = mi.ScalarTransform4f
@@ -1148,6 +1149,15 @@ def test_variants():
             assert abs(result.mean() / expected - 1) < 0.05, variant
             seen.append(variant)
     assert "llvm_ad_rgb" in seen
+
+
+@pytest.mark.parametrize("variant", ["metal_ad_rgb", "metal_ad_spectral"])
+def test_variants_on_metal_are_not_called_scalar(monkeypatch, variant):
+    """Rationale: Mitsuba may have them on macOS; they are vectorised. (None can be loaded on Linux.)"""
+    monkeypatch.setattr(mi, "variant", lambda: variant)
+    with pytest.raises(NotImplementedError, match=f"variant {variant} runs on metal.*llvm_ad_rgb") as caught:
+        check_variant()
+    assert "scalar" not in str(caught.value)
 
 
 # -- registration -----------------------------------------------------------------------------

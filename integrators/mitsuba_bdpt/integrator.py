@@ -111,7 +111,7 @@ decided: an empty text where one did, and where ``decisions`` were given.
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
 
-Not supported, and refused in words: scalar and polarized variants, participating media (also in shape
+Not supported, and refused in words: scalar, polarized and Metal variants, participating media (also in shape
 groups; a medium that an emitter lies in is ignored, as by ``volpath``), derivatives
 (all other methods of ``integrator`` ignore gradients), renders under ``dr.freeze``, ``strategy_images`` on a
 ``specfilm``. Threads need a

@@ -196,12 +196,17 @@ def read_settings(props) -> Settings:
 
 
 def check_variant():
-    """Raise ``NotImplementedError`` for variants that the method cannot serve."""
+    """Raise ``NotImplementedError`` for variants that the method cannot serve, or is not known to."""
     variant = mi.variant()
-    if not variant.startswith(("llvm", "cuda")):
+    if variant.startswith("scalar"):
         raise NotImplementedError(
             f"bdpt: the variant {variant} is scalar; use a vectorised one, for example "
             "mi.set_variant('llvm_ad_rgb')"
+        )
+    if not variant.startswith(("llvm", "cuda")):
+        raise NotImplementedError(
+            f"bdpt: the variant {variant} runs on {variant.partition('_')[0]}, where this method was never "
+            "tried; use a variant of LLVM or CUDA, for example mi.set_variant('llvm_ad_rgb')"
         )
     if mi.is_polarized:
         raise NotImplementedError(
