@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress endurance
+.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress endurance mutants
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -66,6 +66,10 @@ sweep: $(INSTALLED)
 # What was tried to break it, under twenty minutes on two cores: docs/stress.md.
 stress: $(INSTALLED)
 	$(VENV)/bin/python scripts/stress.py
+
+# Planted bugs, and whether the tests see them: a few minutes.
+mutants: $(INSTALLED)
+	$(VENV)/bin/python scripts/mutants.py
 
 # Hours of renders that look for values that are not finite; can be interrupted, and adds to docs/endurance.json.
 endurance: $(INSTALLED)

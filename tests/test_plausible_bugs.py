@@ -87,8 +87,8 @@ def test_what_is_in_front_of_a_lens_hides_the_light_from_it():
 @pytest.mark.parametrize("width, height", [(3, 1), (5, 3)])
 def test_splats_of_few_pixels_count_once(width, height):
     """Rationale: where S does not divide the samples, there are more light subpaths than 1/S of them: of
-    three pixels with S = 16, one for each three samples. A point lamp in a glass ball, whose light splats alone
-    bring to the floor. Expected: the mean that one light subpath for each camera subpath gives."""
+    three pixels with S = 16, one for each three samples. A point lamp in a glass ball, whose light splats
+    alone bring to the floor. Expected: the mean that one light subpath for each camera subpath gives."""
     ball = {"type": "sphere", "center": [0, 1, 0], "radius": 0.2, "bsdf": {"type": "dielectric"}}
     lamp = {"type": "point", "position": [0, 1.05, 0]}
     parts = {"ball": ball, "lamp": lamp, "floor": quad(2, 0), "sensor": sensor(width, height)}
@@ -101,7 +101,8 @@ def test_splats_of_few_pixels_count_once(width, height):
 def test_no_number_decides_two_things(kind):
     """Rationale: light and camera subpaths with one seed, or one dimension for two purposes, bias the image
     by what the two have to do with each other. Expected: first coordinates for all purposes at three
-    vertices of both subpaths of 4,096 samples are uncorrelated in pairs (5 standard errors of independent numbers)."""
+    vertices of both subpaths of 4,096 samples are uncorrelated in pairs (5 standard errors of independent
+    numbers)."""
     lanes = dr.arange(mi.UInt32, 4096)
     points, drawn = Points(kind, mi.UInt32(3)), []
     for side in ("camera", "light"):
