@@ -5,6 +5,7 @@ count. Tests of the real thing, what ``import mitsuba_bdpt`` does to a process, 
 """
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -150,17 +151,30 @@ def test_no_wheel_no_libraries(monkeypatch, tmp_path):
 def test_old_llvm_of_an_imported_drjit_is_refused(version):
     number = ".".join(map(str, version))
     with pytest.raises(llvm.LLVMNotFoundError, match=f"LLVM {number}.*Import mitsuba_bdpt before"):
-        llvm.check_loaded(version)
+        llvm.check_loaded(version, BARE)
 
 
 def test_imported_drjit_without_llvm_is_refused():
     with pytest.raises(llvm.LLVMNotFoundError, match="found no usable LLVM"):
-        llvm.check_loaded((-1, -1, -1))
+        llvm.check_loaded((-1, -1, -1), BARE)
+
+
+@pytest.mark.parametrize("env", [{}, {llvm.VARIABLE: "old"}])
+def test_old_llvm_of_an_imported_drjit_is_answered_with_the_library_to_take(library, env):
+    """Expected: the library that would have been chosen, the variable apart, which named the old one."""
+    new, old = library("libLLVM.so.23.1"), library("old")
+    machine = llvm.Machine({name: str(old) for name in env}, (new,), ())
+    with pytest.raises(llvm.LLVMNotFoundError) as caught:
+        llvm.check_loaded((15, 0, 7), machine)
+    assert f"set {llvm.VARIABLE}={new} before Python starts" in str(caught.value)
+    assert "import mitsuba_bdpt  # isort: skip" in str(caught.value)
+    with pytest.raises(llvm.LLVMNotFoundError, match="install a newer one"):
+        llvm.check_loaded((15, 0, 7), replace(machine, wheel=()))
 
 
 @pytest.mark.parametrize("major", [19, 21, 23])
 def test_new_llvm_of_an_imported_drjit_is_accepted(major):
-    choice = llvm.check_loaded((major, 1, 0))
+    choice = llvm.check_loaded((major, 1, 0), BARE)
     assert (choice.path, choice.origin, choice.version) == (None, "drjit", major)
 
 
@@ -199,6 +213,25 @@ def test_import_after_drjit_with_an_old_llvm_fails():
     done = run(FAKE_DRJIT + "import mitsuba_bdpt")
     assert done.returncode == 1
     assert "LLVMNotFoundError: drjit was imported first and loaded LLVM 15.0.7" in done.stderr
+
+
+def test_remedies_of_an_import_after_drjit_help():
+    """Expected: of the error's two remedies each is what it says: with the variable set as it tells the same
+    lines go, and import sorters leave the README's two lines as they stand, but for the comment."""
+    done = run(FAKE_DRJIT + "import mitsuba_bdpt")
+    path = re.search(rf"set {llvm.VARIABLE}=(\S+) before Python starts", done.stderr)[1]
+    lines = "import mitsuba, drjit\nimport mitsuba_bdpt\nprint(drjit.detail.llvm_version()[0])"
+    done = run(lines, **{llvm.VARIABLE: path})
+    assert done.stdout == f"{llvm.major_version(Path(path))}\n", done.stderr
+
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    code = re.search(r"```python\n(import mitsuba_bdpt.*?)```", readme, re.DOTALL)[1]
+    assert code.index("mitsuba_bdpt") < code.index("import mitsuba as mi")
+    ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "I", "-"]
+    sort = [
+        subprocess.run(ruff, input=text, text=True) for text in (code, code.replace("# isort: skip", "#"))
+    ]
+    assert [done.returncode for done in sort] == [0, 1]
 
 
 def test_import_after_drjit_does_not_ask_for_llvm_on_a_cuda_variant():

@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -98,14 +98,14 @@ def choose(machine: Machine) -> Choice:
     )
 
 
-def check_loaded(version: tuple[int, ...]) -> Choice:
-    """Judge the LLVM `version` of a Dr.Jit that was imported before this package.
+def check_loaded(version: tuple[int, ...], machine: Machine) -> Choice:
+    """Judge the LLVM `version` of a Dr.Jit that was imported before this package on `machine`.
 
     `version` is what ``drjit.detail.llvm_version()`` returns: negative numbers stand for none.
     """
     how = (
-        "Import mitsuba_bdpt before drjit and mitsuba, or set "
-        f"{VARIABLE} to a newer library before Python starts (set later it has no effect)."
+        "Import mitsuba_bdpt before drjit and mitsuba (where an import sorter puts it below them: "
+        f"`import mitsuba_bdpt  # isort: skip`), or {_before_start(machine)} (later it has no effect)."
     )
     if version[0] < 0:
         raise LLVMNotFoundError(f"drjit was imported first and found no usable LLVM. {how}")
@@ -128,7 +128,16 @@ def prepare() -> Choice:
     mitsuba = sys.modules.get("mitsuba")
     if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
         return Choice(None, "none", "the current variant runs on CUDA", None)
-    return check_loaded(drjit.detail.llvm_version())
+    return check_loaded(drjit.detail.llvm_version(), Machine.here())
+
+
+def _before_start(machine: Machine) -> str:
+    """What makes Dr.Jit load a usable library of `machine` by itself, to be done before Python starts."""
+    try:
+        path = choose(replace(machine, env={})).path
+    except LLVMNotFoundError:
+        return f"install a newer one and set {VARIABLE} to its path before Python starts"
+    return f"set {VARIABLE}={path} before Python starts"
 
 
 def major_version(path: Path) -> int | None:
