@@ -435,6 +435,10 @@ def test_an_even_sky_decides_without_a_pilot(monkeypatch):
     assert integrator.statistics["decisions"][0]["coefficients"]["s=1"] == choice.SKY_DIRECT
     monkeypatch.undo()
     assert choice.by_scene(of(sky()).world, of(sky()).plan, bdpt().settings, 1 << 24) is None
+    for bright, kappa in ((1.5, choice.SKY_DIRECT), (10.0, 1.0)):  # a map worth sampling gets its full weight
+        render = of(surroundings(bright=bright))
+        made = choice.by_scene(render.world, render.plan, bdpt().settings, 1 << 14)
+        assert made.direct_coefficient == kappa
     by_hand = bdpt(light_paths=1)
     by_hand.render(sky(), spp=4, develop=False)
     assert by_hand.statistics["decisions"] == [] and by_hand.statistics["rays"]["light"] > 0

@@ -34,10 +34,15 @@ LEAST_OF_MANY = 1 << 20
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
 
-# kappa of s = 1 under an even sky, where s = 0 has hardly any noise of its own. Efficiency over path with
-# multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in `open_sky`, 1.02, 1.00, 0.95 in
-# `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`.
-SKY_DIRECT = 1 / 2
+# Up to this ratio of its largest radiance to its mean a sky is even: a clear one without its sun has some
+# ten, one with it thousands.
+EVEN = 100
+
+# kappa of s = 1 under a sky of a ratio up to `UNIFORM`, where s = 0 has hardly any noise of its own; 1 under
+# other even ones. Efficiency over path with multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in
+# `open_sky`, 1.02, 1.00, 0.95 in `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`. Error of plastic
+# and metal on a floor under maps of the ratios 1.05, 5.9, 13, with 1/2 over that with 1: 0.84, 1.06, 1.06.
+SKY_DIRECT, UNIFORM = 1 / 2, 2
 
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
@@ -291,11 +296,12 @@ def by_scene(world, full: Plan, settings: Settings, samples: int) -> Decision | 
     """The decision for a render of so many ``samples`` for which the scene alone suffices, because a pilot
     would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky
     wherever its light enters, caustics included, and light subpaths hardly find the way in.)"""
-    if samples >= CHEAP_SAMPLES or not world.emitters.even_surroundings:
+    contrast = world.emitters.contrast
+    if samples >= CHEAP_SAMPLES or not contrast <= EVEN:  # also if it is no number
         return None
     if all(candidate.light_paths for candidate in candidates(world, full, settings)):
         return None
-    return Decision(0, 0.0, "none", 1.0, SKY_DIRECT, 1.0, 0.0, 0.0)
+    return Decision(0, 0.0, "none", 1.0, SKY_DIRECT if contrast <= UNIFORM else 1.0, 1.0, 0.0, 0.0)
 
 
 BY_SCENE = [

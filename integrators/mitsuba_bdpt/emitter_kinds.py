@@ -37,11 +37,7 @@ POSITIONS = (POINT, SPOT, PROJECTOR)
 # only one face is sampled (a cube: a sixth).
 _TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
 
-# Ratio of the largest radiance of an environment to its mean up to which it is even: a clear sky without its
-# sun has some ten, one with it thousands.
-EVEN = 100
-
-# Numbers of an environment map that are looked at for that, at most: 4 ms.
+# Numbers of an environment map that are looked at for its contrast, at most: 4 ms.
 _QUICKLY_READ = 1 << 20
 
 _CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
@@ -75,20 +71,21 @@ def _tells_its_points(emitter) -> bool:
     return not _reads_attributes(children(emitter)["radiance"])
 
 
-def is_even(emitter) -> bool:
-    """Whether an emitter is an environment whose radiance is nowhere more than `EVEN` times its mean; false
-    also where that would take long to find out, or where the numbers of an ``envmap`` are not radiances."""
+def contrast(emitter) -> float:
+    """The largest radiance of an environment over its mean; infinite for other emitters, and where that would
+    take long to find out, or where the numbers of an ``envmap`` are not radiances."""
     kind = emitter.class_name()
     if kind == "ConstantBackgroundEmitter":
-        return True
+        return 1.0
     if kind != "EnvironmentMapEmitter" or mi.is_spectral:
-        return False
+        return math.inf
     data = own_parameters(emitter)["data"]
     if dr.width(data) > _QUICKLY_READ:
-        return False
+        return math.inf
     pixels = np.array(data).max(axis=-1)
     rows = np.sin(np.pi * (np.arange(len(pixels)) + 0.5) / len(pixels))
-    return bool(pixels.max() <= EVEN * (pixels.mean(axis=1) @ rows) / rows.sum())
+    mean = float((pixels.mean(axis=1) @ rows) / rows.sum())
+    return float(pixels.max()) / mean if mean > 0 else 1.0
 
 
 def _reads_attributes(texture) -> bool:

@@ -19,6 +19,7 @@ spheres, d^2/cos, environments).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -36,7 +37,7 @@ from .emitter_kinds import (
     PROJECTOR,
     UNKNOWN,
     UNSAMPLED,
-    is_even,
+    contrast,
     is_foreign,
     is_hittable,
     is_lit_directly,
@@ -168,10 +169,9 @@ class Emitters:
                 check_densities(self, index)
 
     @cached_property
-    def even_surroundings(self) -> bool:
-        """Whether all light comes from environments without bright spots, see `emitter_kinds.is_even`."""
-        emitters = self.scene.emitters()
-        return bool(emitters) and all(is_even(emitter) for emitter in emitters)
+    def contrast(self) -> float:
+        """The largest `emitter_kinds.contrast`: infinite unless all light comes from environments."""
+        return max((contrast(emitter) for emitter in self.scene.emitters()), default=math.inf)
 
     def _read_shapes(self, scene, emitters, kinds):
         """Areas of the emitting shapes, how their points are chosen, and their geometric normals."""
