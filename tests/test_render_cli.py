@@ -518,3 +518,14 @@ def test_script_is_the_command(scene):
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert Path("a.exr").exists() and Path("a.png").exists()
+
+
+def test_explain(scene, capsys):
+    """Expected: the command says what a render would do, by bdpt whatever integrator the scene has, with the
+    scene's samples, definitions and properties; no image is written. What is wrong is said as by render."""
+    assert main(["explain", str(scene), "-P", "max_depth=1", "-Dlight=3"]) == 0
+    said = capsys.readouterr().out
+    assert "used: s=0" in said and "max_depth=1 allows no such path" in said and "no pilot" in said
+    assert main(["explain", str(scene), "-P", "max_depth=oops"]) == 1
+    assert "max_depth" in capsys.readouterr().err
+    assert list(scene.parent.iterdir()) == [scene]

@@ -1,8 +1,8 @@
 """The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
 
-``render`` renders a scene file; ``doctor`` explains what the installation found and whether it
-works. The rest of the package is imported inside `main`, because `doctor` has to run where it
-cannot be imported.
+``render`` renders a scene file; ``explain`` says what such a render would do and what it would leave out;
+``doctor`` explains what the installation found and whether it works. The rest of the package is imported
+inside `main`, because `doctor` has to run where it cannot be imported.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     from . import render
 
-    return render.run(options)
+    return render.explain(options) if options.command == "explain" else render.run(options)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -49,17 +49,45 @@ def build_parser() -> argparse.ArgumentParser:
 
     help_text = "render a Mitsuba scene file to an EXR and a PNG image"
     add_render_arguments(commands.add_parser("render", help=help_text, description=help_text))
+
+    help_text = (
+        "say which strategies a render of a scene file uses, which it skips, and what light none finds"
+    )
+    explain = commands.add_parser("explain", help=help_text, description=help_text)
+    add_scene_arguments(explain)
+    explain.set_defaults(integrator="bdpt", time=None, until_error=None)
     return parser
 
 
-def add_render_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``render``; letters and ``-D``, ``-s``, ``-m`` as in Mitsuba."""
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what ``render`` and ``explain`` need of a scene; letters and ``-D``, ``-s``, ``-m`` as in
+    Mitsuba."""
     add = parser.add_argument
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
-    text = "EXR file to write, a PNG of the same name comes beside it; default: renders/SCENE.exr"
-    add("-o", "--output", type=Path, help=text)
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
     add("--spp", type=number(int, 1), help="samples per pixel; default: the scene's")
+    text = "value of a parameter $KEY of the scene; may be repeated"
+    add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
+    text = "property of the integrator, such as skip=none; may be repeated"
+    add(
+        "-P",
+        dest="properties",
+        type=property_,
+        action="append",
+        default=[],
+        metavar="K=V",
+        help=text,
+    )
+    text = "index of the sensor; default: %(default)s"
+    add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
+
+
+def add_render_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``render``."""
+    add_scene_arguments(parser)
+    add = parser.add_argument
+    text = "EXR file to write, a PNG of the same name comes beside it; default: renders/SCENE.exr"
+    add("-o", "--output", type=Path, help=text)
     text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
@@ -74,20 +102,6 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "replace the scene's integrator, keeping depth, hide_emitters, timeout, layers of aov"
     add("--integrator", metavar="TYPE", help=text)
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
-    text = "value of a parameter $KEY of the scene; may be repeated"
-    add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
-    text = "property of the integrator, such as skip=none; may be repeated"
-    add(
-        "-P",
-        dest="properties",
-        type=property_,
-        action="append",
-        default=[],
-        metavar="K=V",
-        help=text,
-    )
-    text = "index of the sensor to render; default: %(default)s"
-    add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
     text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
     add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
 

@@ -40,8 +40,9 @@ EVEN = 100
 
 # kappa of s = 1 under a sky of a ratio up to `UNIFORM`, where s = 0 has hardly any noise of its own; 1 under
 # other even ones. Efficiency over path with multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in
-# `open_sky`, 1.02, 1.00, 0.95 in `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`. Error of plastic
-# and metal on a floor under maps of the ratios 1.05, 5.9, 13, with 1/2 over that with 1: 0.84, 1.06, 1.06.
+# `open_sky`, 1.02, 1.00, 0.95 in `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`. Error of
+# plastic and metal on a floor under maps of the ratios 1.05, 5.9, 13, with 1/2 over that with 1: 0.84, 1.06,
+# 1.06.
 SKY_DIRECT, UNIFORM = 1 / 2, 2
 
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)

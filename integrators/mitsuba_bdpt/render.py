@@ -76,6 +76,20 @@ def run(options: Namespace) -> int:
     return INTERRUPTED if outcome.interrupted else 0
 
 
+def explain(options: Namespace) -> int:
+    """Print what a render as the command line `options` say would do, and return the exit status."""
+    try:
+        check_file(options.scene)
+        scene, integrator = load(options)
+        sensor = choose_sensor(scene, options.sensor)
+        spp = options.spp or sensor.sampler().sample_count()
+        print(integrator.explain(scene, sensor, spp))
+    except (OSError, RuntimeError, TypeError, ValueError) as error:
+        print(f"error: {message(error)}", file=sys.stderr)
+        return 1
+    return 0
+
+
 def message(error: Exception) -> str:
     """The text of `error`; of a Python traceback that Mitsuba has put into it, the last line only."""
     before, traceback, rest = str(error).partition("Traceback (most recent call last):")
