@@ -414,6 +414,66 @@ def test_mistyped_names_are_answered_with_those_that_exist(scene, capsys, argume
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("change", "arguments", "words"),
+    [
+        ((), ["-P", "foo=1", "-P", "bar=x"], "-P foo, -P bar: no parameter of the integrator path; leave"),
+        ((), ["-m", "LLVM_AD_RGB"], "; did you mean llvm_ad_rgb?"),
+        ((), ["-o", "/proc/none/a.exr"], "output='/proc/none/a.exr' cannot be written (No such file"),
+        ((), ["-o", "plain.xml/a.exr"], "name another with -o"),
+        (
+            (),
+            ["--integrator", "bdpt", "--spp", "9999999999"],
+            "spp=9999999999 is out of range.*at most 42949672",
+        ),
+        (('"constant"', '"cnstant"'), [], 'Plugin "cnstant" not found! Did you mean constant?'),
+        (('"hdrfilm"', '"hdr"'), [], "Did you mean hdrfilm?"),
+        (("<emitter", '<shape type="ply"><string name="filename" value="blal.ply"/></shape><emitter'), [])
+        + ("folder '{folder}'; did you mean ball.ply?",),
+        (("<emitter", '<shape type="obj"><string name="filename" value="no/x.obj"/></shape><emitter'), [])
+        + ("there is no folder '{folder}/no': names of files start at the folder of the scene file",),
+        (('type="constant">', 'type="envmap"><string name="filename" value="sky.exr"/>'), [])
+        + ("it is not in the folder '{folder}'\n",),
+        (
+            (
+                'type="$integrator">',
+                'type="aov"><string name="aovs" value="a:depth"/><integrator type="bdpt">',
+            ),
+            ["-P", "aovs=b:depth"],
+            "the command's --integrator bdpt takes layers of aov over",
+        ),
+    ],
+)
+def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, words):
+    Path("ball.ply").touch()
+    if change:
+        assert change[0] in SCENE
+        text = SCENE.replace(*change)
+        if "bdpt" in change[1]:
+            text = text.replace("</integrator>", "</integrator></integrator>")
+            text = text.replace('<default name="integrator" value="path"/>', "")
+        scene.write_text(text)
+    assert main(["render", str(scene), *arguments]) == 1
+    error = capsys.readouterr().err
+    words = re.escape(words.replace("{folder}", str(scene.parent))).replace(r"\.\*", ".*")
+    assert error.startswith("error: ") and re.search(words, error), error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "question"),
+    [
+        (["plain.xml"], "did you mean render plain.xml?"),
+        (["rendr", "plain.xml"], "did you mean render?"),
+        (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
+        (["render", "plain.xml", "--untl-error=1"], "did you mean --until-error?"),
+    ],
+)
+def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys, arguments, question):
+    with pytest.raises(SystemExit) as caught:
+        build_parser().parse_args(arguments)
+    assert caught.value.code == 2 and capsys.readouterr().err.endswith(f"; {question}\n")
+
+
 def test_a_parameter_without_a_value_is_reported(scene, capsys):
     scene.write_text(SCENE.replace('<default name="light" value="2"/>', ""))
     assert main(["render", str(scene)]) == 1

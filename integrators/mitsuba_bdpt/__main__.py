@@ -9,11 +9,15 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import mitsuba_bdpt
+
+from .similar import did_you_mean
 
 PropertyValue = bool | int | float | str
 
@@ -35,11 +39,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return render.explain(options) if options.command == "explain" else render.run(options)
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors ask whether another command or option was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        known = [*self._option_string_actions]
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                known += [*action.choices]
+                known += [
+                    name for parser in action.choices.values() for name in parser._option_string_actions
+                ]
+        wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
+        if wrong:
+            name = wrong[1] or wrong[2]
+            scene = wrong[1] and name.lower().endswith(".xml")
+            question = f"did you mean render {name}?" if scene else did_you_mean(name, known)
+            message = f"{message}; {question}".rstrip("; ")
+        super().error(message)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = argparse.ArgumentParser(
-        prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3."
-    )
+    parser = Parser(prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3.")
     parser.add_argument("--version", action="version", version=mitsuba_bdpt.__version__)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 

@@ -223,7 +223,8 @@ def _make_class():
         def sample(self, *args, **kwargs):
             raise NotImplementedError(
                 "bdpt: cannot be nested in another integrator (aov, moment, stokes): light subpaths "
-                "reach pixels other than their own; render with bdpt itself, which has a parameter aovs"
+                "reach pixels other than their own; render with bdpt itself, which has a parameter aovs "
+                "(the command's --integrator bdpt takes layers of aov over)"
             )
 
         def render_forward(self, *args, **kwargs):

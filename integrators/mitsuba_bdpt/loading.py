@@ -84,7 +84,10 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     """Load the scene and the integrator to render it with."""
     if options.variant not in mi.variants():
         known = ", ".join(mi.variants())
-        raise ValueError(f"variant={options.variant!r} is not one of Mitsuba's: {known}.")
+        question = did_you_mean(options.variant, mi.variants())
+        raise ValueError(
+            f"variant={options.variant!r} is not one of Mitsuba's: {known}; {question}".rstrip("; ")
+        )
     check_file(options.scene)
     try:
         mi.set_variant(options.variant)
@@ -149,6 +152,23 @@ def _scenes_near(scene: Path) -> str:
     return f"{listed}; {did_you_mean(scene.name, there)}".rstrip("; ")
 
 
+def _files_near(scene: Path, name: str) -> str:
+    """Where Mitsuba looked for a file of the ``scene`` that does not exist, and what it may be; empty if the
+    scene file itself does not have this ``name``, of which Mitsuba may tell the last part only."""
+    try:
+        texts = [element.get("value", "") for element in elements(scene)]
+    except ValueError:  # Mitsuba takes more for XML
+        return ""
+    files = [scene.parent / text for text in texts if text == name or Path(text).name == name]
+    if not files:
+        return ""
+    folder = files[0].parent
+    if not folder.is_dir():
+        return f"; there is no folder {str(folder)!r}: names of files start at the folder of the scene file"
+    question = did_you_mean(files[0].name, sorted(path.name for path in folder.iterdir()))
+    return f"; it is not in the folder {str(folder)!r}; {question}".rstrip("; ")
+
+
 def _in_words(error: str, options: Namespace) -> str | None:
     """What to say instead of Mitsuba's ``error`` about a name that it does not know, which is alike; None
     for other errors."""
@@ -161,6 +181,15 @@ def _in_words(error: str, options: Namespace) -> str | None:
     missing = re.search(r"undefined parameter: \$(\w+)", error)
     if missing:
         return f"{error}; give it a value: -D {missing[1]}=VALUE"
+    missing = re.search(
+        r'"([^"]+)": (I/O error while attempting to open file: No such|file not found)', error
+    )
+    if missing:
+        return f"{error}{_files_near(options.scene, missing[1])}"
+    strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
+    given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
+    if given:
+        return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
     missing = re.search(r'Plugin "([^"]*)" not found', error)
     if not missing:
         return None

@@ -24,7 +24,7 @@ MEANING = {
     "rr_depth": "the depth at which Russian roulette starts, 1 or more",
     "stored_vertices": f"the longest path that uses all strategies, 1 to {MAX_STORED}",
     "spp_per_pass": "samples per pixel in one pass, 0 to choose",
-    "spp": "samples per pixel, 0 for the sampler's sample_count",
+    "spp": f"samples per pixel, at most {UNLIMITED}, 0 for the sampler's sample_count",
     "seed": "any number from 0 to 2^32 - 1",
 }
 

@@ -102,9 +102,14 @@ def prepare_output(output: Path) -> None:
         raise ValueError(f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case.")
     for path in (output, output.with_suffix(".png")):
         check_format(path, output)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    for path in (output, output.with_suffix(".png")):
-        check_writable(path)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        for path in (output, output.with_suffix(".png")):
+            check_writable(path)
+    except OSError as error:
+        raise ValueError(
+            f"output={str(output)!r} cannot be written ({error.strerror}); name another with -o."
+        ) from error
 
 
 def check_options(options: Namespace, output: Path) -> None:
