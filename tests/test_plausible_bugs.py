@@ -57,6 +57,29 @@ def test_light_on_a_hidden_lamp_is_not_splatted():
     assert agree(alone, means(scene, hide_emitters=True, skip="none"))
 
 
+def test_a_ball_is_seen_as_it_is_through_a_hidden_lamp():
+    """Rationale: `path` shades what lies behind a hidden lamp at a wrong point of spheres. The pole of a
+    matte ball, which looks the same from everywhere: seen through the lamp above it, and from below the lamp.
+    Expected: the same radiance by camera subpaths alone and by all strategies, within 1 % (the view's
+    edges differ by less); `path` finds a ninth of it."""
+
+    to_world = T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.8)
+    lamp = {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area", "radiance": 4.0}}
+
+    def pole(height):
+        to_world = T().look_at([0, height, 0], [0, 0, 0], [0, 0, 1])
+        ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+        view = sensor(4, 4, to_world=to_world, fov=0.5 * 6 / height)
+        return mi.load_dict({"type": "scene", "lamp": lamp, "ball": ball, "sensor": view})
+
+    hidden = {"hide_emitters": True, "spp": 256}
+    right = means(pole(1.5), light_paths=0, **hidden)
+    for parameters in ({"light_paths": 0}, {"skip": "none"}):
+        assert np.mean(means(pole(6.0), **parameters, **hidden)) == pytest.approx(np.mean(right), rel=0.01)
+    path = mi.load_dict({"type": "path", "max_depth": 4, "hide_emitters": True})
+    assert np.mean(path.render(pole(6.0), spp=256)) < 0.2 * np.mean(right)
+
+
 def test_what_is_in_front_of_a_lens_hides_the_light_from_it():
     """Rationale: the lens is no shape, so that light subpaths that cross it (t = 0) have to be told what is
     in between. A lamp that shines at a large lens through a black plate. Expected: a black image."""
