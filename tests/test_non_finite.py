@@ -6,12 +6,10 @@ expected of each and the reason of each tolerance; the quick ones are run by tes
 
 import math
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import suspects
-from mitsuba_bdpt.objects import children
 from stress_cases import cases
 from stress_cases.poisons import NAN, filled, painted, room
 from stress_cases.warned import Warned
@@ -119,61 +117,3 @@ def test_coefficients_of_spectra_are_no_reflectances():
         assert "reflectance up to 1.5" in suspects.brighteners(bsdfs[1:])[0]
     finally:
         mi.set_variant(before)
-
-
-def picture(dtype, raw):
-    """A bitmap that has every value of its type."""
-    texels = np.linspace(0, 255, 16 * 16 * 3).reshape(16, 16, 3).astype(dtype)
-    return {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": raw, "filter_type": "nearest"}
-
-
-@pytest.mark.parametrize("raw", [False, True])
-def test_bytes_of_a_picture_are_shares_of_255(raw):
-    """Rationale: Mitsuba keeps the bytes of PNG and JPEG files as they are, and all were said to return
-    up to 255 times the light that arrives. Expected: nothing is said of bytes, their brightest texel reflects
-    1; the same numbers in single precision are still named."""
-    kinds = (np.uint8, np.float32)
-    byte, number = (mi.load_dict({"type": "diffuse", "reflectance": picture(k, raw)}) for k in kinds)
-    si = dr.zeros(mi.SurfaceInteraction3f)
-    si.wi, si.uv = mi.Vector3f(0, 0, 1), mi.Point2f(0.999, 0.999)
-    assert dr.allclose(byte.eval_diffuse_reflectance(si).z, 1)
-    assert suspects.brighteners([byte]) == []
-    assert len(suspects.brighteners([number])) == 1
-
-
-def test_bsdfs_without_a_name_are_those_of_a_shape():
-    """Expected: a BSDF that has no id is named by the nearest object around it that has one: the BSDF that it
-    is inside of, else the shape."""
-    loud = {"type": "diffuse", "reflectance": picture(np.float32, True)}
-    outer = mi.load_dict({"type": "twosided", "inner": loud})
-    inner = next(iter(children(outer).values()))  # on both sides
-    inner.set_id("")
-    for name, shapes, said in (
-        ("paint", ["ball"], "a BSDF of BSDF 'paint'"),
-        ("", ["ball"], "a BSDF of shape 'ball'"),
-        ("", None, "a BSDF of a shape without id"),
-    ):
-        outer.set_id(name)
-        (found,) = suspects.brighteners([outer], shapes)
-        assert found == f"{said} has reflectance up to 255"
-
-
-def test_a_warning_is_said_once():
-    """Rationale: a sequence of renders said the same at each. Expected: an integrator says it once, another
-    one once more."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "ball": {
-                "type": "sphere",
-                "bsdf": {"type": "diffuse", "reflectance": picture(np.float32, True)},
-            },
-            "sky": {"type": "constant"},
-            "sensor": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
-        }
-    )
-    for integrator in (mi.load_dict({"type": "bdpt", "max_depth": 2}) for _ in range(2)):
-        with Warned() as texts:
-            for seed in range(3):
-                integrator.render(scene, seed=seed, spp=1)
-        assert sum("more light returns" in text for text in texts) == 1

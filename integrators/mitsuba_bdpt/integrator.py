@@ -13,7 +13,6 @@ import mitsuba as mi
 from . import choice
 from .explain import explain
 from .features import feature_names
-from .objects import all_shapes, is_instance
 from .parameters import check_made_for, check_variant, integer, is_index, read_settings
 from .passes import REPLICATES
 from .plan import UNLIMITED
@@ -21,6 +20,7 @@ from .rendering import Render
 from .snapshot import Snapshot
 from .strategies import layer_names
 from .suspects import brighteners, narrow_spots, not_finite
+from .world import bsdfs
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
 
@@ -145,14 +145,6 @@ def _make_class():
             self.statistics = {}
             self.on_pass = None
             self._cancelled = False
-            self._said = set()  # warnings: one each, however often it renders
-
-        def _warn_once(self, texts):
-            """Log warnings that this integrator has not said yet: a scene is often rendered many times."""
-            for text in texts:
-                if text not in self._said:
-                    self._said.add(text)
-                    mi.Log(mi.LogLevel.Warn, text)
 
         def cancel(self):
             """End the render that is running after its next pass, from ``on_pass`` or another thread."""
@@ -183,7 +175,7 @@ def _make_class():
             if start is not None:
                 _check_resumable(start, self.settings)
                 render.resume(start)
-            self._warn_once(_suspects(scene))
+            _warn_of_suspects(scene)
             try:
                 self._cancelled = False
                 render.run(self.on_pass, lambda: self._cancelled)
@@ -355,22 +347,20 @@ def _log(statistics: dict):
         )
 
 
-def _suspects(scene) -> list[str]:
-    """Warnings about parameters of the scene that spoil images."""
-    shapes = [shape for shape in all_shapes(scene) if not is_instance(shape) and shape.bsdf() is not None]
-    bright = brighteners([shape.bsdf() for shape in shapes], [shape.id() for shape in shapes])
-    narrow, found = narrow_spots(scene), []
+def _warn_of_suspects(scene):
+    bright, narrow = brighteners(bsdfs(scene)), narrow_spots(scene)
     if bright:
-        found.append(
+        mi.Log(
+            mi.LogLevel.Warn,
             f"bdpt: {_some(bright)}: more light returns than arrives, and where it cannot "
-            "leave the image has no limit as max_depth grows; keep such parameters at 1 or below"
+            "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
         )
     if narrow:
-        found.append(
+        mi.Log(
+            mi.LogLevel.Warn,
             f"bdpt: {_some(narrow)}: Mitsuba rounds how the light falls off across so narrow a cone, with "
-            "every integrator, and strategies do not agree about it; make it 0.2 degrees or more"
+            "every integrator, and strategies do not agree about it; make it 0.2 degrees or more",
         )
-    return found
 
 
 def _some(found: list[str]) -> str:

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import bsdf
 from .objects import children, number, own_parameters
 
 # What names of a BSDF's textures say that they scale the light that it scatters.
@@ -24,36 +25,25 @@ _STEP = 2.0**-24
 # this quotient, whatever the orientation (stress case `narrow-spots`).
 _COARSE = 1e-2
 
-# Numbers of a bitmap that are looked at, at most: 1 ms.
-_QUICKLY_READ = 1 << 16
+# Numbers of a bitmap that are looked at, at most: 3 ms.
+_QUICKLY_READ = 1 << 18
 
 
-def brighteners(bsdfs, shapes=None) -> list[str]:
+def brighteners(bsdfs) -> list[str]:
     """The ``bsdfs``, and those inside them, that return more light than they receive, as far as their
-    parameters tell, in words. ``shapes``: the names of those that have them, for BSDFs without one."""
+    parameters tell, in words."""
     found, seen = [], set()
-    for bsdf, shape in zip(bsdfs, shapes or [""] * len(bsdfs), strict=True):
-        holder = f"shape '{shape}'" if shape else "a shape without id"
-        for owner, name in _named(bsdf, holder):
-            if id(owner) in seen:
+    for owner in bsdf.nested(bsdfs):
+        if id(owner) in seen:
+            continue
+        seen.add(id(owner))
+        for name, texture in children(owner).items():
+            if not name.endswith(_SCALES) or not isinstance(texture, mi.Texture):
                 continue
-            seen.add(id(owner))
-            for parameter, texture in children(owner).items():
-                if not parameter.endswith(_SCALES) or not isinstance(texture, mi.Texture):
-                    continue
-                largest = _largest(texture)
-                if largest > _MORE_THAN_ALL:
-                    found.append(f"{name} has {parameter} up to {largest:.4g}")
+            largest = _largest(texture)
+            if largest > _MORE_THAN_ALL:
+                found.append(f"BSDF '{owner.id()}' has {name} up to {largest:.4g}")
     return found
-
-
-def _named(bsdf, holder: str):
-    """``bsdf`` and those inside it, each with a name: its id, or that of the nearest ``holder`` with one."""
-    name = f"BSDF '{bsdf.id()}'" if bsdf.id() else f"a BSDF of {holder}"
-    yield bsdf, name
-    for inner in children(bsdf).values():
-        if isinstance(inner, mi.BSDF):
-            yield from _named(inner, name if bsdf.id() else holder)
 
 
 def _largest(texture) -> float:
@@ -68,10 +58,6 @@ def _largest(texture) -> float:
     data = own_parameters(texture).get("data")
     if data is None or (mi.is_spectral and data.shape[-1] == 3):
         return 0.0  # of colours these are coefficients of spectra, which are 1 at most
-    if dr.is_unsigned_v(data):
-        return (
-            1.0  # bytes of a PNG or JPEG: what they stand for is their share of 255, sRGB undone, 1 at most
-        )
     step = max(-(-dr.width(data) // _QUICKLY_READ), 1)
     return float(np.nanmax(np.array(data.array[::step], dtype=np.float32), initial=0))
 
