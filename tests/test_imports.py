@@ -28,7 +28,7 @@ ORDER = (
     ("emitter_kinds", "spheres"),
     ("agreement", "bsdf", "to_world", "rays", "mis", "sobol"),
     ("objects",),
-    ("llvm", "files", "spread", "moments", "similar", "_version"),
+    ("llvm", "files", "spread", "moments", "notices", "similar", "_version"),
 )
 
 

@@ -9,7 +9,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import suspects
+from mitsuba_bdpt import notices, suspects
 from stress_cases import cases
 from stress_cases.poisons import NAN, filled, painted, room
 from stress_cases.warned import Warned
@@ -49,7 +49,7 @@ def test_culprits_are_named():
     ],
 )
 def test_what_reflects_more_than_it_receives_is_named(bsdf, said):
-    """Expected: one warning per render that names BSDF and parameter; none where all is 1 or less, or where a
+    """Expected: one warning that names BSDF and parameter; none where all is 1 or less, or where a
     parameter above 1 is no reflectance."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
     with Warned() as warnings:
@@ -57,6 +57,100 @@ def test_what_reflects_more_than_it_receives_is_named(bsdf, said):
     assert np.isfinite(image).all()
     assert len(warnings) == bool(said)
     assert all(said in text for text in warnings)
+
+
+def bitmap(value, kind=np.uint8, **keys):
+    """A texture of one value; 8 bits are sRGB unless it is ``raw``."""
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.full((4, 4, 3), value, kind)), **keys}
+
+
+@pytest.mark.parametrize(
+    "texture, said",
+    [
+        (bitmap(243), ""),
+        (bitmap(255, raw=True), ""),
+        (bitmap(65535, np.uint16), ""),
+        (bitmap(200, format="variant"), ""),
+        (bitmap(1.5, np.float32), "up to 1.5"),
+        (bitmap(1.5, np.float16), "up to 1.5"),
+        ({"type": "checkerboard", "color0": bitmap(243), "color1": bitmap(1.5, np.float32)}, "up to 1.5"),
+    ],
+)
+def test_bytes_of_a_bitmap_are_shares_of_255(texture, said):
+    """Rationale: Mitsuba keeps the bytes of 8-bit images, divides them by 255 at each look-up and undoes
+    sRGB: no such texture reflects more than all. Expected: named only where numbers above 1 are kept."""
+    found = suspects.brighteners([mi.load_dict({"type": "principled", "base_color": texture})])
+    assert len(found) == bool(said) and all(said in text for text in found), found
+
+
+def nameless(texture, **keys):
+    """A BSDF without id, nor has its texture one."""
+    return {"type": "diffuse", "id": "", "reflectance": {**texture, "id": ""}} | keys
+
+
+LOUD = bitmap(1.5, np.float32)
+FILE = {"type": "bitmap", "filename": "wood.exr"}
+TWOSIDED = {"type": "twosided", "id": "both", "a": nameless(LOUD)}
+CHECKERED = {"type": "checkerboard", "id": "squares", "color0": LOUD}
+
+
+@pytest.mark.parametrize(
+    "shape, name",
+    [
+        ({"id": "box", "bsdf": nameless(LOUD, id="paint")}, "BSDF 'paint'"),
+        ({"id": "box", "bsdf": TWOSIDED}, "BSDF 'both'"),
+        ({"id": "box", "bsdf": nameless(LOUD)}, "the BSDF of shape 'box'"),
+        ({"id": "box", "bsdf": nameless(FILE)}, "the BSDF with texture 'wood.exr'"),
+        ({"id": "box", "bsdf": nameless({}, reflectance=CHECKERED)}, "the BSDF with texture 'squares'"),
+        ({"id": "", "bsdf": nameless(LOUD)}, "a BSDF without id (SmoothDiffuse of Sphere)"),
+    ],
+)
+def test_the_nearest_object_with_an_id_is_named(shape, name, tmp_path, monkeypatch):
+    """Rationale: scene files give ids to few objects. Expected: one text (a two-sided BSDF holds the same one
+    twice), which names the nearest object around the number that has an id, or a bitmap's file."""
+    monkeypatch.chdir(tmp_path)
+    LOUD["bitmap"].write("wood.exr")
+    (text,) = suspects.brighteners([mi.load_dict({"type": "sphere", **shape})])
+    assert text == f"{name} has reflectance up to 1.5"
+
+
+def test_what_is_wrong_with_a_scene_is_said_once():
+    """Rationale: an animation or a viewer renders a scene hundreds of times. Expected: one warning for any
+    number of renders and integrators, and one more where the scene was edited and another number is too
+    large; a scene that lies where another lay of which it was said is spoken of anew."""
+    scene = room({"type": "diffuse", "reflectance": 1.5})
+    with Warned() as said:
+        for seed in range(3):
+            mi.load_dict({"type": "bdpt", "max_depth": 2}).render(scene, seed=seed, spp=1)
+    assert len(said) == 1 and "up to 1.5" in said[0]
+    parameters = mi.traverse(scene)
+    parameters["plate.bsdf.reflectance.value"] = 2.5
+    parameters.update()
+    with Warned() as again:
+        for seed in range(2):
+            mi.load_dict({"type": "bdpt", "max_depth": 2}).render(scene, seed=seed, spp=1)
+    assert len(again) == 1 and "up to 2.5" in again[0]
+    other, bdpt = room(), mi.load_dict({"type": "bdpt", "max_depth": 2})
+    texts = {f"bdpt: {text}" for text in again}
+    notices._scenes[id(scene)] = other.sensors()[0].film().rfilter(), {"said": texts}
+    with Warned() as anew:
+        bdpt.render(scene, spp=1)
+    assert anew == again
+
+
+def test_a_large_bitmap_is_looked_at_in_part(monkeypatch):
+    """Rationale: reading all of a scene's textures takes longer than a preview. Expected: of two bitmaps of
+    3 * 64^2 numbers, half of the numbers allowed each, from end to end; a row of large ones is found."""
+    monkeypatch.setattr(suspects, "_QUICKLY_READ", 2 * 3 * 64)
+    data = np.full((64, 64, 3), 0.5, np.float32)
+    data[-1] = 3.0
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(data)}
+    bsdfs = [mi.load_dict({"type": "diffuse", "id": f"b{i}", "reflectance": texture}) for i in range(2)]
+    looked = []
+    nanmax = np.nanmax
+    monkeypatch.setattr(np, "nanmax", lambda a, **keys: looked.append(a.size) or nanmax(a, **keys))
+    assert len(suspects.brighteners(bsdfs)) == 2
+    assert looked == [3 * 64, 3 * 64]
 
 
 def beside_spots(*angles):
@@ -68,7 +162,7 @@ def beside_spots(*angles):
 
 
 def test_spots_that_rounding_changes_are_named():
-    """Rationale: at 0.1 degrees 1 - cos has 26 steps of single precision. Expected: one warning per render
+    """Rationale: at 0.1 degrees 1 - cos has 26 steps of single precision. Expected: one warning
     that names the spot and by how much at most; none at 0.3 degrees."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 2})
 

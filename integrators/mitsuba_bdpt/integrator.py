@@ -13,6 +13,8 @@ import mitsuba as mi
 from . import choice
 from .explain import explain
 from .features import feature_names
+from .notices import warn_once
+from .objects import all_shapes, is_instance
 from .parameters import check_made_for, check_variant, integer, is_index, read_settings
 from .passes import REPLICATES
 from .plan import UNLIMITED
@@ -20,7 +22,6 @@ from .rendering import Render
 from .snapshot import Snapshot
 from .strategies import layer_names
 from .suspects import brighteners, narrow_spots, not_finite
-from .world import bsdfs
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
 
@@ -101,7 +102,8 @@ is NaN or infinite, or whose weight does not follow from densities that are, cou
 counts like any other, so that the rest of the image is as if it were zero in truth.
 ``statistics["non_finite"]`` counts them, ``statistics["non_finite_in_pilot"]`` those of the pilots, which
 decide from the rest, and one message of Mitsuba's log (``Warn``) after the render names the parameters that
-hold such numbers. One before the render names BSDFs that reflect more light than they receive.
+hold such numbers. One before the first render of a scene names BSDFs that reflect more light than they
+receive.
 
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
@@ -175,7 +177,7 @@ def _make_class():
             if start is not None:
                 _check_resumable(start, self.settings)
                 render.resume(start)
-            _warn_of_suspects(scene)
+            _warn_of_suspects(scene, sensor)
             try:
                 self._cancelled = False
                 render.run(self.on_pass, lambda: self._cancelled)
@@ -347,17 +349,21 @@ def _log(statistics: dict):
         )
 
 
-def _warn_of_suspects(scene):
-    bright, narrow = brighteners(bsdfs(scene)), narrow_spots(scene)
+def _warn_of_suspects(scene, sensor):
+    """Say once what in the ``scene`` spoils images."""
+    bright = brighteners([shape for shape in all_shapes(scene) if not is_instance(shape)])
+    narrow = narrow_spots(scene)
     if bright:
-        mi.Log(
-            mi.LogLevel.Warn,
+        warn_once(
+            scene,
+            sensor,
             f"bdpt: {_some(bright)}: more light returns than arrives, and where it cannot "
             "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
         )
     if narrow:
-        mi.Log(
-            mi.LogLevel.Warn,
+        warn_once(
+            scene,
+            sensor,
             f"bdpt: {_some(narrow)}: Mitsuba rounds how the light falls off across so narrow a cone, with "
             "every integrator, and strategies do not agree about it; make it 0.2 degrees or more",
         )

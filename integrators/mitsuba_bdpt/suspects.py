@@ -4,12 +4,13 @@ and what is not finite."""
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import bsdf
 from .objects import children, number, own_parameters
 
 # What names of a BSDF's textures say that they scale the light that it scatters.
@@ -25,30 +26,68 @@ _STEP = 2.0**-24
 # this quotient, whatever the orientation (stress case `narrow-spots`).
 _COARSE = 1e-2
 
-# Numbers of a bitmap that are looked at, at most: 3 ms.
-_QUICKLY_READ = 1 << 18
+# Numbers of all bitmaps together that are looked at, at most: 2 ms.
+_QUICKLY_READ = 1 << 17
 
 
-def brighteners(bsdfs) -> list[str]:
-    """The ``bsdfs``, and those inside them, that return more light than they receive, as far as their
-    parameters tell, in words."""
-    found, seen = [], set()
-    for owner in bsdf.nested(bsdfs):
-        if id(owner) in seen:
-            continue
-        seen.add(id(owner))
-        for name, texture in children(owner).items():
-            if not name.endswith(_SCALES) or not isinstance(texture, mi.Texture):
-                continue
-            largest = _largest(texture)
-            if largest > _MORE_THAN_ALL:
-                found.append(f"BSDF '{owner.id()}' has {name} up to {largest:.4g}")
+@dataclass(frozen=True)
+class _Scale:
+    """A ``texture`` that scales what a BSDF scatters, the parameter ``name``; ``owners``: the texture, that
+    BSDF and the objects around it, the innermost first."""
+
+    owners: tuple
+    name: str
+    texture: mi.Texture
+
+
+def brighteners(owners) -> list[str]:
+    """What returns more light than it receives among ``owners``, BSDFs or shapes with a BSDF, and the BSDFs
+    inside them, as far as their parameters tell, in words."""
+    scales = _scales([(owner,) for owner in owners])
+    most = max(_QUICKLY_READ // max(len(scales), 1), 1)
+    found = [(scale, _largest(scale.texture, most)) for scale in scales]
+    return [
+        f"{_called(scale.owners)} has {scale.name} up to {largest:.4g}"
+        for scale, largest in found
+        if largest > _MORE_THAN_ALL
+    ]
+
+
+def _scales(chains) -> list[_Scale]:
+    """What scales light in the objects that begin these ``chains``, each followed by those around it."""
+    chains, found, seen = list(chains), [], set()
+    for chain in chains:  # grows on the way
+        for name, value in children(chain[0]).items():
+            if isinstance(value, mi.BSDF) and id(value) not in seen:
+                seen.add(id(value))
+                chains.append((value, *chain))
+            elif isinstance(value, mi.Texture) and isinstance(chain[0], mi.BSDF) and name.endswith(_SCALES):
+                found.append(_Scale((value, *chain), name, value))
     return found
 
 
-def _largest(texture) -> float:
-    """The largest value of a texture, 0 if it cannot be told quickly."""
-    inner = [_largest(value) for value in children(texture).values() if isinstance(value, mi.Texture)]
+def _called(owners) -> str:
+    """A name for the BSDF that holds the first of ``owners``, a texture, by the nearest that has an id."""
+    named = next((owner for owner in owners[1:] if owner.id()), None)
+    if isinstance(named, mi.BSDF):
+        return f"BSDF '{named.id()}'"
+    texture = owners[0].id() or _file_of(owners[0])
+    if texture:
+        return f"the BSDF with texture '{texture}'"
+    if named is not None:
+        return f"the BSDF of shape '{named.id()}'"
+    return f"a BSDF without id ({' of '.join(owner.class_name() for owner in owners[1:])})"
+
+
+def _file_of(texture) -> str:
+    """Name of the file of a bitmap, which has no id; only its text tells it. Empty for other textures."""
+    found = re.search(r'^\s*name = "(.*)",$', str(texture), re.MULTILINE)
+    return found[1] if found and texture.class_name().startswith("BitmapTexture") else ""
+
+
+def _largest(texture, most: int) -> float:
+    """The largest value of a texture, 0 if it cannot be told. Of a bitmap's numbers so many are looked at."""
+    inner = [_largest(value, most) for value in children(texture).values() if isinstance(value, mi.Texture)]
     if inner:
         return max(inner)
     try:
@@ -58,8 +97,13 @@ def _largest(texture) -> float:
     data = own_parameters(texture).get("data")
     if data is None or (mi.is_spectral and data.shape[-1] == 3):
         return 0.0  # of colours these are coefficients of spectra, which are 1 at most
-    step = max(-(-dr.width(data) // _QUICKLY_READ), 1)
-    return float(np.nanmax(np.array(data.array[::step], dtype=np.float32), initial=0))
+    if dr.is_integral_v(data):
+        return 1.0  # at most: bytes are shares of 255, and undoing sRGB keeps 1
+    values, count = dr.detach(data.array), min(dr.width(data), most)
+    # Sizes are no literals: one kernel for all.
+    index = dr.arange(mi.UInt64, count) * dr.opaque(mi.UInt64, dr.width(data)) // dr.opaque(mi.UInt64, count)
+    read = dr.gather(type(values), values, mi.UInt32(index))
+    return float(np.nanmax(np.array(read, dtype=np.float32), initial=0))
 
 
 def narrow_spots(scene) -> list[str]:

@@ -1,0 +1,37 @@
+"""Warnings that are said once per scene."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import mitsuba as mi
+
+# Scenes of which is known what was said, the latest ones.
+REMEMBERED = 64
+
+_scenes: OrderedDict[int, tuple] = OrderedDict()
+
+
+def notes(scene, sensor) -> dict:
+    """A dictionary that belongs to ``scene`` as long as it lives; ``sensor`` is one that it is rendered with.
+
+    A scene cannot be referred to weakly, and one that is kept alive would take part in the virtual calls of
+    others. Another one may lie where it was: what tells them apart is the filter of its sensor's film, which
+    is small enough to be kept.
+    """
+    mark = next(iter(scene.sensors()), sensor).film().rfilter()
+    known, found = _scenes.pop(id(scene), (None, None))
+    if known is not mark:
+        found = {}
+    _scenes[id(scene)] = mark, found
+    while len(_scenes) > REMEMBERED:
+        _scenes.popitem(last=False)
+    return found
+
+
+def warn_once(scene, sensor, text: str):
+    """Log a warning, unless it was said of the ``scene`` before."""
+    said = notes(scene, sensor).setdefault("said", set())
+    if text not in said:
+        said.add(text)
+        mi.Log(mi.LogLevel.Warn, text)
