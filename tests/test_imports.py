@@ -16,7 +16,7 @@ ORDER = (
     ("rendering",),
     ("parameters", "explain", "passes"),
     ("choice",),
-    ("pilot",),
+    ("pilot", "lost_light"),
     ("kernel", "film", "sinks", "snapshot"),
     ("connect",),
     ("subpath",),

@@ -103,7 +103,9 @@ counts like any other, so that the rest of the image is as if it were zero in tr
 ``statistics["non_finite"]`` counts them, ``statistics["non_finite_in_pilot"]`` those of the pilots, which
 decide from the rest, and one message of Mitsuba's log (``Warn``) after the render names the parameters that
 hold such numbers. One before the first render of a scene names BSDFs that reflect more light than they
-receive.
+receive; one after it the lamps without area of whose light more than a hundredth of the image's is missing,
+because they shine through glass on what is seen through glass. ``statistics["lost_light"]`` has the estimated
+shares by the number of the emitter.
 
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
@@ -185,6 +187,7 @@ def _make_class():
                 self.statistics = render.statistics()
                 _warn_of_what_was_lost(self.statistics, scene)
             _log(self.statistics)
+            self._look_for_lost_light(render)
             _warn_of_decisions_not_begun(self.settings.decisions, len(self.statistics["passes"]))
             return _result(sensor.film(), develop, evaluate)
 
@@ -212,7 +215,15 @@ def _make_class():
             render.accumulator.finish()
             self.statistics = render.statistics()
             _warn_of_what_was_lost(self.statistics, scene)
+            self._look_for_lost_light(render)
             return _result(sensor.film(), develop, evaluate)
+
+        def _look_for_lost_light(self, render):
+            """Say once, and put into the statistics, what light no strategy in use finds."""
+            shares, text = render.lost_light()
+            self.statistics["lost_light"] = shares
+            if text:
+                warn_once(render.world.scene, render.sensor, text)
 
         def sample(self, *args, **kwargs):
             raise NotImplementedError(

@@ -13,13 +13,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import choice, mis, pilot, points
+from . import choice, lost_light, mis, pilot, points
 from ._version import __version__
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
 from .moments import Moments
-from .objects import nothing_freed, step_by_step
+from .notices import notes
+from .objects import nothing_freed, number, step_by_step
 from .parameters import check_film, check_not_frozen, check_scene, check_variant, integer
 from .passes import REPLICATES, Step, batches, schedule
 from .plan import Settings, lost_paths, plan
@@ -427,6 +428,19 @@ class Render:
         self.compile_seconds, self.pilot_seconds = progress["compile_seconds"], progress["pilot_seconds"]
         self._earlier = progress["seconds"]
         self._resumed_at, self._resumed_idle = snapshot.spp, self.compile_seconds + self.pilot_seconds
+
+    def lost_light(self) -> tuple[dict, str]:
+        """Shares of the image's light that no strategy in use finds, by the index of the emitter, and in
+        words, which are empty where it is little. Looked for once for a scene, sensor and choice."""
+        if not self.accumulator.passes or not lost_light.is_possible(self.world, self.plan, self.settings):
+            return {}, ""
+        key = self.sensor.film().rfilter(), self.plan.splat, self.plan.direct, self.settings.max_depth
+        known = notes(self.world.scene, self.sensor).setdefault("lost light", {})
+        if key not in known:
+            known[key] = lost_light.lost_radiance(self.world, self.plan, self.settings.max_depth)
+        whole = number(self.accumulator.mean()) + sum(known[key].values())
+        shares = {i: radiance / whole for i, radiance in known[key].items()}
+        return shares, lost_light.in_words(self.world, self.plan, shares)
 
     def _rays(self):
         rays = {name: self._counts[name] for name in RAYS}

@@ -1,0 +1,284 @@
+"""How much of an image's light no strategy finds: light that leaves a delta emitter through glass (or another
+delta surface) and is seen through glass.
+
+Such a path has no two neighbours that could be joined: lamp, delta surfaces, one other surface, delta
+surfaces, sensor. `plan.lost_paths` says where they are possible; here they are estimated as a photon map does
+it, by a few thousand subpaths from either end that take delta events alone. Paths with several other
+surfaces, no two of which are neighbours, are left out, and so is the lamp itself, seen in a mirror: what is
+lost is at least this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import bsdf, rays
+from .kernel import Shared
+from .objects import nothing_freed, step_by_step
+from .plan import lost_paths
+
+# Subpaths from either end, and how many of those that arrive are compared, at most.
+SUBPATHS, COMPARED = 1 << 13, 1 << 11
+
+# Edges after which a subpath of delta events ends.
+LONGEST = 24
+
+# Radius of the disk around a point that is seen in which light counts, in distances between such points.
+RADIUS = 1.5
+
+# Least cosine between the normals of two points of one surface.
+SAME_SURFACE = 0.9
+
+# Share of an image's light from which on its loss is worth a word. (A caustic beneath a glass ball, seen
+# through the ball, has a thousandth.)
+WORTH_A_WORD = 0.01
+
+# Lamps that a message names, at most.
+NAMED = 3
+
+SEED = 0x6C6F7374
+
+_PLUGINS = {
+    "PointLight": "point light",
+    "SpotLight": "spot",
+    "Projector": "projector",
+    "DirectionalEmitter": "directional light",
+    "DirectionalArea": "directionalarea",
+}
+
+
+@dataclass
+class _Ends:
+    """Where subpaths meet the first surface that has a lobe that is not delta.
+
+    ``p`` position, ``n`` geometric normal on the side they come from, ``through``: light is scattered through
+    the surface, ``weight`` a number, ``edges``, ``distance`` travelled, ``reflectance`` of the surface,
+    ``active``: there is such an end.
+    """
+
+    p: object
+    n: object
+    through: object
+    weight: object
+    edges: object
+    distance: object
+    reflectance: object
+    active: object
+
+    def some(self):
+        """Of the active ones `COMPARED` at most, evenly chosen, their indices, and how many each stands for;
+        None in the first place where there are none."""
+        dr.eval(self)
+        index = dr.compress(self.active)
+        found = dr.width(index)
+        if not found:
+            return None, index, 0
+        kept = min(found, COMPARED)
+        place = dr.arange(mi.UInt64, kept) * dr.opaque(mi.UInt64, found) // dr.opaque(mi.UInt64, kept)
+        index = dr.gather(mi.UInt32, index, mi.UInt32(place))
+        ends = dr.gather(_Ends, self, index)
+        dr.eval(ends, index)
+        return ends, index, found / kept
+
+
+def is_possible(world, plan, settings) -> bool:
+    """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
+    return not plan.arrival and bool(lost_paths(world, plan, settings))
+
+
+def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
+    """Mean radiance over the film that is lost, by the index of the emitter; ``max_depth`` see
+    `plan.Settings`."""
+    with nothing_freed(), step_by_step(world.emitters.evaluated):
+        points, _, times = _seen(world, plan, max_depth).some()
+        if points is None:
+            return {}
+        light, lamp = _lit(world, plan, max_depth)
+        photons, index, more = light.some()
+        if photons is None:
+            return {}
+        found = _meetings(photons, points, max_depth) * (times * more / SUBPATHS**2)
+        lamps = dr.gather(mi.UInt32, lamp, index)
+        dr.eval(found, lamps)
+    total = np.bincount(lamps.numpy(), found.numpy())
+    return {int(i): float(total[i]) for i in np.flatnonzero(total) if np.isfinite(total[i])}
+
+
+def in_words(world, plan, shares: dict[int, float]) -> str:
+    """What is missing, and what to do, where at least `WORTH_A_WORD` of the image's light is; else empty.
+    ``shares`` of the image's light by the index of the emitter."""
+    lost = sum(shares.values())
+    if not lost >= WORTH_A_WORD:
+        return ""
+    emitters = world.scene.emitters()
+    order = sorted(shares, key=shares.get, reverse=True)
+    lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * lost][:NAMED]
+    what = " and ".join(map(_called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
+    what += " through glass or mirrors" if world.delta else " on what is seen"
+    why, remedy = "a lamp without area cannot be found that way", _remedy(lamps)
+    if plan.splat:
+        what += " on what is seen through them"
+    elif not world.camera.joinable:
+        why = f"no light can be traced to the sensor: {world.camera.reason}"
+    else:
+        why = "the render does without light tracing (t=1)"
+        remedy = f"leave light_paths and decisions to the integrator, or {remedy}"
+    share = "nearly all" if lost > 0.99 else f"about {100 * lost:.0f} %"
+    return f"bdpt: {what}: this light, {share} of the image's, is missing, because {why}; {remedy}"
+
+
+def _called(emitter) -> str:
+    """An emitter by its kind and the nearest id."""
+    kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
+    if emitter.id():
+        return f"{kind} '{emitter.id()}'"
+    return (
+        f"the {kind} on shape '{shape.id()}'" if shape is not None and shape.id() else f"a {kind} without id"
+    )
+
+
+def _remedy(emitters) -> str:
+    if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
+        return "give the sun a disk: sunsky, an envmap, or an area light far away"
+    return "give it a small area: an area light on a small sphere or disk"
+
+
+def _shared(world, generator) -> Shared:
+    """Time and wavelengths of subpaths."""
+    sensor = world.camera.sensor
+    time = sensor.shutter_open() + generator.next_float32() * sensor.shutter_open_time()
+    if not mi.is_spectral:
+        return Shared(time, mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+    u = generator.next_float32()
+    wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
+    return Shared(time, wavelengths, weight, u)
+
+
+def _two(generator):
+    return mi.Point2f(generator.next_float32(), generator.next_float32())
+
+
+def _brightness(value):
+    """A spectrum as a number, in the unit of `film.Accumulator.mean`, roughly."""
+    value = mi.unpolarized_spectrum(value)
+    return dr.mean(value) if mi.is_spectral else dr.max(value)
+
+
+def _lit(world, plan, max_depth):
+    """Where light of delta emitters arrives by delta events in a way that next-event estimation does not
+    find; and the emitters' indices."""
+    generator = mi.PCG32(SUBPATHS, SEED, 1)
+    shared = _shared(world, generator)
+    e = world.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
+    active = e.delta & bsdf.is_finite(e.weight) & ~bsdf.is_zero(e.weight)
+    ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
+    weight, index = mi.Spectrum(e.weight), e.index
+    ray.maxt = dr.full(mi.Float, dr.inf, SUBPATHS)  # as wide as those of the sensor, for the same kernel
+    dr.make_opaque(ray, weight, active, beam, index, generator)
+    ends = _follow(world, ray, weight, active, generator, max_depth, True)
+    if plan.direct:
+        ends.active &= (ends.edges > 1) | beam
+    return ends, index
+
+
+def _seen(world, plan, max_depth):
+    """What is seen by delta events in a way that t = 1 does not find. Weights are those of the irradiance
+    there, distances the radii of the disks that stand for these points."""
+    generator = mi.PCG32(SUBPATHS, SEED, 2)
+    shared, camera = _shared(world, generator), world.camera
+    pixels = int(camera.region.size.prod())
+    place = (dr.arange(mi.Float, SUBPATHS) + generator.next_float32()) * dr.opaque(
+        mi.Float, pixels / SUBPATHS
+    )
+    pixel = camera.region.pixel(dr.minimum(mi.UInt32(place), pixels - 1))
+    start = camera.start(pixel, _two(generator), _two(generator), shared)
+    ray, pdf_w = mi.Ray3f(start.ray), mi.Float(start.pdf_w)
+    weight = start.weight * dr.opaque(mi.Spectrum, 1, SUBPATHS)
+    active = dr.full(mi.Bool, True, SUBPATHS)
+    dr.make_opaque(ray, weight, active, pdf_w, generator)
+    ends = _follow(world, ray, weight, active, generator, max_depth, False)
+    if plan.splat:
+        ends.active &= ends.edges > 1
+    ends.weight *= ends.reflectance * dr.inv_pi
+    across = RADIUS * dr.rsqrt(pdf_w * SUBPATHS)
+    ends.distance = across if camera.parallel else across * ends.distance
+    return ends
+
+
+def _follow(world, ray, weight, active, generator, max_depth, adjoint: bool) -> _Ends:
+    """Follow rays by delta events to the first surface that has another lobe (where one has both, a coin
+    decides). One kernel for both sides."""
+    context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
+    last, adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
+
+    def body(ray, weight, edges, distance, active, generator, ends):
+        si = world.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        active = active & si.is_valid()
+        distance += dr.select(active, si.t, 0)
+        surface = si.bsdf()
+        smooth, delta = (_has(surface, kind) for kind in (mi.BSDFFlags.Smooth, mi.BSDFFlags.Delta))
+        both = active & smooth & delta
+        here = active & smooth & (~both | (generator.next_float32() < 0.5))
+        weight = dr.select(both, weight * 2, weight)
+        ends = dr.select(here, _end(si, surface, ray, weight, edges, distance, here), ends)
+        active = active & ~here & delta & (edges < last)
+        bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
+        active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
+        weight = dr.select(active, weight * factor, weight)
+        active &= bsdf.is_finite(weight) & ~bsdf.is_zero(weight)
+        anchor = rays.surface_anchor(si, ray, world.emitters.shape_errors)
+        edges += dr.select(active, mi.UInt32(1), 0)
+        return rays.spawn(anchor, si.to_world(bs.wo), ray), weight, edges, distance, active, generator, ends
+
+    state = ray, weight, mi.UInt32(1), mi.Float(0), active, generator, _nowhere()
+    *_, ends = dr.while_loop(state, lambda *state: state[4], body, label="delta events")
+    dr.eval(ends)
+    return ends
+
+
+def _nowhere() -> _Ends:
+    no = mi.Bool(False)
+    return _Ends(mi.Point3f(0), mi.Normal3f(0), no, mi.Float(0), mi.UInt32(0), mi.Float(0), mi.Float(0), no)
+
+
+def _end(si, surface, ray, weight, edges, distance, active) -> _Ends:
+    """The end of a subpath at ``si``."""
+    kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
+    return _Ends(
+        p=mi.Point3f(si.p),
+        n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d))),
+        through=_has(surface, kinds[0]) | _has(surface, kinds[1]),
+        weight=_brightness(weight),
+        edges=edges,
+        distance=distance,
+        reflectance=_brightness(surface.eval_diffuse_reflectance(si, active)),
+        active=mi.Bool(active),
+    )
+
+
+def _has(surface, kind):
+    return mi.has_flag(surface.flags(), kind)
+
+
+def _meetings(photons: _Ends, points: _Ends, max_depth):
+    """What each of the ``photons`` adds to the ``points`` around it."""
+    count = dr.opaque(mi.UInt32, dr.width(points.p))
+    longest = dr.opaque(mi.UInt32, max_depth)
+
+    def body(i, total):
+        point = dr.gather(_Ends, points, i)
+        cos = dr.dot(point.n, photons.n)
+        cos = dr.select(point.through, dr.abs(cos), cos)
+        r2 = dr.square(point.distance)
+        near = (dr.squared_norm(point.p - photons.p) < r2) & (cos > SAME_SURFACE)
+        near &= point.edges + photons.edges <= longest
+        return i + 1, total + dr.select(near, point.weight / (dr.pi * r2), 0)
+
+    state = mi.UInt32(0), dr.zeros(mi.Float, dr.width(photons.p))
+    _, total = dr.while_loop(state, lambda i, total: i < count, body, label="meetings")
+    return total * photons.weight
