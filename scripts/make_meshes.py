@@ -4,7 +4,7 @@ Every mesh is computed from the few numbers below and written as a small binary 
 rounded to 1e-5, so that the files come out the same, byte for byte, on every machine.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -286,5 +286,12 @@ def make_all(folder=FOLDER):
         write_ply(folder / f"{name}.ply", *make())
 
 
+def main(arguments=None):
+    """Makes them in the folder that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
+    make_all(parser.parse_args(arguments).folder)
+
+
 if __name__ == "__main__":
-    make_all(*sys.argv[1:2])
+    main()

@@ -4,7 +4,7 @@ Environment maps as Mitsuba reads them: rows from the zenith (+y) to the nadir, 
 way of +x, +z and -x back to -z. Slides from the top. Half floats in EXR.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -87,5 +87,12 @@ def make_all(folder=FOLDER):
             file.write(str(folder / f"{name}.exr"))
 
 
+def main(arguments=None):
+    """Makes them in the folder that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
+    make_all(parser.parse_args(arguments).folder)
+
+
 if __name__ == "__main__":
-    make_all(*sys.argv[1:2])
+    main()

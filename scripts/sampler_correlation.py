@@ -17,6 +17,7 @@ The second table is the error of whole images by the points that made them.
 
 from __future__ import annotations
 
+import argparse
 import sys
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
@@ -135,8 +136,9 @@ def error_table() -> list[str]:
     return lines
 
 
-def main() -> int:
+def main(arguments=None) -> int:
     """Print both tables."""
+    argparse.ArgumentParser(description=__doc__.split("\n\n")[0]).parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)  # samplers warn of each count that they round
     print("\n".join([*correlation_table(), "", *error_table()]))

@@ -8,6 +8,7 @@ import json
 import os
 import re
 import resource
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -570,6 +571,23 @@ def test_progress_under_a_time_limit():
     render.show_pass(bar, 8.0)(report)
     assert bar.tasks[0].description == "8 spp, 1 k rays/s, 6 s left"
     assert bar.tasks[0].completed == 0.25
+
+
+@pytest.mark.parametrize("words", [["--help"], ["render", "--help"], ["doctor", "--help"]], ids=" ".join)
+def test_help_does_nothing_else(scene, capsys, words):
+    """Expected: the usage, status 0, no file."""
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 0 and capsys.readouterr().out.startswith("usage: mitsuba_bdpt")
+    assert [path.name for path in Path().iterdir()] == ["plain.xml"]
+
+
+def test_commands_of_the_readme_are_understood():
+    """Expected: each names a scene that exists, and options that there are."""
+    root = SCRIPT.parents[1]
+    found = re.findall(r"^    python -m mitsuba_bdpt (.*)", (root / "README.md").read_text(), re.MULTILINE)
+    scenes = [build_parser().parse_args(shlex.split(line, comments=True)).scene for line in found]
+    assert len(scenes) >= 6 and all((root / path).is_file() for path in scenes)
 
 
 def test_script_is_the_command(scene):

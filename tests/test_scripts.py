@@ -1,5 +1,6 @@
 """What the scripts answer to a user's mistakes."""
 
+import re
 import runpy
 import shlex
 import sys
@@ -159,6 +160,28 @@ def test_a_comparison_with_what_has_no_error_is_refused(monkeypatch):
     line = compare.line("furnace_white", ["path", "bdpt"], 4, 2)
     assert len(line) == len(compare.HEADS) and line[:2] == ["`furnace_white`", "4"]
     assert "exactly that of the reference" in line[2]
+
+
+COMMANDS = sorted(path.name for path in SCRIPTS.glob("*.py") if "__main__" in path.read_text())
+
+
+@pytest.mark.parametrize("script", COMMANDS)
+@pytest.mark.parametrize("words", [["--help"], ["--no-such-option"]], ids=" ".join)
+def test_help_does_nothing_else(here, monkeypatch, capsys, script, words):
+    """Rationale: three scripts took --help for the name of a folder, or measured for minutes. Expected: the
+    usage and nothing else: no file, no render, status 0; a mistyped option has the status 2."""
+    monkeypatch.setattr(mi, "render", lambda *args, **keys: pytest.fail("rendered"))
+    monkeypatch.setattr(mi, "load_dict", lambda *args, **keys: pytest.fail("loaded"))
+    before = sorted(here.rglob("*"))
+    assert by_user(monkeypatch, script, *words) == (0 if words == ["--help"] else 2)
+    shown = capsys.readouterr()
+    assert (shown.out + shown.err).startswith("usage: ") and sorted(here.rglob("*")) == before
+
+
+def test_every_script_of_the_readme_exists():
+    """Expected: the commands that the README names are there, and are commands."""
+    named = set(re.findall(r"python scripts/(\w+\.py)", (SCRIPTS.parent / "README.md").read_text()))
+    assert len(named) > 10 and named <= set(COMMANDS)
 
 
 def test_bugs_are_not_taken_for_mistakes():
