@@ -123,6 +123,10 @@ def image(bdpt, scene, **keywords):
         ),
         ({"light_paths": "1/"}, "light_paths='1/'.*1/16"),
         ({"light_paths": "nan"}, "light_paths='nan'"),
+        ({"skip": 3}, "skip=3 must be a string, one of auto"),
+        ({"skip": [1, 2, 3]}, r"skip=\[1, 2, 3\] must be a string, one of auto"),
+        ({"light_paths": [1, 2, 3]}, r"light_paths=\[1, 2, 3\] must be a number or 'auto'"),
+        ({"inner": {"type": "path"}}, "PathIntegrator cannot be nested in it.*take it out"),
     ],
     ids=str,
 )
@@ -214,6 +218,8 @@ def test_spp_of_zero_is_the_samplers_count():
     np.testing.assert_allclose(a, image(bdpt, scene, spp=6), rtol=1e-4)
     with pytest.raises(ValueError, match="spp=-1"):
         bdpt.render(scene, spp=-1)
+    with pytest.raises(ValueError, match="spp=0.*sample_count.*'sensor'.*set one of them to 1 or more"):
+        bdpt.render(lamp_in_a_sphere(spp=0))
 
 
 @pytest.mark.parametrize("skip", ["none", "auto"])

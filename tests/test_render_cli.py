@@ -339,6 +339,42 @@ def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message)
     assert "Traceback" not in captured.err
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "arguments", "message"),
+    [
+        (
+            'name="width" value="6"',
+            'name="width" value="0"',
+            [],
+            "width=0 of the film must be 1 or more pixels",
+        ),
+        (
+            'name="height" value="4"',
+            'name="height" value="-4"',
+            [],
+            "height=-4 of the film must be 1 or more",
+        ),
+        ('name="width" value="6"', 'name="width" value="1000001"', [], "for a PNG, whose sides have 1000000"),
+        (
+            'name="sample_count" value="4"',
+            'name="sample_count" value="0"',
+            [],
+            "sample_count=0: nothing is to",
+        ),
+        ("<emitter", "<emitter", ["--integrator", "aov"], "integrator=aov is for one around another"),
+        ("<emitter", "<emitter", ["--integrator", "moment"], "integrator=moment is for one around another"),
+    ],
+)
+def test_images_that_cannot_be_are_refused(scene, capsys, old, new, arguments, message):
+    """Rationale: a film of 0 pixels was said to have a field of view that is too wide; a PNG too long failed
+    after the render; a sampler without samples ended the process under `path`; `moment` around nothing gave
+    an image. Expected: words, before anything is rendered."""
+    scene.write_text(SCENE.replace(old, new, 1))
+    assert main(["render", str(scene), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and message in error
+
+
 def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
     def no_gpu(variant):
         raise ImportError("the CUDA backend hasn't been initialized")

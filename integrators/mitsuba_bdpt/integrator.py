@@ -315,6 +315,11 @@ def _resolve(scene, sensor):
 def _samples(sensor, spp, settings) -> int:
     """Samples per pixel of a render that was asked for ``spp``."""
     spp = integer(spp, "spp", 0) or int(sensor.sampler().sample_count())
+    if not spp:
+        raise ValueError(
+            f"bdpt: spp=0 stands for the sample_count of the sampler of sensor '{sensor.id()}', which is 0 "
+            "too; set one of them to 1 or more"
+        )
     if settings.variance and spp < REPLICATES:
         raise ValueError(
             f"bdpt: variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "

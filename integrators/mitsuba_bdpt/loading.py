@@ -114,6 +114,7 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     config = mi.parser.ParserConfig(options.variant)
     defines = in_proportion(options.scene, dict(options.defines))
     state = mi.parser.parse_file(config, str(options.scene), **defines)
+    _check_film_sizes(state)
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     kind = mi.ObjectType.Integrator
     node = next((node for node in state.nodes if node.type == kind), None)
@@ -124,6 +125,12 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
                 f"until_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
             )
         overrides |= {"until_error": options.until_error, "variance": True}
+    if options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator):
+        if options.integrator != "aov" or "aovs" not in overrides:
+            raise ValueError(
+                f"integrator={options.integrator} is for one around another, which the command line cannot "
+                "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
+            )
     if node is not None:
         replace_integrator(state.nodes, node, options.integrator, overrides)
     mi.parser.transform_all(config, state)
@@ -131,6 +138,14 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if node is not None:
         return scene, scene.integrator()
     return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+
+
+def _check_film_sizes(state: mi.parser.ParserState) -> None:
+    """Raise ``ValueError`` for films without pixels, of which Mitsuba says that they see too much."""
+    for node in state.nodes:
+        for name in ("width", "height") if node.type == mi.ObjectType.Film else ():
+            if isinstance(size := node.props.get(name, 1), int) and size < 1:
+                raise ValueError(f"{name}={size} of the film must be 1 or more pixels.")
 
 
 def check_file(scene: Path) -> None:

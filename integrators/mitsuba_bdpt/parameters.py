@@ -72,8 +72,15 @@ def _boolean(props, name):
     return value
 
 
+def _shown(value) -> str:
+    """``value`` in one line, for messages."""
+    return " ".join(repr(value).split())
+
+
 def _choice(props, name, choices):
     value = props.get(name, choices[0])
+    if not isinstance(value, str):
+        raise TypeError(f"bdpt: {name}={_shown(value)} must be a string, one of {', '.join(choices)}")
     if value not in choices:
         raise ValueError(f"bdpt: {name}={value!r} is not known; use one of {', '.join(choices)}")
     return value
@@ -81,10 +88,10 @@ def _choice(props, name, choices):
 
 def _light_paths(props):
     value = props.get("light_paths", "auto")
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise TypeError(f"bdpt: light_paths={_shown(value)} must be a number or 'auto'")
     if value == "auto":
         return value
-    if isinstance(value, bool):
-        raise TypeError(f"bdpt: light_paths={value!r} must be a number or 'auto'")
     try:
         number = float(Fraction(value))
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
@@ -137,10 +144,15 @@ def _check_names(props):
     for name in props.keys():
         if name in known:
             continue
+        if isinstance(props[name], mi.Object):
+            raise ValueError(
+                f"bdpt: {props[name].class_name()} cannot be nested in it: bdpt holds no other object; "
+                "take it out"
+            )
         remedy = REMEDIES.get(name)
         if remedy is None:
             remedy = f"{did_you_mean(name, known)}Parameters: {', '.join(known)}"
-        raise ValueError(f"bdpt: {name}={props[name]!r} is not a parameter; {remedy}")
+        raise ValueError(f"bdpt: {name}={_shown(props[name])} is not a parameter; {remedy}")
 
 
 def read_settings(props) -> Settings:

@@ -34,6 +34,9 @@ PASS_SPP = 16
 SETS = {"time": {"timeout"}, "until_error": {"until_error", "variance"}}
 """The integrator's parameters that an option sets, see `loading.load`."""
 
+PNG_SIDE = 1_000_000
+"""Pixels in a row or column of a PNG, at most: libpng's limit."""
+
 INTERRUPTED = 130
 """The exit status of a process that SIGINT has ended."""
 
@@ -58,8 +61,13 @@ def run(options: Namespace) -> int:
         scene, integrator = load(options)
         check_integrator(options, integrator)
         sensor = choose_sensor(scene, options.sensor)
+        check_png(sensor.film())
         open_ended = options.time is not None or options.until_error is not None
         spp = options.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
+        if not spp:
+            raise ValueError(
+                "The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N."
+            )
         outcome = render(scene, integrator, options, spp, output)
         if outcome.interrupted and not outcome.spp:
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
@@ -88,6 +96,16 @@ def explain(options: Namespace) -> int:
         print(f"error: {message(error)}", file=sys.stderr)
         return 1
     return 0
+
+
+def check_png(film: mi.Film) -> None:
+    """Raise ``ValueError`` for an image that no PNG can hold, which would come out after the render."""
+    width, height = film.crop_size()
+    if max(width, height) > PNG_SIDE:
+        raise ValueError(
+            f"the image of {width} x {height} is too long for a PNG, whose sides have {PNG_SIDE} "
+            "pixels at most; render crop windows."
+        )
 
 
 def message(error: Exception) -> str:
