@@ -2,15 +2,20 @@
 
     python scripts/mutants.py                  # all, some minutes
     python scripts/mutants.py hidden adjoint   # those with such a word in their name
+    python scripts/mutants.py --list           # what is replaced by what
+    python scripts/mutants.py --unchanged      # the same tests on a copy without bugs: they have to pass
 
-For each mutant the tests that are named beside it run against the copy; one at least has to fail. A suite
-that has become blind to one of them is seen here. Exit status 1 if a bug is not seen.
+Each test that is named beside a mutant runs against the copy, in a process of its own, and has to fail by an
+assertion: one that fails by anything else shows that the bug is not the one that was meant. The exit status
+is 1 if a test did not do what it should, and 2 if the text to replace is not in the module once (the code has
+changed: plant the bug anew).
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,103 +23,153 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from mistakes import answered
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
+ASSERTION = re.compile(r"^E +(assert |AssertionError|Failed: DID NOT)", re.MULTILINE)
+PASSED, FAILED = 0, 1  # exit statuses of pytest
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """``old`` text of a module, which occurs once, its replacement, and the tests that see it."""
+    """``old`` stands exactly once in the module ``file``; with ``new`` in its place each of ``tests`` (names
+    that pytest takes) must fail."""
 
     name: str
-    module: str
+    file: str
     old: str
     new: str
-    tests: str
+    tests: tuple[str, ...]
 
 
 MUTANTS = (
     Mutant(
         "splats on hidden emitters",
-        "connect",
+        "connect.py",
         "        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)\n",
         "        pass\n",
-        "tests/test_plausible_bugs.py::test_light_on_a_hidden_lamp_is_not_splatted",
+        ("tests/test_plausible_bugs.py::test_light_on_a_hidden_lamp_is_not_splatted",),
     ),
     Mutant(
         "what is in front of a lens",
-        "cameras",
+        "cameras.py",
         "active=towards & on_lens & unhidden & within & inside",
         "active=towards & on_lens & within & inside",
-        "tests/test_plausible_bugs.py::test_what_is_in_front_of_a_lens_hides_the_light_from_it",
+        ("tests/test_plausible_bugs.py::test_what_is_in_front_of_a_lens_hides_the_light_from_it",),
     ),
     Mutant(
         "count of light subpaths",
-        "kernel",
+        "kernel.py",
         "1.0 if batch.spread else sharing.lanes / batch.size",
         "1.0 if batch.spread else 1 / kernel.plan.served",
-        "tests/test_plausible_bugs.py::test_splats_of_few_pixels_count_once",
+        ("tests/test_plausible_bugs.py::test_splats_of_few_pixels_count_once[3-1]",),
     ),
     Mutant(
         "one seed for both subpaths",
-        "points",
+        "points.py",
         'mi.UInt32(1 if side == "light" else 2)',
         "mi.UInt32(1)",
-        "tests/test_plausible_bugs.py::test_no_number_decides_two_things",
+        (
+            "tests/test_plausible_bugs.py::test_no_number_decides_two_things[sobol]",
+            "tests/test_plausible_bugs.py::test_no_number_decides_two_things[independent]",
+        ),
     ),
     Mutant(
         "two purposes of one dimension",
-        "points",
+        "points.py",
         "    ROULETTE = 9\n",
         "    ROULETTE = 6\n",
-        "tests/test_plausible_bugs.py",
+        ("tests/test_plausible_bugs.py::test_no_number_decides_two_things[sobol]",),
     ),
     Mutant(
         "roulette by the number of the lobe",
-        "subpath",
+        "subpath.py",
         "Purpose.ROULETTE",
         "Purpose.LOBE",
-        "tests/test_plausible_bugs.py::test_each_purpose_is_drawn_for_at_one_place",
+        ("tests/test_plausible_bugs.py::test_each_purpose_is_drawn_for_at_one_place",),
     ),
 )
 
 
-def seen(mutant: Mutant, folder: Path) -> bool:
-    """Whether a test fails on a copy of the package in ``folder`` that has this bug; raises ``ValueError`` if
-    its text is not there once."""
-    copy = folder / "mitsuba_bdpt"
-    shutil.rmtree(copy, ignore_errors=True)
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    file = copy / f"{mutant.module}.py"
-    text = file.read_text()
-    if text.count(mutant.old) != 1:
-        raise ValueError(f"{mutant.name}: {mutant.module}.py has its text {text.count(mutant.old)} times")
-    file.write_text(text.replace(mutant.old, mutant.new))
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", mutant.tests]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT / "scripts")])}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-    if done.returncode not in (0, 1):  # no test ran, or pytest itself failed
-        raise ValueError(f"{mutant.name}: pytest ended with {done.returncode}\n{done.stdout[-2000:]}")
-    return done.returncode == 1
+def planted(folder: Path, mutant: Mutant | None) -> Path:
+    """A copy of the package in ``folder``, with the bug if there is one; returns what PYTHONPATH must begin
+    with. `ValueError` if the text to replace is not there once."""
+    package = folder / PACKAGE.name
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    if mutant is not None:
+        file = package / mutant.file
+        text = file.read_text()
+        if (count := text.count(mutant.old)) != 1:
+            raise ValueError(
+                f"mutant {mutant.name}: {mutant.old!r} stands {count} times in {mutant.file}, not once; "
+                "plant it anew"
+            )
+        file.write_text(text.replace(mutant.old, mutant.new))
+    return folder
 
 
-def main(arguments=None) -> int:
-    """Print what became of each; returns the exit status."""
+def outcome(folder: Path, test: str) -> tuple[int, str]:
+    """Exit status and words of pytest on ``test`` with the package in ``folder``."""
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT / "scripts")])}
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-p", "no:cacheprovider", "-m", "", test]
+    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+def judged(status: int, output: str, bug: bool) -> str:
+    """What is wrong with this outcome of a test, empty if nothing is; ``bug``: there is one to be seen."""
+    if status not in (PASSED, FAILED):
+        return "not run:\n" + output[-1500:]
+    if not bug:
+        return "" if status == PASSED else "fails without the bug:\n" + output[-1500:]
+    if status == PASSED:
+        return "does not see the bug"
+    return "" if ASSERTION.search(output) else "fails by something else:\n" + output[-1500:]
+
+
+def chosen(words: list[str]) -> list[Mutant]:
+    """Mutants with one of these words in their name, all of them if there is no word."""
+    for word in words:
+        if not any(word in mutant.name for mutant in MUTANTS):
+            raise ValueError(
+                f"no mutant has {word!r} in its name; there are {'; '.join(m.name for m in MUTANTS)}"
+            )
+    return [mutant for mutant in MUTANTS if not words or any(word in mutant.name for word in words)]
+
+
+def run(mutants: list[Mutant], bug: bool) -> int:
+    """Print a line for each test; the number of those that did not do what they should."""
+    wrong = 0
+    for mutant in mutants:
+        for test in mutant.tests:
+            with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
+                where = planted(Path(folder), mutant if bug else None)
+                fault = judged(*outcome(where, test), bug)
+            wrong += bool(fault)
+            seen = "sees it" if bug else "passes without it"
+            print(f"{mutant.name}: {test} {fault or seen}", flush=True)
+    return wrong
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("words", nargs="*", help="only mutants with one of these words in their name")
-    words = parser.parse_args(arguments).words
-    blind = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for mutant in MUTANTS:
-            if words and not any(word in mutant.name for word in words):
-                continue
-            found = seen(mutant, Path(folder))
-            blind += not found
-            print(f"{'seen' if found else 'NOT SEEN'}: {mutant.name}", flush=True)
-    return 1 if blind else 0
+    parser.add_argument("--list", action="store_true", help="print names and what is replaced, run nothing")
+    parser.add_argument("--unchanged", action="store_true", help="run the same tests without the bugs")
+    arguments = parser.parse_args()
+    mutants = chosen(arguments.words)
+    if arguments.list:
+        for mutant in mutants:
+            print(f"{mutant.name}: {mutant.file}: {mutant.old!r} -> {mutant.new!r}")
+        return 0
+    wrong = run(mutants, not arguments.unchanged)
+    tests = sum(len(mutant.tests) for mutant in mutants)
+    print(f"{len(mutants)} mutants, {tests} tests: {wrong} wrong")
+    return 1 if wrong else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(answered(main))
