@@ -80,14 +80,43 @@ MUTANTS = (
         "points.py",
         "    ROULETTE = 9\n",
         "    ROULETTE = 6\n",
-        ("tests/test_plausible_bugs.py::test_no_number_decides_two_things[sobol]",),
+        (
+            "tests/test_plausible_bugs.py::test_no_number_decides_two_things[sobol]",
+            "tests/test_known_answers.py::test_lobes_and_roulette_are_independent[camera]",
+            "tests/test_known_answers.py::test_lobes_and_roulette_are_independent[light]",
+        ),
     ),
     Mutant(
         "roulette by the number of the lobe",
         "subpath.py",
         "Purpose.ROULETTE",
         "Purpose.LOBE",
-        ("tests/test_plausible_bugs.py::test_each_purpose_is_drawn_for_at_one_place",),
+        (
+            "tests/test_plausible_bugs.py::test_each_purpose_is_drawn_for_at_one_place",
+            "tests/test_known_answers.py::test_lobes_and_roulette_are_independent[camera]",
+            "tests/test_known_answers.py::test_lobes_and_roulette_are_independent[light]",
+        ),
+    ),
+    Mutant(
+        "numbers of the light subpath for the camera's",
+        "kernel.py",
+        'points.stream("camera", place.index(slot), slot)',
+        'points.stream("light", place.index(slot), slot)',
+        ("tests/test_plausible_bugs.py::test_subpaths_draw_from_their_own_streams",),
+    ),
+    Mutant(
+        "what is between a lens and its near plane",
+        "cameras.py",
+        "(walk.pi.t >= (o.z - view.near) / slope)",
+        "(walk.pi.t >= o.z / slope)",
+        ("tests/test_known_answers.py::test_a_near_plane_hides_what_stands_before_it_from_light",),
+    ),
+    Mutant(
+        "camera rays past hidden lamps keep their start",  # as in `path`
+        "kernel.py",
+        "        pi, ray = rays.intersect_past_emitters(",
+        "        pi, _ = rays.intersect_past_emitters(",
+        ("tests/test_plausible_bugs.py::test_a_ball_is_seen_as_it_is_through_a_hidden_lamp",),
     ),
 )
 

@@ -136,6 +136,29 @@ def test_no_number_decides_two_things(kind):
     assert len(drawn) == 2 * 3 * 12 and np.abs(found - np.eye(len(drawn))).max() < 5 / 4096**0.5
 
 
+def test_subpaths_draw_from_their_own_streams(monkeypatch):
+    """Rationale: as before, where the kernel asks for a stream. Expected: one stream for each side, and each
+    draw of a side is from the one that was made for it."""
+    made, wrong, stream, draw = [], [], Points.stream, Points._draw
+
+    def making(self, side, *place):
+        made.append((side, stream(self, side, *place)))
+        return made[-1][1]
+
+    def drawing(self, side, source, purpose, vertex, dims):
+        owner = next(owner for owner, known in made if known is source)
+        wrong.extend([(purpose, side, owner)] * (owner != side))
+        return draw(self, side, source, purpose, vertex, dims)
+
+    monkeypatch.setattr(Points, "stream", making)
+    monkeypatch.setattr(Points, "_draw", drawing)
+    scene = lit_from_above(floor=quad(2, 0), sensor=sensor())
+    mi.load_dict({"type": "bdpt", "light_paths": 1, "connections": "one"}).render(scene, spp=1)
+    sides = sorted(side for side, _ in made)
+    made.clear()  # a failure would keep variables of a loop that is recorded beyond the end of Dr.Jit
+    assert sides == ["camera", "light"] and not wrong
+
+
 def test_each_purpose_is_drawn_for_at_one_place(monkeypatch):
     """Rationale: as before, at the place that draws. Expected: a kernel with all strategies draws for each
     purpose once (a loop is recorded once; what joins endpoints with a lens is of another vertex)."""
