@@ -271,6 +271,15 @@ def hidden_lamp():
     )
 
 
+def behind_hidden_lamp(near_clip=0.01):
+    """A ball of light in front of another ball; or before the near plane, where no camera ray meets it."""
+    return scene(
+        sensor(near_clip=near_clip),
+        ball=ball(center=[0, 0.6, 0], radius=0.6),
+        lamp=lamp() | {"type": "sphere", "to_world": transform().translate([0, 1.2, 2.6]).scale(0.5)},
+    )
+
+
 def tile_error(image, reference):
     """Root mean square of the relative differences of 8 x 8 tiles."""
 
@@ -357,6 +366,12 @@ CASES = [
     Case(
         "`hide_emitters`: hidden lamps still cast their shapes on the image",
         hidden_lamp,
+        parameters={"hide_emitters": True},
+    ),
+    Case(
+        "`hide_emitters`: a sphere behind a hidden lamp; `path` shades it at a wrong place (14 % too dark)",
+        behind_hidden_lamp,
+        equal=lambda: behind_hidden_lamp(near_clip=3.4),
         parameters={"hide_emitters": True},
     ),
     Case(
