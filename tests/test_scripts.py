@@ -11,6 +11,7 @@ import equal_time
 import matplotlib.image
 import mistakes
 import mitsuba as mi
+import mutants
 import numpy as np
 import pytest
 import reference
@@ -69,6 +70,7 @@ def by_user(monkeypatch, script, *arguments):
         ("fireflies.py nowhere", "scene='nowhere' is not in scenes/"),
         ("floor.py nowhere", "scene='nowhere' is not in scenes/"),
         ("overhead.py nowhere", "scene='nowhere' is not in scenes/"),
+        ("mutants.py nowhere", "no mutant has 'nowhere' in its name"),
         ("page.py broken", "broken: rows.parquet is missing or not whole; run scripts/sweep.py"),
         ("page.py . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page.py . -o words.toml/a.html", "words.toml"),
@@ -182,6 +184,39 @@ def test_every_script_of_the_readme_exists():
     """Expected: the commands that the README names are there, and are commands."""
     named = set(re.findall(r"python scripts/(\w+\.py)", (SCRIPTS.parent / "README.md").read_text()))
     assert len(named) > 10 and named <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda mutant: mutant.name)
+def test_mutants_can_be_planted(mutant, tmp_path):
+    """Rationale: once the code has changed, a bug whose text is no longer there would be found at the next
+    `make mutants` only, and a test that was renamed as well. Expected: the text is replaced in the copy; the
+    tests exist."""
+    copy = mutants.planted(tmp_path, mutant) / mutants.PACKAGE.name / mutant.file
+    original = (mutants.PACKAGE / mutant.file).read_text()
+    assert mutant.old not in copy.read_text() or mutant.old in mutant.new
+    assert copy.read_text() != original and compile(copy.read_text(), copy, "exec")
+    for test in mutant.tests:
+        file, _, name = test.partition("::")
+        function = name.partition("[")[0]
+        assert f"\ndef {function}(" in (SCRIPTS.parent / file).read_text(), test
+
+
+@pytest.mark.parametrize(
+    ("status", "output", "bug", "fault"),
+    [
+        (0, "1 passed", True, "does not see the bug"),
+        (1, "E   NameError: name 'x'", True, "fails by something else"),
+        (1, "E       assert 1 == 2", True, ""),
+        (1, "E       AssertionError: ", True, ""),
+        (4, "no such test", True, "not run"),
+        (0, "1 passed", False, ""),
+        (1, "E       assert 1 == 2", False, "fails without the bug"),
+    ],
+)
+def test_outcomes_of_mutants_are_judged(status, output, bug, fault):
+    """Expected: only a test that fails by an assertion sees a bug; without one it has to pass."""
+    judged = mutants.judged(status, output, bug)
+    assert judged.startswith(fault) and bool(judged) == bool(fault)
 
 
 def test_bugs_are_not_taken_for_mistakes():
