@@ -1,15 +1,17 @@
 """What the default's choice of strategies is worth: its time to an error over that of the best fixed choice.
 
-    python scripts/choices.py small_casters/point_cube cornell_box --seeds 8
+    python scripts/choices.py small_casters/point_cube cornell_box
     python scripts/choices.py --all -o docs/choices.json    # every scene; can be interrupted
 
-For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath are rendered by
-hand (parameter ``decisions``), and the default with ``--seeds`` seeds, 64 samples per pixel. A time is that
-of the processor, pilot included, which neighbours on the machine disturb less than seconds; errors are
-relMSE, raw and trimmed of the worst 0.1 %. The table shows, raw and trimmed: the default's time times error
-(means over the seeds) over the least of the fixed choices, that of the worst seed, and what was chosen. The
-least of some thirty noisy products is below the true one: figures are on the safe side. The scenes of
-small_casters get a reference of 8,192 samples per pixel with a light subpath each.
+For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, and what pilots
+of 32 seeds choose, are rendered by hand (parameter ``decisions``); those which one render of a seed of its
+own shows to be among the best, or which are chosen, with 8 seeds, as the default is, 64 samples per pixel.
+A time is that of the processor, pilot included, which neighbours on the machine disturb less than seconds;
+errors are relMSE, raw and trimmed of the worst 0.1 %. The table shows, raw and trimmed: the default's time
+times error (means over the seeds) over the least of the fixed choices, the same of what the worst of the
+pilots chose, and what was chosen. The least of several noisy products is below the true one: figures are on
+the safe side. The scenes of small_casters get a reference of 8,192 samples per pixel with a light subpath
+each.
 """
 
 from __future__ import annotations
@@ -27,14 +29,16 @@ import reference
 from metrics import TRIM, rel_mse
 from mistakes import answered
 from mitsuba_bdpt import choice, pilot, rendering
-from mitsuba_bdpt.__main__ import number
 from tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
-SPP, FIXED_SEEDS, SERVED = 64, 3, (1, 4, 16)
-REFERENCE_SPP, REFERENCE_SEED, FIXED_SEED = 4096, 1_000_000, 1000
+SPP, SEEDS, PILOT_SEEDS, SERVED = 64, 8, 32, (1, 4, 16)
+REFERENCE_SPP, REFERENCE_SEED, FIRST_SEED = 4096, 1_000_000, 1000
+
+# A fixed choice is among the best if one render's time times error, raw or trimmed, is within this factor.
+AMONG_BEST = 1.4
 SMALL = "small_casters"
 
 
@@ -60,57 +64,82 @@ def measured(scene, integrator, seed: int, expected) -> np.ndarray:
     return np.array([seconds, rel_mse(image, expected), rel_mse(image, expected, TRIM)])
 
 
-def products(rows) -> np.ndarray:
+def product(rows) -> np.ndarray:
     """Time times error, raw and trimmed, of the means over several renders; of times the least, which
     neighbours disturbed least."""
     rows = np.array(rows)
     return rows[:, 0].min() * rows[:, 1:].mean(axis=0)
 
 
-def fixed(scene, depth: int, expected) -> dict:
-    """`products` of the candidates, by weighting, number of camera subpaths and kind of connections."""
+def by_hand(scene, depth: int, way: choice.Candidate, mean: float):
+    """An integrator that does what the candidate ``way`` says; ``mean`` of the image."""
+    made = json.dumps([way.decided(0, 1.0, 1.0, mean).record()])
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})
+    integrator.render(scene, spp=1)  # compiles
+    return integrator
+
+
+def piloted(scene, settings) -> Counter:
+    """How often pilots of `PILOT_SEEDS` seeds choose which candidate; nothing where no pilot is asked."""
+    tables = (
+        rendering.Render(scene, scene.sensors()[0], settings, seed, SPP).decide()
+        for seed in range(PILOT_SEEDS)
+    )
+    return Counter(table[0].candidate for table in tables if table)
+
+
+def fixed(scene, depth: int, expected, chosen) -> dict:
+    """`product` of the candidates that are among the best or ``chosen``."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.world, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    found = {}
-    for way in choice.candidates(render.world, render.plan, settings):
-        if way.connections == "all" or way.served not in SERVED:
-            continue
-        made = json.dumps([way.decided(0, 1.0, 1.0, mean).record()])
-        integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})
-        integrator.render(scene, spp=1)
-        rows = [measured(scene, integrator, FIXED_SEED + i, expected) for i in range(FIXED_SEEDS)]
-        found[way.weighting, way.served, way.connections] = products(rows)
-    return found
+    ways = {way for way in choice.candidates(render.world, render.plan, settings) if way.served in SERVED}
+    ways = {way: by_hand(scene, depth, way, mean) for way in ways | set(chosen)}
+    first = {way: product([measured(scene, made, FIRST_SEED, expected)]) for way, made in ways.items()}
+    best = np.min(list(first.values()), axis=0)
+    return {
+        way: product([measured(scene, made, seed, expected) for seed in range(SEEDS)])
+        for way, made in ways.items()
+        if way in chosen or (first[way] <= AMONG_BEST * best).any()
+    }
 
 
-def measure(name: str, seeds: int) -> dict:
+def named(way: choice.Candidate) -> str:
+    """In words: light subpaths per camera subpath, connections, coefficients of t <= 1 and s = 1."""
+    weighting = pilot.WEIGHTINGS[way.weighting]
+    if not way.light_paths:
+        return f"0, {way.direct:g}"
+    return f"1/{way.served} {way.connections} {weighting.light * way.served:g}"
+
+
+def measure(name: str) -> dict:
     """A row: the default's time times error over the best fixed choice's, raw and trimmed, of the mean over
-    the seeds and of the worst seed; how often what was chosen."""
+    the seeds and of the worst pilot; how often what was chosen; the ratios of the fixed choices."""
     scene, depth, expected = loaded(name)
-    best = np.min(list(fixed(scene, depth, expected).values()), axis=0)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
-    integrator.render(scene, seed=FIXED_SEED, spp=SPP)  # compiles
-    rows, chosen = [], Counter()
-    for seed in range(seeds):
-        rows.append(measured(scene, integrator, seed, expected))
-        made = integrator.statistics["decisions"]
-        share = made[-1]["light_paths"] if made else None
-        chosen[f"1/{round(1 / share)} {made[-1]['connections']}" if share else "no light subpaths"] += 1
-    rows = np.array(rows)
-    worst = rows[:, 0].min() * rows[:, 1:].max(axis=0)
+    integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
+    chosen = piloted(scene, integrator.settings)
+    found = fixed(scene, depth, expected, chosen)
+    best = np.min(list(found.values()), axis=0)
+    default = product([measured(scene, integrator, seed, expected) for seed in range(SEEDS)])
+    worst = np.max([found[way] for way in chosen] or [default], axis=0)
     return {
         "scene": name,
-        "mean": (products(rows) / best).tolist(),
+        "mean": (default / best).tolist(),
         "worst": (worst / best).tolist(),
-        "chosen": dict(chosen.most_common()),
+        "chosen": {named(way): n for way, n in chosen.most_common()},
+        "fixed": {named(way): (found[way] / best).tolist() for way in sorted(found, key=named)},
     }
 
 
 def shown(row: dict) -> list[str]:
     """A row as the cells of the table."""
     cells = [f"{mean:.2f} ({worst:.2f})" for mean, worst in zip(row["mean"], row["worst"], strict=True)]
-    return [f"`{row['scene']}`", *cells, ", ".join(f"{text} ({n})" for text, n in row["chosen"].items())]
+    return [
+        f"`{row['scene']}`",
+        *cells,
+        ", ".join(f"{text} ({n})" for text, n in row["chosen"].items()) or "–",
+    ]
 
 
 def main(arguments=None) -> int:
@@ -120,7 +149,6 @@ def main(arguments=None) -> int:
     )
     parser.add_argument("scenes", nargs="*", help="names in scenes/, also small_casters/NAME")
     parser.add_argument("--all", action="store_true", help="the benchmark's scenes and all of small_casters")
-    parser.add_argument("--seeds", type=number(int, 1), default=8)
     parser.add_argument("-o", "--output", type=Path, help="JSON of the rows; scenes that are in it are kept")
     options = parser.parse_args(arguments)
     names = list(options.scenes)
@@ -135,11 +163,11 @@ def main(arguments=None) -> int:
     rows = {row["scene"]: row for row in kept or []}
     for name in names:
         if name not in rows:
-            rows[name] = measure(name, options.seeds)
+            rows[name] = measure(name)
             print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
         if options.output:
             reference.write_json(options.output, list(rows.values()))
-    head = ["scene", "raw: mean (worst seed)", "trimmed: mean (worst seed)", "chosen (seeds)"]
+    head = ["scene", "raw: default (worst pilot)", "trimmed: default (worst pilot)", "chosen (pilots)"]
     print(table(head, [shown(rows[name]) for name in names]))
     return 0
 

@@ -348,6 +348,49 @@ def test_gain_of_points_is_what_nets_leave():
     assert (moments._gain(np.ones((64, 2)), np.ones(64)) == 1).all()  # no variance, nothing to gain
 
 
+def test_gain_of_single_weightings_is_mostly_that_of_all():
+    """Rationale: some 128 pairs of nets know what points leave of all weightings together, and hardly of
+    each. Expected: 0.65 of all leaves 0.65^2 (what 64 points leave over what nets do is 0.65 again); of one
+    weighting that seems to gain ten times as much `OWN_GAIN` counts; one that is ruled out does not."""
+    made = made_of(np.ones((moments.GROUPS, len(pilot.WEIGHTINGS))), {})
+    even = replace(made, gain=np.full(len(pilot.WEIGHTINGS), 0.65))
+    np.testing.assert_allclose(even.variance(0, True)[:, 0], 0.65**2, rtol=1e-12)
+    base = made.base.copy()
+    base[:, 0] = np.inf
+    gain = np.where(np.arange(len(pilot.WEIGHTINGS)) == 1, 0.05, 0.5)
+    gain[0] = 1
+    seen = replace(made, base=base, gain=gain).variance(0, True)[0, 0]
+    common = (0.05 + 8 * 0.5) / 9
+    expected = 0.05**moments.OWN_GAIN * common ** (1 - moments.OWN_GAIN)
+    assert np.isinf(seen[0]) and seen[1] == pytest.approx(expected ** (1.35 + expected))
+
+
+def test_direct_light_is_never_rare():
+    """Rationale: the sun on a floor that seen pixels far away cover much of: its light subpaths find such a
+    pixel thousands of times as often as the camera does, and yet every camera sample finds the sun there.
+    Expected: no part of the variance is that of rare paths, whatever the coefficient."""
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(500)}
+    sun = {"type": "directional", "direction": [0.2, -1, 0.1]}
+    view = camera(64) | {"to_world": T().look_at([0, 2, 4], [0, 1, -4], [0, 1, 0])}
+    target = mi.load_dict({"type": "scene", "sensor": view, "floor": floor, "sun": sun})
+    found = moments_of(target, 1 << 12, max_depth=3)
+    assert (found.light[:, 3:].mean(axis=0) > 0).all() and (found.rare == 0).all()
+
+
+def test_light_subpaths_from_infinity_cost_more():
+    """Expected: the share of the light subpaths that start at infinity is that of the emitters' sampling
+    weights, and they take `COSTS`["far"] more."""
+    sphere = {"type": "sphere", "emitter": {"type": "area", "sampling_weight": 3.0}}
+    sun = {"type": "directional", "sampling_weight": 1.0}
+    for emitters, share in (({"a": sphere}, 0), ({"a": sphere, "b": sun}, 0.25), ({"b": sun}, 1)):
+        target = mi.load_dict({"type": "scene", "sensor": camera(16), **emitters})
+        assert of(target).world.emitters.far_share == share
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
+    way = choice.Candidate(pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, 0)), 4, "none")
+    more = choice.cost(way, rays) - choice.cost(way, rays | {"far": 0.0})
+    assert more == pytest.approx(choice.COSTS["far"] / 4 / 2)
+
+
 @pytest.mark.parametrize("make, least, most", [(sky, 0.05, 0.5), (cornell, 0.4, 0.9)])
 def test_measured_gain_of_points(make, least, most):
     """Expected: what a pilot says points leave of the variance of path tracing is what renders of a net per
@@ -456,7 +499,7 @@ def test_path_tracing_alone_before_what_is_hardly_better():
     """Expected: light subpaths that gain less than `LIGHT_GAIN` are left out, and it is said by how much;
     those that gain more are used."""
     shape = (pilot.GROUPS, len(pilot.WEIGHTINGS))
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined", "shadow_inner"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     alone, light = (pilot.WEIGHTINGS.index(w) for w in (ALONE, pilot.Weighting(1, 1, 1 / 16, 0)))
     possible = [choice.Candidate(n, s, "none") for n, s in ((alone, 1), (light, 16))]
     cost = choice.cost(possible[1], rays)
@@ -710,7 +753,7 @@ def test_the_same_kernel_where_it_hardly_matters():
     where it takes 1 / 1.1."""
     numbers = [pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, inner)) for inner in (0, 1)]
     possible = [choice.Candidate(n, 4, kind) for n, kind in zip(numbers, ("none", "one"), strict=True)]
-    kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "bsdfs")
+    kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "bsdfs", "far")
     rays = dict.fromkeys(kinds, 1.0)
     ratio = choice.cost(possible[1], rays) / choice.cost(possible[0], rays)
     for faster, chosen in ((1.03, "none"), (1.1, "one")):
@@ -727,7 +770,7 @@ def test_certainty():
     light = pilot.Weighting(1, 1, 1 / 16, 0)
     alone, lit = (pilot.WEIGHTINGS.index(w) for w in (ALONE, light))
     possible = [choice.Candidate(alone, 1, "none"), choice.Candidate(lit, 16, "none")]
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
     base[:, alone] = 10
     assert choice.certainty(made_of(base, rays), possible, True) == 1

@@ -51,12 +51,13 @@ SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 # it). Fitted to 28 scenes on two cores: off by 20 % (root mean square) for the ratio of a candidate's time to
 # that of path tracing alone, which scripts/candidates.py shows.
 COSTS = {
-    "light_path": 1.4,  # to start a light subpath
-    "light": 0.9,  # each of its rays
-    "inner": 0.2,  # to look for connections at all, per sample
-    "joined": 1.15,  # a connection that is drawn and tested
-    "shadow_inner": 1.1,  # each that is tested, where all are
-    "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
+    "light_path": 1.6,  # to start a light subpath
+    "far": 3.5,  # beside it, to start one from infinity
+    "light": 0.8,  # each of its rays
+    "inner": 0.6,  # to look for connections at all, per sample
+    "joined": 0.55,  # a connection that is drawn and tested
+    "shadow_inner": 0.65,  # each that is tested, where all are
+    "diverging": 0.55,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }
 
 # Numbers of BSDFs from which on, and up to which, the lanes of a packet take turns in evaluating theirs.
@@ -343,7 +344,8 @@ def cost(candidate: Candidate, rays: dict) -> float:
     """Cost of a sample; path tracing alone is 1. ``rays`` per sample of the pilot, see `moments.Moments`."""
     total = camera = rays["camera"] + rays["shadow_s1"]
     if candidate.light_paths:
-        light = COSTS["light_path"] + COSTS["light"] * (rays["light"] + rays["shadow_t1"])
+        light = COSTS["light_path"] + COSTS["far"] * rays["far"]
+        light += COSTS["light"] * (rays["light"] + rays["shadow_t1"])
         total += light * candidate.light_paths
     if candidate.connections != "none":
         kind = "joined" if candidate.connections == "one" else "shadow_inner"

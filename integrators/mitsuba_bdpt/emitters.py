@@ -119,11 +119,11 @@ class Emitters:
     ``direct``, ``traced``, ``joinable``: camera subpaths can hit one, next-event estimation can choose one,
     light subpaths can start from one, one of these points can be joined with a sensor; ``unhittable``: one
     cannot be hit; ``finite_hittable``: one that can be hit and joined is not at infinity; ``on_shapes``: one
-    is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: one can be reached only
-    by the light subpaths that it starts; ``evaluated``: one that lives, be it in another scene, makes it
-    necessary to record kernels without symbolic loops, calls and branches. ``left_out``: what single ones
-    cannot take part in, and why. ``disks`` where light subpaths from infinity start, if any do;
-    ``shape_errors`` of the scene, for rays.
+    is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of them do; ``beams``:
+    one can be reached only by the light subpaths that it starts; ``evaluated``: one that lives, be it in
+    another scene, makes it necessary to record kernels without symbolic loops, calls and branches.
+    ``left_out``: what single ones cannot take part in, and why. ``disks`` where light subpaths from infinity
+    start, if any do; ``shape_errors`` of the scene, for rays.
     """
 
     def __init__(self, scene):
@@ -141,7 +141,7 @@ class Emitters:
         self.finite_hittable = AREA in self.kinds
         self.on_shapes = any(e.get_shape() is not None for e in emitters)
         self.beams = DIRECTIONAL_AREA in self.kinds
-        self.at_infinity = bool(self.kinds & {INFINITE, DIRECTIONAL})
+        self.at_infinity, self.far_share = bool(self.kinds & {INFINITE, DIRECTIONAL}), 0.0
         living = living_emitters()
         self.evaluated = any(needs_evaluation(name) for name in living)
         self.left_out = [text for e, k in zip(emitters, kinds, strict=True) for text in left_out(e, k)]
@@ -149,8 +149,12 @@ class Emitters:
             return
         share_functions([*emitters, *filter(None, (e.get_shape() for e in emitters))])
         self._pointers = scene.emitters_dr()
-        sampling_weight = mi.Float([number(e.sampling_weight()) for e in emitters])
+        weights = [number(e.sampling_weight()) for e in emitters]
+        sampling_weight = mi.Float(weights)
         self._kind, self._pmf = mi.UInt32(kinds), sampling_weight / dr.sum(sampling_weight)
+        of_kinds = list(zip(weights, kinds, strict=True))
+        far = sum(w for w, k in of_kinds if k in (INFINITE, DIRECTIONAL))
+        self.far_share = far / sum(w for w, k in of_kinds if is_traced(k)) if far > 0 else 0.0
         foreign = any(is_foreign(name) for name in living)
         self._ask_shapes = foreign and not _all_answer(self._pointers)
         self._read_shapes(scene, emitters, kinds)

@@ -236,10 +236,12 @@ class Pilot:
 
     def _rare(self, size, c, squares) -> list:
         """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that
-        camera subpaths make too rarely for points to help, see `SELDOM`."""
+        camera subpaths make too rarely for points to help, see `SELDOM`. (Not light that comes from a lamp
+        without a detour: every camera sample finds it with s = 1, if that can find it at all.)"""
         shares = _shares(size, c) | {"light": 0}
+        often = (c.s == 2) & (shares["direct"] > 0)
         return [
-            square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 1)))
+            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 1))))
             for w, square in zip(WEIGHTINGS, squares, strict=True)
         ]
 
@@ -285,7 +287,8 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
-    return replace(found, rays=found.rays | {"bsdfs": world.traits.asked.count})
+    known = {"bsdfs": world.traits.asked.count, "far": world.emitters.far_share}
+    return replace(found, rays=found.rays | known)
 
 
 def _add(target, columns: int, values, row, active):
