@@ -1,6 +1,7 @@
 """What a render takes besides its samples, and what a sample takes.
 
     python scripts/overhead.py cornell_box veach_mis open_sky
+    python scripts/overhead.py --short cornell_box veach_mis thin_lens
 
 Medians over rounds in which all of them alternate, at 128^2. The cost of a sample, over that of `path`:
 seconds of a whole render of 64 samples per pixel less those of 4, so that what is fixed cancels. Path
@@ -8,6 +9,12 @@ tracing alone (light_paths=0) with its points and with independent numbers; a li
 subpaths without inner connections, with one per vertex, with all; everything switched on. A whole render of
 one sample, with path tracing alone. The pilot: its seconds, of the statistics, in renders of 64 and 256
 samples per pixel, and its share of these.
+
+With --short: whole renders of 4 and 16 samples per pixel, where a look at the scene takes more than what it
+finds out saves. Time of `path` with multijitter, of path tracing alone (without a look), of the default, and
+of the pilot in it; and what a look might take at most for a render that it leaves at path tracing alone to
+have 0.6 (4 samples) or 0.8 (16) of the efficiency of `path`, at the same error: below 0, it may not even
+record its one kernel.
 """
 
 from __future__ import annotations
@@ -26,6 +33,9 @@ from tables import table
 from timing import timed
 
 ROUNDS, SHORT, LONG = 7, 4, 64
+
+# Samples per pixel of short renders, and the least efficiency over `path` that is wanted of them.
+GOALS, SHORT_ROUNDS = {4: 0.6, 16: 0.8}, 15
 
 ALONE = {"type": "bdpt", "light_paths": 0}
 SHARED = {"type": "bdpt", "light_paths": 1 / 16}
@@ -73,12 +83,41 @@ def measure(name: str) -> list[str]:
     return row
 
 
+def measure_short(name: str) -> list[list[str]]:
+    """The rows of the table of short renders."""
+    depth = benchmark_depth(name)
+    scene = reference.load_scene(name, resolution=reference.RESOLUTION, sampler="independent")
+    stronger = reference.load_scene(name, resolution=reference.RESOLUTION, sampler="multijitter")
+    made = [
+        (mi.load_dict({"type": "path", "max_depth": depth}), stronger),
+        (mi.load_dict(ALONE | {"max_depth": depth}), scene),
+        (mi.load_dict({"type": "bdpt", "max_depth": depth}), scene),
+    ]
+    rows = []
+    for spp, goal in GOALS.items():
+        spent, looks = [], []
+        for seed in range(SHORT_ROUNDS + 1):
+            spent.append([1e3 * timed(s, integrator, spp, seed)[1] for integrator, s in made])
+            looks.append(1e3 * made[-1][0].statistics["seconds"]["pilot"])
+        path, alone, default = (statistics.median(column) for column in zip(*spent[1:], strict=True))
+        look = statistics.median(looks[1:])
+        cells = [f"{x:.0f} ms" for x in (path, alone, default, look, path / goal - alone)]
+        rows.append([f"`{name}`", str(spp), *cells])
+    return rows
+
+
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
-    names = parser.parse_args(arguments).scenes
+    parser.add_argument("--short", action="store_true", help="renders of 4 and 16 samples per pixel")
+    options = parser.parse_args(arguments)
+    names = options.scenes
     mi.set_variant("llvm_ad_rgb")
+    if options.short:
+        head = ["scene", "spp", "`path` multijitter", "path tracing alone", "default", "of that the pilot"]
+        print(table([*head, "a look might take"], [row for name in names for row in measure_short(name)]))
+        return 0
     head = ["scene", "`path`, per sample and pixel", *list(METHODS)[1:], "a render of 1 sample"]
     head += [f"pilot at {spp}" for spp in (LONG, 4 * LONG)]
     print(table(head, [measure(name) for name in names]))

@@ -72,15 +72,15 @@ def test_calls_of_few_questions_and_of_all(monkeypatch):
 
 
 def test_pilots_of_rooms():
-    """Rationale: in scenes of many BSDFs the pilot's kernel takes a second to compile, longer than a short
-    render. Expected: none is asked where 2^17 samples would be enough with fewer BSDFs, and it is said why;
-    from 2^20 on one is, also there."""
+    """Rationale: in scenes of many BSDFs the pilot's kernel takes a second to compile, longer than a preview.
+    Expected: none is asked where 2^17 samples would be enough with fewer BSDFs, and it is said why; from 2^22
+    on one is, also there."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
     few, many = (mi.load_dict(room(n, 128)) for n in (bsdf.MANY - 2, bsdf.MANY))  # the lamp has one more
     assert len(integrator.decide(few, spp=8)) == 1
-    assert integrator.decide(many, spp=63) == []
+    assert integrator.decide(many, spp=255) == []
     assert str(choice.LEAST_OF_MANY) in integrator.statistics["no_pilot"]
-    assert len(integrator.decide(many, spp=64)) == 1
+    assert len(integrator.decide(many, spp=256)) == 1
 
 
 def test_bitmaps_do_not_cut_kernels(kernels):

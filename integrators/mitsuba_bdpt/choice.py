@@ -26,10 +26,10 @@ PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 17, 1 << 24
 
-# The least number in scenes of many BSDFs (`bsdf.MANY`), where the pilot's kernel takes about a second to
-# compile, as long as these samples. (In a room of 27 materials a pilot changed the efficiency of 2^17 samples
-# by 1.06 and of 2^19 by 0.88, once nothing had to be compiled.)
-LEAST_OF_MANY = 1 << 20
+# The least number in scenes of many BSDFs (`bsdf.MANY`), where the pilot's kernel takes 1.5 seconds to
+# compile: a preview of 256^2 pixels at 32 samples each takes no longer. (In a room of 27 materials a pilot
+# changed the efficiency of 2^17 samples by 1.06 and of 2^19 by 0.88, once nothing had to be compiled.)
+LEAST_OF_MANY = 1 << 22
 
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
