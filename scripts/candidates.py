@@ -1,14 +1,12 @@
 """What the pilot predicts of each way to render, beside what renders show.
 
     python scripts/candidates.py cornell_box uplight_room glass_caustics
-    python scripts/candidates.py --seeds 12 cornell_box ajar_door   # what the pilots of 12 renders choose
 
 For each scene (128^2, as in the benchmark) and a selection of candidates: the predicted variance of a sample
 with what points leave of it, split into that of camera samples and that of splats, and cost; the relMSE of
 renders of 64 samples per pixel times 64, trimmed of its worst 0.1 %, with the default points, and their time
-over that of path tracing alone. Renders of a given candidate come from the parameter ``decisions``. With
-``--seeds``, instead: how far the cost times variance of what renders' own pilots choose is above the least of
-all candidates, both judged by 2^17 samples. (scripts/choices.py judges by renders.)
+over that of path tracing alone. Renders of a given candidate come from the parameter ``decisions``. (What
+pilots choose, and what that is worth: scripts/choices.py.)
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ import argparse
 import json
 import statistics
 import sys
-from collections import Counter
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 from tables import table
@@ -28,7 +25,6 @@ import metrics
 import reference
 from mistakes import answered
 from mitsuba_bdpt import choice, pilot, rendering
-from mitsuba_bdpt.__main__ import number
 from reference import RESOLUTION, benchmark_depth
 from timing import timed
 
@@ -109,38 +105,13 @@ def lines(name: str, depth: int) -> list:
     return rows
 
 
-def stability(name: str, depth: int, seeds: int) -> list:
-    """A row about what ``seeds`` renders choose; where none asks a pilot, why."""
-    scene = reference.load_scene(name, resolution=RESOLUTION)
-    settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
-    judge = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
-    settled = not choice.is_open(judge.plan, settings)
-    if settled or choice.by_scene(judge.world, judge.plan, settings, SPP * RESOLUTION**2):
-        return [f"`{name}`", judge.why_no_pilot(), "–", "–"]
-    possible = choice.candidates(judge.world, judge.plan, settings)
-    table_of_judge = choice.choose(predicted(scene, settings), possible, True)
-    times = {row.candidate: row.time for row in table_of_judge}
-    renders = (rendering.Render(scene, scene.sensors()[0], settings, seed, SPP) for seed in range(seeds))
-    chosen = [render.decide()[0].candidate for render in renders]
-    above = [times[c] / table_of_judge[0].time - 1 for c in chosen]
-    counts = Counter(f"1/{c.served} {c.connections}" if c.light_paths else "0" for c in chosen)
-    texts = ", ".join(f"{text} ({n})" for text, n in counts.most_common())
-    return [f"`{name}`", texts, f"{100 * statistics.median(above):.0f} %", f"{100 * max(above):.0f} %"]
-
-
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
-    text = "compare what the pilots of so many renders choose"
-    parser.add_argument("--seeds", type=number(int, 1), help=text)
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     depths = {name: benchmark_depth(name) for name in options.scene}
-    if options.seeds:
-        rows = [stability(name, depth, options.seeds) for name, depth in depths.items()]
-        print(table(["scene", "chosen (seeds)", "above the best: median", "worst"], rows))
-        return 0
     head = ["scene", "light_paths, connections, kappa of t=1 over its count", "predicted: camera + splats"]
     head += ["relMSE · spp", "ratio", "predicted cost", "time"]
     rows = []

@@ -1,7 +1,8 @@
 """What the default's choice of strategies is worth: its time to an error over that of the best fixed choice.
 
     python scripts/choices.py small_casters/point_cube cornell_box
-    python scripts/choices.py --all -o docs/choices.json    # every scene; can be interrupted
+    python scripts/choices.py --all -o docs/choices.json            # every scene; can be interrupted
+    python scripts/choices.py --all -o docs/choices.json --again    # after a change of the choice
 
 For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, and what pilots
 of 32 seeds choose, are rendered by hand (parameter ``decisions``); those which one render of a seed of its
@@ -64,11 +65,16 @@ def measured(scene, integrator, seed: int, expected) -> np.ndarray:
     return np.array([seconds, rel_mse(image, expected), rel_mse(image, expected, TRIM)])
 
 
-def product(rows) -> np.ndarray:
-    """Time times error, raw and trimmed, of the means over several renders; of times the least, which
+def mean_of(rows) -> list[float]:
+    """Seconds, raw and trimmed error of several renders: means, but of the seconds the least, which
     neighbours disturbed least."""
     rows = np.array(rows)
-    return rows[:, 0].min() * rows[:, 1:].mean(axis=0)
+    return [float(rows[:, 0].min()), *rows[:, 1:].mean(axis=0).tolist()]
+
+
+def products(found: dict) -> dict:
+    """Time times error, raw and trimmed, of what `mean_of` has found for each way."""
+    return {name: seconds * np.array(errors) for name, (seconds, *errors) in found.items()}
 
 
 def by_hand(scene, depth: int, way: choice.Candidate, mean: float):
@@ -88,20 +94,25 @@ def piloted(scene, settings) -> Counter:
     return Counter(table[0].candidate for table in tables if table)
 
 
-def fixed(scene, depth: int, expected, chosen) -> dict:
-    """`product` of the candidates that are among the best or ``chosen``."""
+def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
+    """`mean_of` the candidates, by their names, that are among the best or ``chosen``. Where those among the
+    best are ``known``, only the best of these and the chosen are rendered, as times have to be compared."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.world, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    ways = {way for way in choice.candidates(render.world, render.plan, settings) if way.served in SERVED}
-    ways = {way: by_hand(scene, depth, way, mean) for way in ways | set(chosen)}
-    first = {way: product([measured(scene, made, FIRST_SEED, expected)]) for way, made in ways.items()}
-    best = np.min(list(first.values()), axis=0)
-    return {
-        way: product([measured(scene, made, seed, expected) for seed in range(SEEDS)])
-        for way, made in ways.items()
-        if way in chosen or (first[way] <= AMONG_BEST * best).any()
-    }
+    ways = {named(way): way for way in choice.candidates(render.world, render.plan, settings)}
+    if known:
+        old = products(known)
+        names = chosen | {min(old, key=lambda name: old[name][i]) for i in (0, 1)}
+    else:
+        names = chosen | {name for name, way in ways.items() if way.served in SERVED}
+    made = {name: by_hand(scene, depth, ways[name], mean) for name in sorted(names)}
+    if not known:
+        first = products({n: measured(scene, way, FIRST_SEED, expected) for n, way in made.items()})
+        best = np.min(list(first.values()), axis=0)
+        made = {n: w for n, w in made.items() if n in chosen or (first[n] <= AMONG_BEST * best).any()}
+    rendered = {n: [measured(scene, w, seed, expected) for seed in range(SEEDS)] for n, w in made.items()}
+    return known | {name: mean_of(rows) for name, rows in rendered.items()}
 
 
 def named(way: choice.Candidate) -> str:
@@ -112,34 +123,30 @@ def named(way: choice.Candidate) -> str:
     return f"1/{way.served} {way.connections} {weighting.light * way.served:g}"
 
 
-def measure(name: str) -> dict:
-    """A row: the default's time times error over the best fixed choice's, raw and trimmed, of the mean over
-    the seeds and of the worst pilot; how often what was chosen; the ratios of the fixed choices."""
+def measure(name: str, known: dict) -> dict:
+    """A row: seconds, raw and trimmed error of the default and of fixed choices (those ``known`` are kept),
+    and how often pilots have chosen which of these."""
     scene, depth, expected = loaded(name)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
-    chosen = piloted(scene, integrator.settings)
-    found = fixed(scene, depth, expected, chosen)
-    best = np.min(list(found.values()), axis=0)
-    default = product([measured(scene, integrator, seed, expected) for seed in range(SEEDS)])
-    worst = np.max([found[way] for way in chosen] or [default], axis=0)
+    chosen = {named(way): n for way, n in piloted(scene, integrator.settings).most_common()}
     return {
         "scene": name,
-        "mean": (default / best).tolist(),
-        "worst": (worst / best).tolist(),
-        "chosen": {named(way): n for way, n in chosen.most_common()},
-        "fixed": {named(way): (found[way] / best).tolist() for way in sorted(found, key=named)},
+        "fixed": fixed(scene, depth, expected, set(chosen), known),
+        "default": mean_of([measured(scene, integrator, seed, expected) for seed in range(SEEDS)]),
+        "chosen": chosen,
     }
 
 
 def shown(row: dict) -> list[str]:
     """A row as the cells of the table."""
-    cells = [f"{mean:.2f} ({worst:.2f})" for mean, worst in zip(row["mean"], row["worst"], strict=True)]
-    return [
-        f"`{row['scene']}`",
-        *cells,
-        ", ".join(f"{text} ({n})" for text, n in row["chosen"].items()) or "–",
-    ]
+    found = products(row["fixed"] | {"default": row["default"]})
+    default = found.pop("default")
+    best = np.min(list(found.values()), axis=0)
+    worst = np.max([found[name] for name in row["chosen"]] or [default], axis=0)
+    cells = [f"{m:.2f} ({w:.2f})" for m, w in zip(default / best, worst / best, strict=True)]
+    counts = ", ".join(f"{name} ({n})" for name, n in row["chosen"].items())
+    return [f"`{row['scene']}`", *cells, counts or "–"]
 
 
 def main(arguments=None) -> int:
@@ -149,6 +156,7 @@ def main(arguments=None) -> int:
     )
     parser.add_argument("scenes", nargs="*", help="names in scenes/, also small_casters/NAME")
     parser.add_argument("--all", action="store_true", help="the benchmark's scenes and all of small_casters")
+    parser.add_argument("--again", action="store_true", help="render the default of scenes in OUTPUT anew")
     parser.add_argument("-o", "--output", type=Path, help="JSON of the rows; scenes that are in it are kept")
     options = parser.parse_args(arguments)
     names = list(options.scenes)
@@ -162,8 +170,8 @@ def main(arguments=None) -> int:
     kept = options.output and options.output.exists() and json.loads(options.output.read_text())
     rows = {row["scene"]: row for row in kept or []}
     for name in names:
-        if name not in rows:
-            rows[name] = measure(name)
+        if name not in rows or options.again:
+            rows[name] = measure(name, rows[name]["fixed"] if name in rows else {})
             print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
         if options.output:
             reference.write_json(options.output, list(rows.values()))

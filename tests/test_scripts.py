@@ -100,7 +100,6 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
 @pytest.mark.parametrize(
     "command",
     [
-        "candidates.py x --seeds -1",
         "endurance.py --seconds nan",
         "endurance.py --samples inf",
         "endurance.py --render-samples 0",

@@ -48,8 +48,8 @@ SKY_DIRECT, UNIFORM = 1 / 2, 2
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
 # What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
-# it). Fitted to 28 scenes on two cores: off by 20 % (root mean square) for the ratio of a candidate's time to
-# that of path tracing alone, which scripts/candidates.py shows.
+# it). Fitted to all candidates in 26 scenes on two cores: off by 6 % (root mean square) for the ratios of their
+# times, which scripts/candidates.py shows.
 COSTS = {
     "light_path": 1.6,  # to start a light subpath
     "far": 3.5,  # beside it, to start one from infinity
@@ -69,7 +69,7 @@ FEW_BSDFS, MANY_BSDFS = 4, 16
 # finds of that is off by a fifth.
 DIRECT_GAIN = 1.3
 
-# Light subpaths have to gain this factor over path tracing alone: predicted costs are off by 17 %, and who
+# Light subpaths have to gain this factor over path tracing alone: predictions are off by as much, and who
 # renders a plain scene should not notice that they were an option.
 LIGHT_GAIN = 1.15
 
