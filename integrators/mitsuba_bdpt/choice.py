@@ -48,8 +48,8 @@ SKY_DIRECT, UNIFORM = 1 / 2, 2
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
 # What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
-# it). Fitted to all candidates in 26 scenes on two cores: off by 6 % (root mean square) for the ratios of their
-# times, which scripts/candidates.py shows.
+# it). Fitted to all candidates in 26 scenes on two cores: off by 6 % (root mean square) for the ratios of
+# their times, which scripts/candidates.py shows.
 COSTS = {
     "light_path": 1.6,  # to start a light subpath
     "far": 3.5,  # beside it, to start one from infinity
