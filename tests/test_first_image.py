@@ -94,3 +94,23 @@ def test_bitmaps_do_not_cut_kernels(kernels):
     assert len(integrator.statistics["passes"]) == 2
     large = [kernel for kernel in kernels if "Symbolic loop" in kernel]
     assert len(large) == 2 and large[0] == large[1]
+
+
+def test_decisions_share_kernels(kernels):
+    """Rationale: pilots of other seeds choose other numbers of light subpaths and coefficients, and compiling
+    a kernel anew takes as long as a preview. Expected: one kernel for all of them, and one for each kind of
+    connections."""
+    scene = mi.load_dict(room(2, 16))
+    ways = [
+        (1, 1 / 64, "none"),
+        (1 / 16, 1, "none"),
+        (1, 1 / 16, "one"),
+        (1 / 4, 1, "one"),
+        (1 / 4, 1, "all"),
+    ]
+    for light_paths, splat, connections in ways:
+        coefficients = {"t<=1": splat, "s=1": 1.0}
+        made = ALL[0] | {"light_paths": light_paths, "connections": connections, "coefficients": coefficients}
+        render(scene, decisions=json.dumps([made]))
+    large = [kernel for kernel in kernels if "Symbolic loop" in kernel]
+    assert [large.index(kernel) for kernel in large] == [0, 0, 2, 2, 4]
