@@ -130,12 +130,16 @@ def measure(name: str, known: dict) -> dict:
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
     chosen = {named(way): n for way, n in piloted(scene, integrator.settings).most_common()}
-    return {
-        "scene": name,
-        "fixed": fixed(scene, depth, expected, set(chosen), known),
-        "default": mean_of([measured(scene, integrator, seed, expected) for seed in range(SEEDS)]),
-        "chosen": chosen,
-    }
+    found = fixed(scene, depth, expected, set(chosen), known)
+    rows = {}  # by decision: another one takes another time
+    for seed in range(SEEDS):
+        row = measured(scene, integrator, seed, expected)
+        (made,) = integrator.statistics["decisions"] or [None]
+        label = made and (made["light_paths"], made["connections"])
+        rows.setdefault(label, []).append(row)
+    weights = [len(group) / SEEDS for group in rows.values()]
+    default = np.average([mean_of(group) for group in rows.values()], axis=0, weights=weights)
+    return {"scene": name, "fixed": found, "default": default.tolist(), "chosen": chosen}
 
 
 def shown(row: dict) -> list[str]:

@@ -60,7 +60,7 @@ POOL_WAVES = np.array(
 RING_INNER, RING_OUTER, RING_HEIGHT = 0.88, 1.0, 0.34  # the ring of ring_caustic
 MIRROR_RIM = 3.0  # radius of the headlight's mirror, in focal lengths
 
-# The pebble of small_casters: rows and sides (9,900 triangles), and its bumps: amplitude, waves from pole to
+# The pebble of small_casters: rows and sides (9,898 triangles), and its bumps: amplitude, waves from pole to
 # pole, waves around the axis.
 PEBBLE_ROWS, PEBBLE_SIDES = 50, 101
 PEBBLE_BUMPS = ((0.10, 2, 3), (0.06, 5, 2), (0.03, 7, 6))

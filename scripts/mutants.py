@@ -282,20 +282,21 @@ def run(mutants: list[Mutant], bug: bool) -> int:
     return wrong
 
 
-def main() -> int:
+def main(arguments=None) -> int:
+    """Run the tests of the mutants, or print these."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("words", nargs="*", help="only mutants with one of these words in their name")
     parser.add_argument("--list", action="store_true", help="print names and what is replaced, run nothing")
     parser.add_argument("--unchanged", action="store_true", help="run the same tests without the bugs")
-    arguments = parser.parse_args()
-    mutants = chosen(arguments.words)
-    if arguments.list:
+    options = parser.parse_args(arguments)
+    mutants = chosen(options.words)
+    if options.list:
         for mutant in mutants:
             print(f"{mutant.name}: {mutant.file}: {mutant.old!r} -> {mutant.new!r}")
         return 0
-    wrong = run(mutants, not arguments.unchanged)
+    wrong = run(mutants, not options.unchanged)
     tests = sum(len(mutant.tests) for mutant in mutants)
     print(f"{len(mutants)} mutants, {tests} tests: {wrong} wrong")
     return 1 if wrong else 0

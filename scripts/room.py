@@ -27,7 +27,7 @@ def _normals(seed: int) -> dict:
 
 
 def _colour(i: int) -> dict:
-    """A reflectance that no other material of the number ``i`` has."""
+    """A reflectance of the material of the number ``i`` alone."""
     return {"type": "rgb", "value": [0.2 + 0.02 * i, 0.7 - 0.01 * i, 0.3 + 0.01 * i]}
 
 
@@ -71,15 +71,20 @@ KINDS = (
         "bsdf": _two_sided({"type": "diffuse", "reflectance": _picture(i + 1)}),
     },
     lambda i: {"type": "thindielectric", "int_ior": 1.4 + 0.01 * i},
-    lambda i: _two_sided({"type": "conductor", "material": ("Ag", "Cr")[i % 2]}),
+    lambda i: _two_sided({"type": "conductor", "material": "Ag", "specular_reflectance": _colour(i)}),
     lambda i: _two_sided({"type": "plastic", "diffuse_reflectance": _colour(i)}),
 )
+
+
+MOST = 40  # beyond that colours and roughness would be above 1
 
 
 def room(materials: int, size: int = 128) -> dict:
     """A scene of so many materials for ``mi.load_dict``, ``size``^2 pixels: walls, floor and a lamp of the
     first kind, and a grid of balls and blocks on the floor, one for each of the other materials. The mix is
-    that of `KINDS`, over and over; no two materials are equal."""
+    that of `KINDS`, over and over; no two materials are equal. `MOST` at most."""
+    if not 1 <= materials <= MOST:
+        raise ValueError(f"materials={materials} is out of range; a room has 1 to {MOST} of them")
     t = mi.ScalarTransform4f()
     made = [KINDS[i % len(KINDS)](i) for i in range(materials)]
     scene = {

@@ -229,7 +229,8 @@ def test_remedies_of_an_import_after_drjit_help():
     assert code.index("mitsuba_bdpt") < code.index("import mitsuba as mi")
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "I", "-"]
     sort = [
-        subprocess.run(ruff, input=text, text=True) for text in (code, code.replace("# isort: skip", "#"))
+        subprocess.run(ruff, input=text, text=True, capture_output=True)
+        for text in (code, code.replace("# isort: skip", "#"))
     ]
     assert [done.returncode for done in sort] == [0, 1]
 

@@ -199,6 +199,40 @@ def test_a_lens_finds_it():
     assert not warnings and integrator.statistics["lost_light"] == {}
 
 
+def test_another_share_is_not_said_anew(monkeypatch):
+    """Rationale: the share in the text is of the image's mean, which has noise. Expected: one warning for two
+    renders of a scene that find different shares."""
+    texts = iter(["bdpt: about 30 %", "bdpt: about 31 %"])
+    monkeypatch.setattr(lost_light, "in_words", lambda *_: next(texts))
+    scene = scene_of(LAMPS["point"], block=BLOCK)
+    with Warned() as warnings:
+        for seed in range(2):
+            bdpt().render(scene, spp=1, seed=seed)
+    assert warnings == ["about 30 %"] and next(texts, None) is None
+
+
+def test_the_black_side_of_a_surface_lacks_no_light(monkeypatch):
+    """Rationale: a one-sided surface is black from behind. Expected: nothing is lost on a floor that is seen
+    and lit from behind, under a sheet of nothing."""
+    scene = scene_of(LAMPS["point"], floor=floor() | {"flip_normals": True}, sheet=sheet({"type": "null"}))
+    assert estimate(scene, monkeypatch) == 0
+
+
+def test_an_edited_lamp_is_looked_at_anew():
+    """Rationale: shares are of the image that was rendered. Expected: with 100 times the intensity the same
+    share is lost (of an image with noise: within a tenth)."""
+    scene, integrator = scene_of(LAMPS["point"], block=BLOCK), bdpt()
+    params = mi.traverse(scene)
+    (key,) = (name for name in params.keys() if name.endswith("intensity.value"))
+    shares = []
+    for _ in range(2):
+        integrator.render(scene, spp=16)
+        shares.append(sum(integrator.statistics["lost_light"].values()))
+        params[key] = params[key] * 100
+        params.update()
+    assert shares[0] > 0.1 and shares[1] == pytest.approx(shares[0], rel=0.1)
+
+
 def test_it_is_looked_for_once(monkeypatch):
     """Rationale: the look takes some ten milliseconds, and its kernels are compiled. Expected: one for three
     renders of a scene where such paths are possible, none where they are not."""

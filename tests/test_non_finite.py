@@ -9,7 +9,7 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import notices, suspects
+from mitsuba_bdpt import emitter_kinds, notices, suspects
 from stress_cases import cases
 from stress_cases.poisons import NAN, filled, painted, room
 from stress_cases.warned import Warned
@@ -151,6 +151,17 @@ def test_a_large_bitmap_is_looked_at_in_part(monkeypatch):
     monkeypatch.setattr(np, "nanmax", lambda a, **keys: looked.append(a.size) or nanmax(a, **keys))
     assert len(suspects.brighteners(bsdfs)) == 2
     assert looked == [3 * 64, 3 * 64]
+
+
+@pytest.mark.parametrize("texel", [math.nan, math.inf, -1e4])
+def test_a_map_without_a_mean_is_not_even(texel):
+    """Rationale: a comparison with NaN is false, so that such a map counted as uniform, and the scene alone
+    decided. Expected: no number up to which a sky is even; black all over is even."""
+    texels = np.full((8, 16, 3), 0.5, np.float32)
+    texels[2, 3] = texel
+    for data, expected in ((texels, math.inf), (0 * texels[:2], 1.0)):
+        made = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(data)})
+        assert emitter_kinds.contrast(made) == expected
 
 
 def beside_spots(*angles):

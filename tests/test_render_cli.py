@@ -609,7 +609,9 @@ def test_progress_under_a_time_limit():
     assert bar.tasks[0].completed == 0.25
 
 
-@pytest.mark.parametrize("words", [["--help"], ["render", "--help"], ["doctor", "--help"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [["--help"], *([name, "--help"] for name in ("render", "explain", "doctor"))], ids=" ".join
+)
 def test_help_does_nothing_else(scene, capsys, words):
     """Expected: the usage, status 0, no file."""
     with pytest.raises(SystemExit) as ended:

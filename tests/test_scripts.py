@@ -189,7 +189,7 @@ def test_every_script_of_the_readme_exists():
 def test_mutants_can_be_planted(mutant, tmp_path):
     """Rationale: once the code has changed, a bug whose text is no longer there would be found at the next
     `make mutants` only, and a test that was renamed as well. Expected: the text is replaced in the copy; the
-    tests exist."""
+    tests exist (`make mutants` sees whether their parameters do)."""
     copy = mutants.planted(tmp_path, mutant) / mutants.PACKAGE.name / mutant.file
     original = (mutants.PACKAGE / mutant.file).read_text()
     assert mutant.old not in copy.read_text() or mutant.old in mutant.new

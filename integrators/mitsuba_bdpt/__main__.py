@@ -1,8 +1,8 @@
 """The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
 
 ``render`` renders a scene file; ``explain`` says what such a render would do and what it would leave out;
-``doctor`` explains what the installation found and whether it works. The rest of the package is imported
-inside `main`, because `doctor` has to run where it cannot be imported.
+``doctor`` explains what the installation found and whether it works. What needs Mitsuba is imported inside
+`main`, because `doctor` has to run where that cannot be imported.
 """
 
 from __future__ import annotations

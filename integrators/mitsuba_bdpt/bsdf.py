@@ -194,7 +194,7 @@ def sample(
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
         return drawn, _evaluated(bsdf, si, *joined, traits.asked) if target else None
 
-    drawn, evaluated = _answers(questions, bsdf, si, u1, u2, active, target, traits.asked)
+    drawn, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
     step = _step(si, drawn, drawn.weight)
     if traits.round_trip:  # no alternative that would have to make this event from the other side
         step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
@@ -212,19 +212,19 @@ def sample_adjoint(
         weight = _adjoint_weight(bsdf, si, drawn, sampled, traits)
         return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits.asked) if target else None
 
-    drawn, weight, evaluated = _answers(questions, bsdf, si, u1, u2, active, target, traits.asked)
+    drawn, weight, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
     cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
     step = _step(si, drawn, dr.select(is_zero(weight), 0, weight * cos_ratio))
     return step, _adjoint(target.cos_ratio, *evaluated) if target else None
 
 
-def _answers(questions, bsdf, si, u1, u2, active, target, asked: Asked):
-    """Answers of ``questions(bsdf, si, u1, u2, active)``; direction and mask of a ``target`` follow."""
+def _answers(questions, asked: Asked, target, bsdf, *args):
+    """Answers of ``questions(bsdf, *args)``, the last of ``args`` a mask; direction and mask of a ``target``
+    follow."""
     joined = (target.wo, target.active) if target else ()
-    mask = active | target.active if target else active
-    return asked.together(
-        bsdf, lambda bsdf, *args: questions(bsdf, *args[:-1]), si, u1, u2, active, *joined, mask
-    )
+    mask = args[-1] | target.active if target else args[-1]
+    # The last argument is the call's mask.
+    return asked.together(bsdf, lambda bsdf, *args: questions(bsdf, *args[:-1]), *args, *joined, mask)
 
 
 def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):

@@ -266,7 +266,7 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
 
 def least_samples(traits) -> int:
     """How many samples a render needs for a pilot; `bsdf.Traits` of its scene."""
-    return max(LEAST_SAMPLES, LEAST_OF_MANY) if traits.asked.many else LEAST_SAMPLES
+    return LEAST_OF_MANY if traits.asked.many else LEAST_SAMPLES
 
 
 def lanes(samples: int) -> int:

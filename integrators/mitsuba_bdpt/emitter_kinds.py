@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from .objects import all_shapes, children, matrix_of, number, own_parameters
+from .spheres import Sphere, sphere_normal
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
 # direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
@@ -73,7 +74,7 @@ def _tells_its_points(emitter) -> bool:
 
 def contrast(emitter) -> float:
     """The largest radiance of an environment over its mean; infinite for other emitters, and where that would
-    take long to find out, or where the numbers of an ``envmap`` are not radiances."""
+    take long to find out, where the numbers of an ``envmap`` are not radiances, or none that has a ratio."""
     kind = emitter.class_name()
     if kind == "ConstantBackgroundEmitter":
         return 1.0
@@ -85,7 +86,9 @@ def contrast(emitter) -> float:
     pixels = np.array(data).max(axis=-1)
     rows = np.sin(np.pi * (np.arange(len(pixels)) + 0.5) / len(pixels))
     mean = float((pixels.mean(axis=1) @ rows) / rows.sum())
-    return float(pixels.max()) / mean if mean > 0 else 1.0
+    if not pixels.any():  # black everywhere
+        return 1.0
+    return float(pixels.max()) / mean if 0 < mean < math.inf else math.inf
 
 
 def _reads_attributes(texture) -> bool:
@@ -161,7 +164,13 @@ def _is_sampled_from_behind(emitter) -> bool:
         return False
     u = mi.Point2f(0.4, 0.6)
     by_texture, _ = emitter.sample_position(0, u)
-    return number(dr.dot(by_texture.n, emitter.get_shape().sample_position(0, u).n)) < 0
+    # A sphere's normals are compared at one point: those of two points may be opposite anyway.
+    sphere = Sphere.of(emitter.get_shape())
+    if sphere is not None:
+        normal = sphere_normal(by_texture.p, sphere.center, sphere.outward)
+    else:
+        normal = emitter.get_shape().sample_position(0, u).n
+    return number(dr.dot(by_texture.n, normal)) < 0
 
 
 def check_coordinates(emitter):

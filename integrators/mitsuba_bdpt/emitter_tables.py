@@ -192,8 +192,8 @@ class SmoothMeshes:
     """Geometric normals of emitting meshes that have vertex normals.
 
     Repeats the choice of a face that ``Mesh.sample_position`` makes: by area, from ``sample.y``. Mitsuba's
-    table are sums of areas in single precision, so the choice is repeated on the same sums, made in the same
-    way: those in double precision find another face for 23 % of the points of a sphere of 32,512 faces.
+    table is of sums of areas in single precision, so the choice is repeated on the same sums, made in the
+    same way: those in double precision find another face for 23 % of the points of a sphere of 32,512 faces.
     """
 
     @staticmethod

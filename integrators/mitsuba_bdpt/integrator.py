@@ -47,8 +47,8 @@ All of them are combined by multiple importance sampling.
    - |string|
    - ``impossible`` leaves out what the scene cannot use, draws one connection per camera vertex and drops
      small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^17
-     samples or more, asks a pilot what pays, or the scene alone where that tells (see `choice`); ``none``
-     does everything.
+     samples or more (2^22 in scenes of ten BSDFs or more), asks a pilot what pays, or the scene alone where
+     that tells (see `choice`); ``none`` does everything.
  * - light_paths
    - |string| or |float|
    - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses; without one 1/4, but 1 on
@@ -105,7 +105,8 @@ decide from the rest, and one message of Mitsuba's log (``Warn``) after the rend
 hold such numbers. One before the first render of a scene names BSDFs that reflect more light than they
 receive; one after it the lamps without area of whose light more than a hundredth of the image's is missing,
 because they shine through glass on what is seen through glass. ``statistics["lost_light"]`` has the estimated
-shares by the number of the emitter.
+shares by the number of the emitter; what is lost is estimated at the first render, and again after edits of
+the lamps or the sensor, but not of what is around them.
 
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
@@ -223,7 +224,8 @@ def _make_class():
             shares, text = render.lost_light()
             self.statistics["lost_light"] = shares
             if text:
-                warn_once(render.world.scene, render.sensor, text)
+                about = "lost light", render.plan.splat, render.plan.direct
+                warn_once(render.world.scene, render.sensor, text, about)
 
         def sample(self, *args, **kwargs):
             raise NotImplementedError(

@@ -143,8 +143,7 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
     after the other); nothing is evaluated yet."""
     sharing = shared_by(kernel, batch, points)
-    # Exact also where S does not divide the batch; a pilot's estimates are those of one light subpath.
-    kernel = kernel.bound(points, 1.0 if batch.spread else sharing.lanes / batch.size)
+    kernel = kernel.bound(points, _count_light(batch, sharing))
     lane = dr.arange(mi.UInt32, sharing.lanes)
     common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), lane)
 
@@ -170,7 +169,7 @@ def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
     """Trace some camera samples of a batch again, as `trace` does: those of these ``slot``s (``UInt32``) with
     the light subpath of the lane that each is in. (For whoever looks at single samples; no render does.)"""
     sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, sharing.lanes / batch.size)
+    kernel = kernel.bound(points, _count_light(batch, sharing))
     common, of_light = _begin(kernel, sink, _Places(kernel, batch, spp), sharing.lane(slot))
     counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
     return _sum(of_light, _camera_subpath(kernel, sink, common, slot, counters, mi.Bool(True)))
@@ -182,6 +181,12 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
     return Sharing(batch.pixels, batch.samples, kernel.plan.served, points.seed)
+
+
+def _count_light(batch: Batch, sharing: Sharing) -> float:
+    """Light subpaths per camera subpath: exact also where S does not divide the batch. A pilot's estimates
+    are those of one, whose number it divides by itself."""
+    return 1.0 if batch.spread else sharing.lanes / batch.size
 
 
 def _begin(kernel, sink, place: _Places, lane):

@@ -18,7 +18,7 @@ import numpy as np
 
 from . import bsdf, rays
 from .kernel import Shared
-from .objects import nothing_freed, step_by_step
+from .objects import children, nothing_freed, own_parameters, step_by_step
 from .plan import lost_paths
 
 # Subpaths from either end, and how many of those that arrive are compared, at most.
@@ -88,6 +88,16 @@ class _Ends:
 def is_possible(world, plan, settings) -> bool:
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
     return not plan.arrival and bool(lost_paths(world, plan, settings))
+
+
+def lamps_and_sensor(world) -> tuple:
+    """What tells the scene's delta emitters and the sensor from others, and from themselves after an edit:
+    their numbers, but those of bitmaps."""
+    lamps = [e for e in world.scene.emitters() if e.get_shape() is None and not e.is_environment()]
+    textures = (inner for lamp in lamps for inner in children(lamp).values() if isinstance(inner, mi.Texture))
+    owners = [*lamps, *textures, world.camera.sensor]
+    values = (value for owner in owners for value in own_parameters(owner).values())
+    return tuple(str(value) for value in values if not dr.is_tensor_v(value))
 
 
 def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
@@ -249,6 +259,8 @@ def _nowhere() -> _Ends:
 def _end(si, surface, ray, weight, edges, distance, active) -> _Ends:
     """The end of a subpath at ``si``."""
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
+    front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
+    seen = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, front, back)  # the other side of most BSDFs is black
     return _Ends(
         p=mi.Point3f(si.p),
         n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d))),
@@ -257,7 +269,7 @@ def _end(si, surface, ray, weight, edges, distance, active) -> _Ends:
         edges=edges,
         distance=distance,
         reflectance=_brightness(surface.eval_diffuse_reflectance(si, active)),
-        active=mi.Bool(active),
+        active=active & seen,
     )
 
 

@@ -41,6 +41,11 @@ SPLAT_GAIN = 0.75
 OWN_GAIN = 0.3
 
 
+# Fields of `Moments` that have a row for each group, and all of its arrays.
+_OF_GROUPS = ("base", "rare", "light", "draw")
+ARRAYS = (*_OF_GROUPS, "gain")
+
+
 @dataclass(frozen=True)
 class Moments:
     """What a pilot found, in units of the image's relative squared error per sample and pixel.
@@ -85,8 +90,7 @@ class Moments:
 
     def of(self, groups) -> Moments:
         """The moments of these of its groups, by number."""
-        rows = {n: getattr(self, n)[groups] for n in ("base", "rare", "light", "draw")}
-        return replace(self, **rows)
+        return replace(self, **{n: getattr(self, n)[groups] for n in _OF_GROUPS})
 
     def joined(self, other: Moments) -> Moments:
         """This pilot and another, of which each counts by its number of ``lanes``."""
@@ -96,7 +100,7 @@ class Moments:
             return share * a + (1 - share) * b
 
         rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
-        means = {f.name: mean(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)[:6]}
+        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*ARRAYS, "mean")}
         return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
 
 
@@ -138,12 +142,12 @@ def group(lane):
 
 
 def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) -> Moments:
-    """The moments of a pilot of independent ``samples``, and ``nets``, with the ``splats`` of a light subpath
-    per camera sample; ``rays`` per camera sample."""
-    lanes = len(samples.tile)
+    """The moments of a pilot of independent ``samples``, and ``nets``, with ``splats`` as if of one light
+    subpath per camera sample; ``rays`` per camera sample."""
+    count = len(samples.tile)
     width = samples.estimate.shape[1]
     sizes = splats.sums[:, :, splats.size].sum(axis=2) / splats.lanes
-    groups = group(np.arange(lanes))
+    groups = group(np.arange(count))
     inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
     weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
@@ -153,13 +157,13 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
         """By group, one column per weighting: those that have no use for ``values`` come first."""
         total = weighted[:, columns]
         if values is not None:
-            of_samples = _by_group(values * of_sample) * (GROUPS / lanes)
+            of_samples = _by_group(values * of_sample) * (GROUPS / count)
             total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), splats.moment)
-    by_group = _by_group(estimate[:, -1:])[:, 0] / lanes + sizes.sum(axis=1)
+    by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
     return Moments(
         base=np.where(base < RULED_OUT, base, np.inf),
         rare=summed(None, splats.rare),
@@ -168,7 +172,7 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,
-        lanes=lanes + (len(nets.tile) if nets else 0),
+        lanes=count + (len(nets.tile) if nets else 0),
     )
 
 

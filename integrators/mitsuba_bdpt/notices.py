@@ -29,9 +29,11 @@ def notes(scene, sensor) -> dict:
     return found
 
 
-def warn_once(scene, sensor, text: str):
-    """Log a warning, unless it was said of the ``scene`` before."""
+def warn_once(scene, sensor, text: str, about=None):
+    """Log a warning, unless it was said of the ``scene`` before: the same ``text``, or one ``about`` the same
+    where it has numbers that differ from render to render."""
     said = notes(scene, sensor).setdefault("said", set())
-    if text not in said:
-        said.add(text)
+    about = about or text
+    if about not in said:
+        said.add(about)
         mi.Log(mi.LogLevel.Warn, text)

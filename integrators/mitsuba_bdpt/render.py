@@ -87,7 +87,6 @@ def run(options: Namespace) -> int:
 def explain(options: Namespace) -> int:
     """Print what a render as the command line `options` say would do, and return the exit status."""
     try:
-        check_file(options.scene)
         scene, integrator = load(options)
         sensor = choose_sensor(scene, options.sensor)
         spp = options.spp or sensor.sampler().sample_count()

@@ -18,7 +18,7 @@ from ._version import __version__
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
-from .moments import Moments
+from .moments import ARRAYS, Moments
 from .notices import notes
 from .objects import nothing_freed, number, step_by_step
 from .parameters import check_film, check_not_frozen, check_scene, check_variant, integer
@@ -31,9 +31,6 @@ from .world import World
 
 # Kinds of rays in the statistics, of what the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
-
-# The arrays of a pilot's `Moments`.
-MOMENTS = ("base", "rare", "light", "draw", "gain")
 
 # Pilots have the sequences that follow this number, see `sequence_seed`, and images, after changes of the
 # decision, those that follow the other one.
@@ -377,7 +374,7 @@ class Render:
         moments = None
         if self._moments is not None:
             moments = {name: getattr(self._moments, name) for name in ("mean", "rays", "lanes")}
-            arrays |= {f"moments.{name}": getattr(self._moments, name) for name in MOMENTS}
+            arrays |= {f"moments.{name}": getattr(self._moments, name) for name in ARRAYS}
         progress = {
             "whole": True,
             "decisions": [decision.record() for decision in self.decisions],
@@ -418,7 +415,7 @@ class Render:
             self._adopt(decision, progress["left_out"])
         self.accumulator.restore(snapshot.passes, arrays, progress["replicates"])
         if progress["moments"] and "moments.base" in arrays:
-            parts = {name: arrays[f"moments.{name}"] for name in MOMENTS}
+            parts = {name: arrays[f"moments.{name}"] for name in ARRAYS}
             self._moments = Moments(**parts, **progress["moments"])
         self._pilots, self._next_pilot = progress["pilots"]
         self._small_first, self._no_pilot = progress["small_first"], progress["no_pilot"]
@@ -431,10 +428,11 @@ class Render:
 
     def lost_light(self) -> tuple[dict, str]:
         """Shares of the image's light that no strategy in use finds, by the index of the emitter, and in
-        words, which are empty where it is little. Looked for once for a scene, sensor and choice."""
+        words, which are empty where it is little. Looked for once for a scene, lamps, sensor and choice."""
         if not self.accumulator.passes or not lost_light.is_possible(self.world, self.plan, self.settings):
             return {}, ""
-        key = self.sensor.film().rfilter(), self.plan.splat, self.plan.direct, self.settings.max_depth
+        choice_made = self.plan.splat, self.plan.direct, self.settings.max_depth
+        key = self.sensor.film().rfilter(), lost_light.lamps_and_sensor(self.world), *choice_made
         known = notes(self.world.scene, self.sensor).setdefault("lost light", {})
         if key not in known:
             known[key] = lost_light.lost_radiance(self.world, self.plan, self.settings.max_depth)

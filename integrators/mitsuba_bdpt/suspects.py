@@ -32,12 +32,11 @@ _QUICKLY_READ = 1 << 17
 
 @dataclass(frozen=True)
 class _Scale:
-    """A ``texture`` that scales what a BSDF scatters, the parameter ``name``; ``owners``: the texture, that
-    BSDF and the objects around it, the innermost first."""
+    """A texture that scales what a BSDF scatters, the parameter ``name``; ``owners``: the texture, that BSDF
+    and the objects around it, the innermost first."""
 
     owners: tuple
     name: str
-    texture: mi.Texture
 
 
 def brighteners(owners) -> list[str]:
@@ -45,7 +44,7 @@ def brighteners(owners) -> list[str]:
     inside them, as far as their parameters tell, in words."""
     scales = _scales([(owner,) for owner in owners])
     most = max(_QUICKLY_READ // max(len(scales), 1), 1)
-    found = [(scale, _largest(scale.texture, most)) for scale in scales]
+    found = [(scale, _largest(scale.owners[0], most)) for scale in scales]
     return [
         f"{_called(scale.owners)} has {scale.name} up to {largest:.4g}"
         for scale, largest in found
@@ -62,7 +61,7 @@ def _scales(chains) -> list[_Scale]:
                 seen.add(id(value))
                 chains.append((value, *chain))
             elif isinstance(value, mi.Texture) and isinstance(chain[0], mi.BSDF) and name.endswith(_SCALES):
-                found.append(_Scale((value, *chain), name, value))
+                found.append(_Scale((value, *chain), name))
     return found
 
 
