@@ -4,15 +4,17 @@
     python scripts/choices.py --all -o docs/choices.json            # every scene; can be interrupted
     python scripts/choices.py --all -o docs/choices.json --again    # after a change of the choice
 
-For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, and what pilots
-of 32 seeds choose, are rendered by hand (parameter ``decisions``); those which one render of a seed of its
-own shows to be among the best, or which are chosen, with 8 seeds, as the default is, 64 samples per pixel.
-A time is that of the processor, pilot included, which neighbours on the machine disturb less than seconds;
-errors are relMSE, raw and trimmed of the worst 0.1 %. The table shows, raw and trimmed: the default's time
-times error (means over the seeds) over the least of the fixed choices, the same of what the worst of the
-pilots chose, and what was chosen. The least of several noisy products is below the true one: figures are on
-the safe side. The scenes of small_casters get a reference of 8,192 samples per pixel with a light subpath
-each.
+For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
+inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
+``decisions``); those which one render of a seed of its own shows to be among the best, or which are chosen,
+with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, pilot included, which
+neighbours on the machine disturb less than seconds; errors are relMSE, raw and trimmed of the worst 0.1 %.
+The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
+fixed choices, with the interval that nine in ten resamplings of the seeds (the same for both sides) lie in,
+and the same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its
+two ratios, which is 1 where one choice is best by both errors; and what was chosen. The least of several
+noisy products is below the true one: figures are on the safe side. The scenes of small_casters get a
+reference of 8,192 samples per pixel with a light subpath each.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import json
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
@@ -40,6 +43,9 @@ REFERENCE_SPP, REFERENCE_SEED, FIRST_SEED = 4096, 1_000_000, 1000
 
 # A fixed choice is among the best if one render's time times error, raw or trimmed, is within this factor.
 AMONG_BEST = 1.4
+
+# Resamplings of the seeds, and the quantiles between which nine in ten of them lie.
+RESAMPLINGS, INTERVAL = 1000, (0.05, 0.95)
 SMALL = "small_casters"
 
 
@@ -65,16 +71,11 @@ def measured(scene, integrator, seed: int, expected) -> np.ndarray:
     return np.array([seconds, rel_mse(image, expected), rel_mse(image, expected, TRIM)])
 
 
-def mean_of(rows) -> list[float]:
-    """Seconds, raw and trimmed error of several renders: means, but of the seconds the least, which
-    neighbours disturbed least."""
+def product(rows, seeds=slice(None)) -> np.ndarray:
+    """Time times error, raw and trimmed, from `measured` of several seeds, of which the errors' means are
+    over ``seeds``; the time is the least, which neighbours disturbed least."""
     rows = np.array(rows)
-    return [float(rows[:, 0].min()), *rows[:, 1:].mean(axis=0).tolist()]
-
-
-def products(found: dict) -> dict:
-    """Time times error, raw and trimmed, of what `mean_of` has found for each way."""
-    return {name: seconds * np.array(errors) for name, (seconds, *errors) in found.items()}
+    return rows[:, 0].min() * rows[seeds, 1:].mean(axis=0)
 
 
 def by_hand(scene, depth: int, way: choice.Candidate, mean: float):
@@ -95,24 +96,28 @@ def piloted(scene, settings) -> Counter:
 
 
 def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
-    """`mean_of` the candidates, by their names, that are among the best or ``chosen``. Where those among the
-    best are ``known``, only the best of these and the chosen are rendered, as times have to be compared."""
+    """`measured` with each seed, of the candidates, by their names, that are among the best or ``chosen``.
+    Where those among the best are ``known``, only the best of these and the chosen are rendered, as times
+    have to be compared."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.world, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    ways = {named(way): way for way in choice.candidates(render.world, render.plan, settings)}
+    ways = choice.candidates(render.world, render.plan, settings)
+    ways += [replace(way, connections="all") for way in ways if way.connections == "one"]
+    ways = {named(way): way for way in ways}
     if known:
-        old = products(known)
+        old = {name: product(rows) for name, rows in known.items()}
         names = chosen | {min(old, key=lambda name: old[name][i]) for i in (0, 1)}
     else:
         names = chosen | {name for name, way in ways.items() if way.served in SERVED}
     made = {name: by_hand(scene, depth, ways[name], mean) for name in sorted(names)}
     if not known:
-        first = products({n: measured(scene, way, FIRST_SEED, expected) for n, way in made.items()})
+        first = {n: product([measured(scene, w, FIRST_SEED, expected)]) for n, w in made.items()}
         best = np.min(list(first.values()), axis=0)
         made = {n: w for n, w in made.items() if n in chosen or (first[n] <= AMONG_BEST * best).any()}
-    rendered = {n: [measured(scene, w, seed, expected) for seed in range(SEEDS)] for n, w in made.items()}
-    return known | {name: mean_of(rows) for name, rows in rendered.items()}
+    return known | {
+        name: [measured(scene, way, seed, expected) for seed in range(SEEDS)] for name, way in made.items()
+    }
 
 
 def named(way: choice.Candidate) -> str:
@@ -124,33 +129,52 @@ def named(way: choice.Candidate) -> str:
 
 
 def measure(name: str, known: dict) -> dict:
-    """A row: seconds, raw and trimmed error of the default and of fixed choices (those ``known`` are kept),
-    and how often pilots have chosen which of these."""
+    """A row: `measured` with each seed, of the default and of fixed choices (those ``known`` are kept), and
+    how often pilots have chosen which of these."""
     scene, depth, expected = loaded(name)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
     chosen = {named(way): n for way, n in piloted(scene, integrator.settings).most_common()}
     found = fixed(scene, depth, expected, set(chosen), known)
-    rows = {}  # by decision: another one takes another time
+    rows, kinds = [], []
     for seed in range(SEEDS):
-        row = measured(scene, integrator, seed, expected)
+        rows.append(measured(scene, integrator, seed, expected))
         (made,) = integrator.statistics["decisions"] or [None]
-        label = made and (made["light_paths"], made["connections"])
-        rows.setdefault(label, []).append(row)
-    weights = [len(group) / SEEDS for group in rows.values()]
-    default = np.average([mean_of(group) for group in rows.values()], axis=0, weights=weights)
-    return {"scene": name, "fixed": found, "default": default.tolist(), "chosen": chosen}
+        kinds.append(made and (made["light_paths"], made["connections"]))
+    # One kind of decision takes other times than another: the least of each, as often as it is made.
+    least = {kind: min(row[0] for row, of in zip(rows, kinds, strict=True) if of == kind) for kind in kinds}
+    rows = np.array(rows)
+    rows[:, 0] = np.mean([least[kind] for kind in kinds])
+    return {"scene": name, "fixed": rounded(found), "default": rounded({"": rows})[""], "chosen": chosen}
+
+
+def rounded(found: dict) -> dict:
+    """``found`` with five digits of each number."""
+    return {name: [[float(f"{x:.5g}") for x in row] for row in rows] for name, rows in found.items()}
+
+
+def ratios(row: dict, seeds=slice(None)) -> dict:
+    """Time times error, raw and trimmed, over the least of the fixed choices, by name of the choice."""
+    found = {name: product(rows, seeds) for name, rows in row["fixed"].items()}
+    best = np.min(list(found.values()), axis=0)
+    return {
+        name: value / best for name, value in (found | {"default": product(row["default"], seeds)}).items()
+    }
 
 
 def shown(row: dict) -> list[str]:
     """A row as the cells of the table."""
-    found = products(row["fixed"] | {"default": row["default"]})
+    found = ratios(row)
     default = found.pop("default")
-    best = np.min(list(found.values()), axis=0)
     worst = np.max([found[name] for name in row["chosen"]] or [default], axis=0)
-    cells = [f"{m:.2f} ({w:.2f})" for m, w in zip(default / best, worst / best, strict=True)]
+    random = np.random.default_rng(SEEDS)
+    drawn = (ratios(row, random.integers(0, SEEDS, SEEDS))["default"] for _ in range(RESAMPLINGS))
+    low, high = np.quantile(list(drawn), INTERVAL, axis=0)
+    cells = [
+        f"{m:.2f} ({a:.2f}–{b:.2f}), {w:.2f}" for m, a, b, w in zip(default, low, high, worst, strict=True)
+    ]
     counts = ", ".join(f"{name} ({n})" for name, n in row["chosen"].items())
-    return [f"`{row['scene']}`", *cells, counts or "–"]
+    return [f"`{row['scene']}`", *cells, f"{min(map(max, found.values())):.2f}", counts or "–"]
 
 
 def main(arguments=None) -> int:
@@ -179,7 +203,13 @@ def main(arguments=None) -> int:
             print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
         if options.output:
             reference.write_json(options.output, list(rows.values()))
-    head = ["scene", "raw: default (worst pilot)", "trimmed: default (worst pilot)", "chosen (pilots)"]
+    head = [
+        "scene",
+        "raw: default, worst pilot",
+        "trimmed: default, worst pilot",
+        "best by both",
+        "chosen (pilots)",
+    ]
     print(table(head, [shown(rows[name]) for name in names]))
     return 0
 

@@ -37,9 +37,12 @@ def test_runs_add_up(tmp_path, capsys):
     assert status == 0 and endurance.samples_of(second) >= total + 70_000
     for name, entry in second["scenes"].items():
         assert entry["samples"] == sum(entry["samples_by"].values())
-        assert entry["renders"] > first["scenes"][name]["renders"] >= 1
-        assert entry["seconds"] > first["scenes"][name]["seconds"]
+        assert entry["renders"] >= first["scenes"][name]["renders"] >= 1
         assert entry["non_finite"] == 0 and entry["peak_memory"] > 1 << 20
+    # How long each took is the machine's; which of them is next follows from it.
+    least = min(SCENES, key=lambda name: first["scenes"][name]["seconds"])
+    for key in ("renders", "seconds", "samples"):
+        assert second["scenes"][least][key] > first["scenes"][least][key]
     assert sum(second["samples_by_source"].values()) == endurance.samples_of(second)
     assert list(tmp_path.iterdir()) == [path]
     # More than are asked for: nothing is rendered.
