@@ -19,6 +19,7 @@ import sys
 import tempfile
 
 from mistakes import answered
+from mitsuba_bdpt import __main__ as command
 from probes import numbers
 from tables import table
 
@@ -81,11 +82,15 @@ def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--rooms", type=int, nargs="+", help="numbers of materials; 0: the Cornell box")
-    parser.add_argument("--spp", type=int, nargs="+", default=[8], help="samples per pixel, of rooms")
-    parser.add_argument("--rounds", type=int, default=3, help="renders of each room")
+    count = command.number(int, 1)
+    parser.add_argument("--spp", type=count, nargs="+", help="samples per pixel, of rooms; default: 8")
+    parser.add_argument("--rounds", type=count, help="renders of each room; default: 3")
     asked = parser.parse_args(arguments)
+    if asked.rooms is None and (asked.spp or asked.rounds):
+        parser.error("--spp and --rounds are of rooms: add --rooms")
+    spp, rounds = asked.spp or [8], asked.rounds or 3
     if asked.rooms is not None:
-        print(table(*_rooms(asked.rooms, asked.spp, asked.rounds)))
+        print(table(*_rooms(asked.rooms, spp, rounds)))
         return 0
     rows = []
     for lamps, bsdfs in COUNTS:

@@ -190,6 +190,29 @@ def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
         assert lost_light.WORTH_A_WORD < share <= 1
 
 
+def test_red_light_on_a_blue_floor_is_no_loss():
+    """Rationale: the brightest of a lamp's colour times the brightest of the floor's is light that nobody
+    sees. Expected: nothing is lost of a red lamp on a blue floor beneath glass, and of a white one much."""
+    blue = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0, 0, 0.8]}}
+    for red, lost in (([10, 0, 0], False), ([10, 10, 10], True)):
+        lamp = {"type": "point", "position": [0.5, 3, 0], "intensity": {"type": "rgb", "value": red}}
+        scene = scene_of(lamp, block=BLOCK, floor=floor() | {"bsdf": blue})
+        render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
+        found = sum(lost_light.lost_radiance(render.world, render.plan, 16).values())
+        assert (found > 0) == lost
+
+
+def test_a_mask_reflects_what_its_opacity_says(monkeypatch):
+    """Rationale: Mitsuba's `mask` answers with the reflectance of what is inside of it. Expected: beneath
+    a sheet of nothing a floor of opacity 0.25 loses a quarter of what one without a mask does, within 5 %:
+    the same subpaths, but for the coin where a floor lets light through, among 2^17 (noise of 2 %)."""
+    masked = floor() | {"bsdf": {"type": "mask", "opacity": 0.25, "bsdf": floor()["bsdf"]}}
+    null = sheet({"type": "null"})
+    whole = estimate(scene_of(LAMPS["spot"], sheet=null), monkeypatch)
+    found = estimate(scene_of(LAMPS["spot"], sheet=null, floor=masked), monkeypatch)
+    assert found == pytest.approx(whole / 4, rel=0.05)
+
+
 def test_a_lens_finds_it():
     """Rationale: with a lens, light subpaths arrive at the sensor (t = 0). Expected: nothing is said."""
     eye = camera("thinlens", aperture_radius=0.05, focus_distance=4.0)

@@ -39,16 +39,16 @@ def check_densities(emitters, index: int):
         return
     u, number = spread_points(CHECKED), dr.opaque(mi.UInt32, index)
     ps, _ = emitter.sample_position(0, u)
-    ps = emitters._upright(ps, number, mi.Bool(True))
+    ps = emitters.upright(ps, number, mi.Bool(True))
     seen = _seen(emitter.get_shape(), ps)
-    stated = emitters._area_density(emitter, number, seen, seen.n, mi.Bool(True))
+    stated = emitters.area_density(emitter, number, seen, seen.n, mi.Bool(True))
     of_points = _differ(ps.pdf, dr.select(dr.dot(seen.sh_frame.n, ps.n) > 0, stated, 0))
     it = dr.zeros(mi.Interaction3f)
     others, _ = emitter.sample_position(0, mi.Point2f(u.y, u.x))
     it.p = _places(emitter.get_shape().bbox(), others.p)
     ds, _ = emitter.sample_direction(it, u)
     in_view = dr.abs(dr.dot(ds.n, ds.d)) > 0.01
-    stated = emitters._pdf_direction(emitter, number, it, ds, mi.Bool(True))
+    stated = emitters.density_of_direction(emitter, number, it, ds, mi.Bool(True))
     of_directions = _differ(dr.select(in_view, ds.pdf, 0), stated)
     dr.eval(of_points, of_directions)  # one kernel
     for what, (differ, compared) in (("points", of_points), ("directions", of_directions)):
@@ -70,7 +70,8 @@ def _is_rounded(emitter) -> bool:
 
 
 def _seen(shape, ps):
-    """What a ray finds from before the points ``ps`` of a shape."""
+    """What a ray finds from before the points ``ps`` of a shape: from so far that their rounding does not
+    decide on which side it starts, and so near that hardly any other part of the shape lies between."""
     height = dr.opaque(mi.Float, 1e-3 * max(shape.bbox().extents()))
     return shape.ray_intersect(mi.Ray3f(ps.p + height * ps.n, -mi.Vector3f(ps.n)), mi.RayFlags.All)
 

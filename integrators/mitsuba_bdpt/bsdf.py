@@ -69,7 +69,8 @@ class Traits:
 # From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands
 # over the interaction once, which saves 6 % of the time in a Cornell box; but each place that makes one has
 # functions of its own, one per BSDF, where the same few questions, asked anywhere, are compiled once. (Rooms
-# of 10 and of 27 materials take the same time either way.)
+# of 10 and of 27 materials take the same time either way. What diverging lanes cost in a decision is another
+# matter, see `choice.MANY_BSDFS`.)
 MANY = 10
 
 
@@ -253,6 +254,8 @@ class _Drawn:
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
+    """A direction that Mitsuba's ``sample`` draws, with its densities both ways, in one virtual call."""
+
     def ask(self, si, u1, u2, active):
         ctx = mi.BSDFContext()
         bs, weight = self.sample(ctx, si, u1, u2, active)

@@ -93,6 +93,9 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 # Of a recorded number: what single precision still holds when it is multiplied.
 MOST = 1e30
 
+# Of a group's variance over the median of all groups': below it is noise, see `_robust_mean`.
+LEAST_USUAL = 0.1
+
 # Per sample, as relMSE: below it nobody sees noise, and candidates differ by that of the pilot.
 LEAST_VARIANCE = 1e-4
 
@@ -156,14 +159,17 @@ def read_decisions(text: str) -> tuple[Decision, ...]:
         if passes != sorted(set(passes)):
             raise ValueError(f"passes {passes} must rise")
         return made
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ValueError(
             f"bdpt: decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: "
-            f"{type(error).__name__} {error}"
+            f"{what}"
         ) from error
 
 
 def _read_decision(entry: dict) -> Decision:
+    if not isinstance(entry, dict) or not isinstance(entry.get("coefficients", {}), dict):
+        raise TypeError(f"{entry!r} is no decision")
     light_paths, connections = _number(entry, "light_paths"), entry["connections"]
     if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
         raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
@@ -422,6 +428,7 @@ def _robust_mean(values):
         return values.mean(axis=0)
     values = np.where(finite, values, np.inf)  # losing light in one group is losing light
     usual = values[:, finite] / np.maximum(np.median(values[:, finite], axis=0), LEAST_VARIANCE)
+    usual = np.maximum(usual, LEAST_USUAL)  # an estimate of little variance may be negative
     least = usual.min(axis=1)
     most = np.sort(least)[len(least) * 3 // 4 - 1]
     scale = np.where(least > most, most / np.where(least > most, least, 1), 1)

@@ -299,15 +299,15 @@ class Emitters:
         """A point on the shape of an emitter, density included."""
         shape = emitter.get_shape()
         if self._ask_shapes:
-            return self._upright(shape.sample_position(like.time, u_point, active), index, active)
+            return self.upright(shape.sample_position(like.time, u_point, active), index, active)
         # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
         ps, _ = emitter.sample_position(like.time, u_point, active)
         if self._any_by_shape:
             mask = self._is_by_shape(index, active)
             ps = dr.select(mask, shape.sample_position(like.time, u_point, mask), ps)
-        return self._upright(ps, index, active)
+        return self.upright(ps, index, active)
 
-    def _upright(self, ps, index, active):
+    def upright(self, ps, index, active):
         """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
         if self._turned_spheres:
             sphere = self._placements.at(index, active)
@@ -378,7 +378,7 @@ class Emitters:
             return ps.n
         return self._smooth_meshes.normal(ps.n, index, u_point.y, active)
 
-    def _pdf_direction(self, emitter, index, it, ds, active):
+    def density_of_direction(self, emitter, index, it, ds, active):
         """Density with which next-event estimation at ``it`` samples ``ds`` (solid angle, without
         the selection). Turns ``ds.n``, which callers build for this call alone.
 
@@ -489,7 +489,7 @@ class Emitters:
             ds = dr.zeros(mi.DirectionSample3f)
             ds.p, ds.n, ds.uv = emission.si.p, emission.anchor.n, emission.si.uv
             ds.time, ds.d, ds.dist, ds.emitter = emission.si.time, -emission.d, dist, emitter
-            pdf = self._pdf_direction(emitter, emission.index, mi.Interaction3f(si), ds, here)
+            pdf = self.density_of_direction(emitter, emission.index, mi.Interaction3f(si), ds, here)
             density = dr.select(here, pmf * pdf * emission.cos, density)
         return dr.select(emission.beam, 0, density) if self.beams else density
 
@@ -540,7 +540,7 @@ class Emitters:
         ds, weight = emitter.sample_direction(si, u, active)
         if self._any_by_shape:
             mask = self._is_by_shape(index, active)
-            ps = self._upright(emitter.get_shape().sample_position(si.time, u, mask), index, mask)
+            ps = self.upright(emitter.get_shape().sample_position(si.time, u, mask), index, mask)
             by_shape, its_weight = _sample_shape(emitter, ps, si, mask)
             ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
         if self._small_spheres:
@@ -572,7 +572,7 @@ class Emitters:
             weight = dr.select(self._is(index, active, UNSAMPLED), 0, weight)
         ratio = mi.Float(0)
         if AREA in self.kinds:
-            density = self._area_density(emitter, index, ds, n, area)
+            density = self.area_density(emitter, index, ds, n, area)
             emitted = pmf * density * dr.maximum(cos_shading, 0) * dr.inv_pi
             ratio = dr.select(area, emitted / (pdf * cos), ratio)
         if self.kinds & set(POSITIONS):
@@ -614,14 +614,14 @@ class Emitters:
             ds.n = dr.select(self._is(index, active, UNKNOWN), ds.n, mi.Normal3f(si.n))
         else:
             ds.n = mi.Normal3f(si.n)
-        pdf = pmf * self._pdf_direction(emitter, index, it, ds, active)
+        pdf = pmf * self.density_of_direction(emitter, index, it, ds, active)
         connect, first, second = mi.Float(pdf), mi.Float(pdf), self._density_across(previous, ds.d)
         on_surface = si.is_valid()
         if self.kinds & {AREA, UNKNOWN}:
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
             connect = dr.select(on_surface, pdf * to_area, connect)
         if AREA in self.kinds:
-            density = self._area_density(emitter, index, si, si.n, active & on_surface)
+            density = self.area_density(emitter, index, si, si.n, active & on_surface)
             cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
             first = dr.select(on_surface, pmf * density, first)
             second = dr.select(on_surface, cos_second, second)
@@ -630,7 +630,7 @@ class Emitters:
             connect = dr.select(self._is(index, active, UNSAMPLED), 0, connect)
         return connect, first, second
 
-    def _area_density(self, emitter, index, at, n, active):
+    def area_density(self, emitter, index, at, n, active):
         """Density of emission's y_0 on a surface, without the selection. ``at`` has ``p``, ``uv``."""
         density = dr.gather(mi.Float, self._inv_area, index, active)
         if not self._any_by_texture:

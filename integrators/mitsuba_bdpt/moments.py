@@ -137,7 +137,8 @@ class Splats:
 
 
 def group(lane):
-    """The independent part to which a sample belongs: of one pixel all are in the same."""
+    """The independent part to which a sample, or the light subpath of a lane, belongs. The `PER_PIXEL`
+    samples of a pixel, whose products are taken, are in the same."""
     return lane // PER_PIXEL % GROUPS
 
 

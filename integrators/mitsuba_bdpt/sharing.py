@@ -33,7 +33,7 @@ LONGEST_RUN = 16
 # A part has as many runs or more, or else runs of one pixel: few would meet at few distances.
 LEAST_RUNS = 256
 
-_PARTS = 2  # part 1 and on: 1 and 2 are the words of the points' own seeds, see `Points.stream`
+_FIRST_WORD = 2  # of parts 1 and on: 1 and 2 are the words of the points' own seeds, see `Points.stream`
 _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # tell the keys of the rounds apart
 
 
@@ -95,7 +95,7 @@ class Sharing:
         return self._place(seat, part, row, column, hashed)
 
     def _keys(self, part):
-        key = sobol.hash_u32(self._seed, part + _PARTS)
+        key = sobol.hash_u32(self._seed, part + _FIRST_WORD)
         return [key ^ word for word in _ROUNDS]
 
     def _place(self, seat, part, row, column, hashed):
