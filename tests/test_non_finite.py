@@ -5,6 +5,7 @@ expected of each and the reason of each tolerance; the quick ones are run by tes
 """
 
 import math
+import warnings
 
 import mitsuba as mi
 import numpy as np
@@ -34,6 +35,16 @@ def test_culprits_are_named():
     """Expected: the texture that holds NaN is named, and no parameter of a sound scene."""
     assert suspects.not_finite(filled(painted(NAN))) == ["plate.bsdf.reflectance.data"]
     assert suspects.not_finite(room()) == []
+
+
+def test_a_transform_that_is_not_finite_is_named():
+    """Expected: the radius NaN of a lamp is in its ``to_world``, and NumPy says nothing of it."""
+    lamp = {"type": "sphere", "radius": NAN, "emitter": {"type": "area"}}
+    scene = mi.load_dict({"type": "scene", "ball": lamp, "sensor": {"type": "perspective"}})
+    assert suspects.not_finite(scene) == ["ball.to_world"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mi.load_dict({"type": "bdpt"}).render(scene, spp=1)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import sys
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.objects import own_parameters
+from mitsuba_bdpt.objects import named, own_parameters
 
 OBJECTS = {
     "point": {"type": "point", "position": [1, 2, 3]},
@@ -61,3 +61,17 @@ def test_scenes_that_the_cycle_collector_frees():
     command = [sys.executable, "-c", FREED_MEANWHILE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0 and done.stdout.strip() == "alive", done.stderr[-500:]
+
+
+def test_what_has_no_id_is_named_by_its_class_or_shape():
+    """Expected: an id where there is one, for a lamp on a shape the shape's, else the class; a refusal says
+    so in place of a name that is empty."""
+    stretched = mi.ScalarTransform4f().scale([1, 2, 1])
+    spot = {"type": "spot", "id": "", "to_world": stretched}
+    lamp = {"type": "rectangle", "emitter": {"type": "area", "id": ""}}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "spot": spot, "lamp": lamp})
+    names = sorted(named(emitter) for emitter in scene.emitters())
+    assert names == ["without id (SpotLight)", "without id on shape 'lamp'"]
+    assert named(scene.sensors()[0]) == "'sensor'"
+    with pytest.raises(ValueError, match=r"to_world of spot without id \(SpotLight\) distorts angles"):
+        mi.load_dict({"type": "bdpt"}).render(scene, spp=1)

@@ -126,7 +126,7 @@ def image(bdpt, scene, **keywords):
         ({"skip": 3}, "skip=3 must be a string, one of auto"),
         ({"skip": [1, 2, 3]}, r"skip=\[1, 2, 3\] must be a string, one of auto"),
         ({"light_paths": [1, 2, 3]}, r"light_paths=\[1, 2, 3\] must be a number or 'auto'"),
-        ({"inner": {"type": "path"}}, "PathIntegrator cannot be nested in it.*take it out"),
+        ({"inner": {"type": "path"}}, r"inner \(PathIntegrator\) cannot be nested in it.*take it out"),
     ],
     ids=str,
 )

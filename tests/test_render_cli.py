@@ -275,6 +275,37 @@ def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
     assert re.search(words, capsys.readouterr().err)
 
 
+def test_direct_is_replaced_with_its_depth(around):
+    """Rationale: `direct` has no `max_depth`, and what took its place went on without end. Expected: emission
+    and direct light, inside of others too, unless the command line says otherwise."""
+    plain = around.read_text().replace('<integer name="max_depth" value="3"/>', "")
+    around.write_text(plain.replace('<integer name="rr_depth" value="2"/>', ""))
+    settings = loaded(around, "-Dintegrator=direct", "--integrator", "bdpt").settings
+    assert (settings.max_depth, settings.hide_emitters) == (2, True)
+    deeper = loaded(around, "-Dintegrator=direct", "--integrator", "bdpt", "-P", "max_depth=5").settings
+    assert deeper.max_depth == 5
+
+
+def test_an_integrator_around_none_is_named(around, capsys):
+    text = around.read_text()
+    start, end = text.index('<integrator name="img"'), text.index("</integrator>") + len("</integrator>")
+    around.write_text(
+        text.replace(text[start:end], "").replace('<default name="integrator" value="path"/>', "")
+    )
+    assert main(["render", str(around), "--integrator", "bdpt"]) == 1
+    assert "aov is around none" in (error := capsys.readouterr().err) and "write one inside of it" in error
+
+
+@pytest.mark.parametrize(
+    "text", ['<bsdf version="3.0.0" type="diffuse"/>', '<shape version="3.0.0" type="cube"/>']
+)
+def test_a_file_without_a_scene_is_reported(scene, capsys, text):
+    scene.write_text(text)
+    assert main(["render", str(scene)]) == 1
+    error = capsys.readouterr().err
+    assert "plain.xml' holds a single object" in error and "no <scene>" in error
+
+
 def test_an_integrator_without_max_depth_can_replace_one_with_it(scene):
     assert main(["render", str(scene), "--integrator", "direct"]) == 0
 
@@ -430,6 +461,8 @@ MISTYPED = [
     (["--integrator", "Path"], "did you mean path?"),
     (["--integrator", "prbvolpth"], "did you mean prbvolpath?"),
     (["--integrator", "xyzzy"], "integrator='xyzzy' is not a plugin; use for example bdpt"),
+    (["--integrator", "diffuse"], "integrator='diffuse' is a bsdf, no integrator; use for example bdpt"),
+    (["--integrator", ""], "integrator='' names no integrator"),
     (["-Dintegrator=pth"], 'Plugin "pth" not found! Did you mean path?'),
     (["-Dlihgt=1"], "-D lihgt: no parameter of the scene; it has integrator=path, format=float32, light=2"),
     (["-Dlihgt=1"], "; did you mean light?"),
@@ -503,6 +536,7 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
         (["rendr", "plain.xml"], "did you mean render?"),
         (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
         (["render", "plain.xml", "--untl-error=1"], "did you mean --until-error?"),
+        (["explain", "plain.xml", "--integrator", "path"], "that is an option of render"),
     ],
 )
 def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys, arguments, question):

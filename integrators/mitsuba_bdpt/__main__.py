@@ -43,20 +43,27 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors ask whether another command or option was meant."""
 
     def error(self, message: str) -> NoReturn:
-        known = [*self._option_string_actions]
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                known += [*action.choices]
-                known += [
-                    name for parser in action.choices.values() for name in parser._option_string_actions
-                ]
+        known = [*self._option_string_actions, *self._commands()]
+        known += [name for parser in self._commands().values() for name in parser._option_string_actions]
         wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
         if wrong:
             name = wrong[1] or wrong[2]
             scene = wrong[1] and name.lower().endswith(".xml")
             question = f"did you mean render {name}?" if scene else did_you_mean(name, known)
+            if name in known:
+                question = f"that is an option of {' and '.join(self._commands_with(name))}"
             message = f"{message}; {question}".rstrip("; ")
         super().error(message)
+
+    def _commands(self) -> dict[str, argparse.ArgumentParser]:
+        """The parsers of the commands, by name."""
+        kinds = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
+        return {name: parser for action in kinds for name, parser in action.choices.items()}
+
+    def _commands_with(self, option: str) -> list[str]:
+        """The commands that have this ``option``."""
+        found = [name for name, parser in self._commands().items() if option in parser._option_string_actions]
+        return found or [self.prog]
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -108,7 +115,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``render``."""
     add_scene_arguments(parser)
     add = parser.add_argument
-    text = "EXR file to write, a PNG of the same name comes beside it; default: renders/SCENE.exr"
+    text = "EXR file to write, a PNG comes beside it, folders are made; default: renders/SCENE.exr"
     add("-o", "--output", type=Path, help=text)
     text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
@@ -137,7 +144,8 @@ def number(kind: type, minimum: float, maximum: float = math.inf) -> Callable[[s
         except ValueError:
             value = math.nan
         if not (minimum <= value <= maximum and math.isfinite(value)):
-            limit = "" if maximum == math.inf else f" and at most {maximum:g}"
+            most = maximum if kind is int else f"{maximum:g}"
+            limit = "" if maximum == math.inf else f" and at most {most}"
             name = "a whole number" if kind is int else "a number"
             raise argparse.ArgumentTypeError(
                 f"got {text!r}, which must be {name} of at least {minimum:g}{limit}"

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import children
+from .objects import children, named
 
 CHECKED = 4096  # samples of an emitter
 
@@ -56,7 +56,7 @@ def check_densities(emitters, index: int):
         if off > OFF:
             raise NotImplementedError(
                 f"bdpt: {off:.1%} of the {what} that Mitsuba {mi.__version__} samples of emitter "
-                f"'{emitter.id()}' have another density than is known here, so that the image would be "
+                f"{named(emitter)} have another density than is known here, so that the image would be "
                 "wrong; use integrator type 'path', and please report the scene"
             )
 

@@ -11,7 +11,7 @@ from math import inf
 import drjit as dr
 import mitsuba as mi
 
-from .objects import children
+from .objects import children, named
 
 # Wavelengths at which a film is asked for its response to a spectrum of 1.
 RESPONSE_SAMPLES = 4096
@@ -25,7 +25,7 @@ def film_colours(sensor):
         return Rgb(film)
     if film.class_name() != "SpecFilm":
         raise NotImplementedError(
-            f"bdpt: film '{film.id()}' of class {film.class_name()} is not supported; use hdrfilm or specfilm"
+            f"bdpt: film {named(film)} of class {film.class_name()} is not supported; use hdrfilm or specfilm"
         )
     return Bands(film, sensor)
 

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import all_shapes, children, matrix_of, number, own_parameters
+from .objects import all_shapes, children, matrix_of, named, number, own_parameters
 from .spheres import Sphere, sphere_normal
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
@@ -61,7 +61,7 @@ def _tells_its_points(emitter) -> bool:
     shape = emitter.get_shape()
     if shape.shape_type() in _CURVES:
         raise NotImplementedError(
-            f"bdpt: emitter '{emitter.id()}' is on a curve ('{shape.id()}'), which Mitsuba's emitters cannot "
+            f"bdpt: emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "
             "sample; use a cylinder or a mesh"
         )
     sampled = shape.shape_type() in _SAMPLED
@@ -126,7 +126,7 @@ _WHY_NOT = {
 def left_out(emitter, kind: int) -> list[tuple[str, str]]:
     """What an emitter cannot take part in, and why."""
     names = ["s=1"] * (not is_lit_directly(kind)) + ["light subpaths"] * (not is_traced(kind))
-    return [(f"{name} of emitter '{emitter.id()}'", _WHY_NOT[kind]) for name in names]
+    return [(f"{name} of emitter {named(emitter)}", _WHY_NOT[kind]) for name in names]
 
 
 def is_foreign(class_name: str) -> bool:
@@ -178,8 +178,8 @@ def check_coordinates(emitter):
     shape = emitter.get_shape()
     if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
         raise ValueError(
-            f"bdpt: emitter '{emitter.id()}' has a textured radiance on a mesh without texture coordinates "
-            f"('{shape.id()}'); make the radiance uniform, or give the mesh coordinates"
+            f"bdpt: emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
+            f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"
         )
 
 
@@ -189,8 +189,8 @@ def refuse_curves(scene, emitter, why: str):
     for shape in all_shapes(scene):
         if shape.shape_type() in _CURVES:
             raise NotImplementedError(
-                f"bdpt: emitter '{emitter.id()}' {why}, which is not supported beside curves "
-                f"('{shape.id()}'); remove one of them, or use integrator type 'path'"
+                f"bdpt: emitter {named(emitter)} {why}, which is not supported beside curves "
+                f"({named(shape)}); remove one of them, or use integrator type 'path'"
             )
 
 
@@ -200,7 +200,7 @@ def _check_rotation(emitter):
     columns = _columns(emitter)
     if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
         raise ValueError(
-            f"bdpt: to_world of {_plugin(emitter)} '{emitter.id()}' is not a rotation (the lengths of its "
+            f"bdpt: to_world of {_plugin(emitter)} {named(emitter)} is not a rotation (the lengths of its "
             f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
         )
 
@@ -218,7 +218,7 @@ def check_angles(emitter):
             emitter.class_name()
         ]
         raise ValueError(
-            f"bdpt: to_world of {plugin} '{emitter.id()}' distorts angles (the lengths of its columns are "
+            f"bdpt: to_world of {plugin} {named(emitter)} distorts angles (the lengths of its columns are "
             f"{_lengths(columns)}); leave out scaling and shear, and set {angle} instead"
         )
 

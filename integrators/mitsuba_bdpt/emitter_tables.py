@@ -10,7 +10,7 @@ import numpy as np
 
 from .agreement import CHECKED, OFF, spread_points
 from .emitter_kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_angles, is_textured
-from .objects import children, matrix_of, own_parameters
+from .objects import children, matrix_of, named, own_parameters
 from .spheres import Sphere, is_small
 
 
@@ -69,7 +69,7 @@ def placement(emitter, kind, extent) -> Placement:
         cos_cutoff = dr.slice(dr.cos(dr.deg2rad(cutoff_angle)))
         if cos_cutoff >= 1:
             raise ValueError(
-                f"bdpt: spot '{emitter.id()}' has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
+                f"bdpt: spot {named(emitter)} has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
                 "width in single precision; make it 0.02 degrees or more"
             )
         return Placement(
@@ -234,7 +234,7 @@ class SmoothMeshes:
         off = np.mean(height > 2e-6 * np.abs(faces.corners).max())
         if off > OFF:
             raise ValueError(
-                f"bdpt: {off:.1%} of the points that Mitsuba samples on the mesh '{shape.id()}', which emits "
+                f"bdpt: {off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
                 "or measures, are not on the faces that its areas tell: after an edit of faces Mitsuba keeps "
                 "its table of areas; update vertex_positions with them, or load the scene anew"
             )
@@ -301,7 +301,7 @@ def _curved_faces(shape):
     n = np.array(params["vertex_normals"], dtype=np.float64).reshape(-1, 3)
     if faces.max(initial=0) >= len(p):
         raise ValueError(
-            f"bdpt: the emitting mesh '{shape.id()}' has a face with vertex {faces.max()} of {len(p)}; "
+            f"bdpt: the emitting mesh {named(shape)} has a face with vertex {faces.max()} of {len(p)}; "
             "mend the file that it comes from"
         )
     a, b, c = p[faces].transpose(1, 0, 2)

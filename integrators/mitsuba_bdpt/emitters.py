@@ -57,7 +57,7 @@ from .emitter_tables import (
     placement,
 )
 from .infinity import Disks
-from .objects import children, living_emitters, number, share_functions
+from .objects import children, living_emitters, named, number, share_functions
 from .spheres import cone_density, is_turned_sphere, may_light_itself, sphere_normal
 from .to_world import check_to_world
 
@@ -183,7 +183,7 @@ class Emitters:
         sampled = [k in (AREA, DIRECTIONAL_AREA) for k in kinds]
         for e, s in zip(emitters, sampled, strict=True):
             if s:
-                check_to_world(e.get_shape(), f"emitter '{e.id()}'")
+                check_to_world(e.get_shape(), f"emitter {named(e)}")
         areas = [
             dr.slice(e.get_shape().surface_area()) if s else 1.0
             for e, s in zip(emitters, sampled, strict=True)
@@ -212,7 +212,7 @@ class Emitters:
         if 0 in areas:
             emitter = emitters[areas.index(0)]
             raise ValueError(
-                f"bdpt: emitter '{emitter.id()}' is on a shape without area ('{emitter.get_shape().id()}'); "
+                f"bdpt: emitter {named(emitter)} is on a shape without area ({named(emitter.get_shape())}); "
                 "remove it, or give it some"
             )
         # The radiance of a directional area is told by its texture alone.

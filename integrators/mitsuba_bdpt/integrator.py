@@ -14,7 +14,7 @@ from . import choice
 from .explain import explain
 from .features import feature_names
 from .notices import warn_once
-from .objects import all_shapes, is_instance
+from .objects import all_shapes, is_instance, named
 from .parameters import check_made_for, check_variant, integer, is_index, read_settings
 from .passes import REPLICATES
 from .plan import UNLIMITED
@@ -319,7 +319,7 @@ def _samples(sensor, spp, settings) -> int:
     spp = integer(spp, "spp", 0) or int(sensor.sampler().sample_count())
     if not spp:
         raise ValueError(
-            f"bdpt: spp=0 stands for the sample_count of the sampler of sensor '{sensor.id()}', which is 0 "
+            f"bdpt: spp=0 stands for the sample_count of the sampler of sensor {named(sensor)}, which is 0 "
             "too; set one of them to 1 or more"
         )
     if settings.variance and spp < REPLICATES:
@@ -406,7 +406,8 @@ def _warn_of_decisions_not_begun(decisions, passes: int):
 
 
 def _warn_of_what_was_lost(statistics: dict, scene):
-    """Say how many values were not finite, and in what parameters of the scene to look for the cause."""
+    """Say how many values were not finite, and in what parameters of the scene to look for the cause; of each
+    render, since it is about its image."""
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return

@@ -18,6 +18,9 @@ from .similar import did_you_mean
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
 
+DEPTHS = {"direct": 2}
+"""``max_depth`` of integrators that have no such parameter, whose paths end as early."""
+
 NOT_CARRIED = {
     "moment": "second moments, which bdpt has not: its parameter variance adds the variance of each pixel",
     "stokes": "Stokes vectors, which bdpt has not: it is not polarized",
@@ -82,6 +85,8 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
 
 def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     """Load the scene and the integrator to render it with."""
+    if options.integrator == "":
+        raise ValueError("integrator='' names no integrator; use for example bdpt, or leave it out.")
     if options.variant not in mi.variants():
         known = ", ".join(mi.variants())
         question = did_you_mean(options.variant, mi.variants())
@@ -93,7 +98,7 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
         mi.set_variant(options.variant)
     except ImportError as error:
         raise ValueError(
-            f"variant={options.variant!r} cannot be used on this machine ({error}); "
+            f"variant={options.variant!r} cannot be used on this machine ({str(error).rstrip('.')}); "
             "use an LLVM variant, for example llvm_ad_rgb."
         ) from error
     mi.file_resolver().prepend(str(options.scene.resolve().parent))
@@ -114,6 +119,7 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     config = mi.parser.ParserConfig(options.variant)
     defines = in_proportion(options.scene, dict(options.defines))
     state = mi.parser.parse_file(config, str(options.scene), **defines)
+    _check_root(state, options.scene)
     _check_film_sizes(state)
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     kind = mi.ObjectType.Integrator
@@ -138,6 +144,17 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if node is not None:
         return scene, scene.integrator()
     return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+
+
+def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
+    """Raise ``ValueError`` if the file ``scene`` holds one object that is no scene."""
+    root = state.nodes[0]
+    if root.type != mi.ObjectType.Scene:
+        held = f"{root.type.name.lower()} {root.props.plugin_name()}"
+        raise ValueError(
+            f"scene={str(scene)!r} holds a single object, {held}, and no <scene>: write one around it, with "
+            "a sensor and lights."
+        )
 
 
 def _check_film_sizes(state: mi.parser.ParserState) -> None:
@@ -205,6 +222,9 @@ def _in_words(error: str, options: Namespace) -> str | None:
     given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
     if given:
         return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
+    other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
+    if other and other[1] == options.integrator:
+        return f"integrator={other[1]!r} is a {other[2]}, no integrator; use for example bdpt"
     missing = re.search(r'Plugin "([^"]*)" not found', error)
     if not missing:
         return None
@@ -292,9 +312,10 @@ def _nested(nodes: Sequence, node) -> tuple[str, object]:
     found = [(key, inner) for key, inner in found if inner.type == mi.ObjectType.Integrator]
     if len(found) != 1:
         names = ", ".join(f"{key!r} ({inner.props.plugin_name()})" for key, inner in found)
+        remedy = "leave out the others" if found else "write one inside of it"
         raise ValueError(
             f"integrator: the scene's integrator {node.props.plugin_name()} is around {names or 'none'}; to "
-            "replace the one inside, there has to be just one: in the scene file, leave out the others."
+            f"replace the one inside, there has to be just one: in the scene file, {remedy}."
         )
     return found[0]
 
@@ -308,6 +329,9 @@ def integrator_properties(
     else:
         properties = mi.Properties(kind)
         properties.set_id(given.id())
+        if given.plugin_name() in DEPTHS and kind not in DEPTHS:
+            properties["max_depth"] = DEPTHS[given.plugin_name()]
+            properties.mark_queried("max_depth")
         for key in KEPT:
             if key in given:
                 properties[key] = given[key]

@@ -16,6 +16,16 @@ def number(x) -> float:
     return float(dr.slice(x) if dr.is_array_v(x) else x)
 
 
+def named(owner) -> str:
+    """What a message calls an object: its id in quotation marks, or that it has none, with what tells it."""
+    if owner.id():
+        return f"'{owner.id()}'"
+    shape = owner.get_shape() if isinstance(owner, (mi.Emitter, mi.Sensor)) else None
+    if shape is not None and shape.id():
+        return f"without id on shape '{shape.id()}'"
+    return f"without id ({owner.class_name()})"
+
+
 # Numbers in a row without an emitter after which no more are expected; those of freed ones are used again.
 _GAP = 64
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from . import choice, features, mis, points
 from .colour import Bands, film_colours
-from .objects import all_shapes
+from .objects import all_shapes, named
 from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
 from .similar import did_you_mean
 from .strategies import layer_names
@@ -146,8 +146,8 @@ def _check_names(props):
             continue
         if isinstance(props[name], mi.Object):
             raise ValueError(
-                f"bdpt: {props[name].class_name()} cannot be nested in it: bdpt holds no other object; "
-                "take it out"
+                f"bdpt: {name} ({props[name].class_name()}) cannot be nested in it: bdpt holds no other "
+                "object; take it out"
             )
         remedy = REMEDIES.get(name)
         if remedy is None:
@@ -251,13 +251,13 @@ def check_scene(scene, sensor):
     """Raise ``NotImplementedError`` for what the method cannot render."""
     if sensor.get_medium() is not None:
         raise NotImplementedError(
-            f"bdpt: sensor '{sensor.id()}' lies in a participating medium, which is not supported; "
+            f"bdpt: sensor {named(sensor)} lies in a participating medium, which is not supported; "
             "use integrator type 'volpath'"
         )
     for shape in all_shapes(scene):
         if shape.is_medium_transition():
             raise NotImplementedError(
-                f"bdpt: shape '{shape.id()}' bounds a participating medium, which is not supported; "
+                f"bdpt: shape {named(shape)} bounds a participating medium, which is not supported; "
                 "use integrator type 'volpath'"
             )
 
@@ -268,7 +268,7 @@ def check_film(sensor, settings: Settings):
     colour = film_colours(sensor)
     if settings.strategy_images and isinstance(colour, Bands):
         raise NotImplementedError(
-            f"bdpt: strategy_images=True is not possible with film '{sensor.film().id()}' of class SpecFilm: "
+            f"bdpt: strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
     _check_size(sensor.film(), len(colour.names), settings)

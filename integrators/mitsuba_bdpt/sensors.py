@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from . import cameras
-from .objects import children, number
+from .objects import children, named, number
 from .other_sensors import Distant, IrradianceMeter, Opaque, Orthographic
 from .sensor_records import Sensor
 from .to_world import check_to_world
@@ -42,12 +42,12 @@ def _batch(sensor) -> Sensor:
     views = [view for view in children(sensor).values() if isinstance(view, mi.Sensor)]
     if sensor.film().sample_border():
         raise NotImplementedError(
-            f"bdpt: film of batch sensor '{sensor.id()}' has sample_border, which has no meaning beside "
+            f"bdpt: film of batch sensor {named(sensor)} has sample_border, which has no meaning beside "
             "the views of a batch; set it to false"
         )
     if mi.is_spectral and any("srf" in children(view) for view in views):
         raise NotImplementedError(
-            f"bdpt: a view of batch sensor '{sensor.id()}' has an srf of its own, but wavelengths are "
+            f"bdpt: a view of batch sensor {named(sensor)} has an srf of its own, but wavelengths are "
             "sampled before the view is known; render the views one by one"
         )
     kinds = {view.class_name() for view in views}
@@ -60,16 +60,16 @@ def _meter(sensor, shape_errors) -> Sensor:
     film = sensor.film()
     if film.sample_border():
         raise NotImplementedError(
-            f"bdpt: film of irradiance meter '{sensor.id()}' has sample_border, which asks for points beyond "
+            f"bdpt: film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
             "its shape; set it to false"
         )
     shape = sensor.get_shape()
     if number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
         raise NotImplementedError(
-            f"bdpt: irradiance meter '{sensor.id()}' is on a {shape.class_name()} ('{shape.id()}'), of which "
+            f"bdpt: irradiance meter {named(sensor)} is on a {shape.class_name()} ({named(shape)}), of which "
             "Mitsuba samples no points; put it on another shape"
         )
-    check_to_world(shape, f"irradiance meter '{sensor.id()}'")
+    check_to_world(shape, f"irradiance meter {named(sensor)}")
     if tuple(film.size()) != (1, 1):
         return Opaque(sensor, "the film has more than one pixel: which of them a point belongs to is unknown")
     return IrradianceMeter(sensor, shape_errors)

@@ -37,7 +37,8 @@ class Sphere:
         # one, or its opposite.
         u = mi.Point2f(0.3, 0.2)
         local = dr.dot(shape.sample_position(0, u).n, mi.warp.square_to_uniform_sphere(u))
-        turned = not np.allclose(matrix[:3, :3], radius * np.eye(3), rtol=0, atol=1e-6 * radius)
+        off = np.abs(matrix[:3, :3] - radius * np.eye(3)).max()
+        turned = not off <= 1e-6 * radius  # also if it is not finite
         outward = 1.0 if number(local) > 0 else -1.0
         return Sphere(mi.ScalarPoint3f(matrix[:3, 3]), radius, outward, turned)
 

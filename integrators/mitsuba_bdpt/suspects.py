@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import children, number, own_parameters
+from .objects import children, named, number, own_parameters
 
 # What names of a BSDF's textures say that they scale the light that it scatters.
 _SCALES = ("reflectance", "transmittance", "base_color")
@@ -67,14 +67,14 @@ def _scales(chains) -> list[_Scale]:
 
 def _called(owners) -> str:
     """A name for the BSDF that holds the first of ``owners``, a texture, by the nearest that has an id."""
-    named = next((owner for owner in owners[1:] if owner.id()), None)
-    if isinstance(named, mi.BSDF):
-        return f"BSDF '{named.id()}'"
+    holder = next((owner for owner in owners[1:] if owner.id()), None)
+    if isinstance(holder, mi.BSDF):
+        return f"BSDF {named(holder)}"
     texture = owners[0].id() or _file_of(owners[0])
     if texture:
         return f"the BSDF with texture '{texture}'"
-    if named is not None:
-        return f"the BSDF of shape '{named.id()}'"
+    if holder is not None:
+        return f"the BSDF of shape {named(holder)}"
     return f"a BSDF without id ({' of '.join(owner.class_name() for owner in owners[1:])})"
 
 
@@ -117,7 +117,7 @@ def narrow_spots(scene) -> list[str]:
         opening = 2 * math.sin(math.radians(angle) / 2) ** 2  # 1 - cos, of which none is lost
         if _STEP > _COARSE * opening:
             most = f"{_STEP / opening:.0%}" if opening > _STEP else "all"
-            found.append(f"spot '{emitter.id()}' has cutoff_angle={angle:g} (up to {most} of its light)")
+            found.append(f"spot {named(emitter)} has cutoff_angle={angle:g} (up to {most} of its light)")
     return found
 
 
@@ -125,6 +125,7 @@ def not_finite(scene) -> list[str]:
     """Names of the scene's parameters that hold NaN or infinity. (Looks at every number.)"""
     found = []
     for name, value in mi.traverse(scene):
+        value = getattr(value, "matrix", value)  # of transforms
         if dr.is_float_v(value) and not np.isfinite(np.array(value)).all():
             found.append(name)
     return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from .objects import inverse_of, matrix_of
+from .objects import inverse_of, matrix_of, named
 
 # Relative; single precision and its products are far below.
 _TOLERANCE = 1e-3
@@ -23,7 +23,7 @@ def check_to_world(shape, owner: str):
     reason = check(matrix, inverse) if np.isfinite([matrix, inverse]).all() else None
     if reason is not None:
         kind = shape.class_name().lower()
-        raise ValueError(f"bdpt: {owner} is on a {kind} ('{shape.id()}') whose to_world {reason}")
+        raise ValueError(f"bdpt: {owner} is on a {kind} ({named(shape)}) whose to_world {reason}")
 
 
 def _disk(matrix, inverse):
