@@ -18,7 +18,7 @@ from .pilot import WEIGHTINGS
 from .plan import CONNECTIONS, LIGHT_PATHS, Plan, Settings, lost_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
-# `LEAST_SAMPLES` has none. A pilot's sample takes three to seven times as long as one of path tracing alone,
+# `LEAST_SAMPLES` has none. A pilot's sample takes several times as long as one of path tracing alone,
 # and recording it longer than all of a short pilot's samples (scripts/overhead.py): 2 % of a render of
 # `CHEAP_SAMPLES` of path tracing alone. In between a pilot is asked where the scene alone does not tell what
 # pays: all the same a render with one is faster than one that guesses (docs/skipping.md).
