@@ -21,6 +21,7 @@ import tempfile
 from mistakes import answered
 from mitsuba_bdpt import __main__ as command
 from probes import numbers
+from room import MOST
 from tables import table
 
 COUNTS = ((1, 1), (30, 1), (300, 1), (1, 10), (1, 100))
@@ -81,7 +82,8 @@ print(taken[0][0], taken[0][1] - taken[1][1])
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--rooms", type=int, nargs="+", help="numbers of materials; 0: the Cornell box")
+    materials = command.number(int, 0, MOST)
+    parser.add_argument("--rooms", type=materials, nargs="+", help="numbers of materials; 0: the Cornell box")
     count = command.number(int, 1)
     parser.add_argument("--spp", type=count, nargs="+", help="samples per pixel, of rooms; default: 8")
     parser.add_argument("--rounds", type=count, help="renders of each room; default: 3")

@@ -213,6 +213,45 @@ def test_a_mask_reflects_what_its_opacity_says(monkeypatch):
     assert found == pytest.approx(whole / 4, rel=0.05)
 
 
+def projector(colour):
+    """A projector one of whose texels has this colour."""
+    pixels = np.full((8, 8, 3), 2, np.float32)
+    pixels[4, 4] = colour
+    return LAMPS["projector"] | {"irradiance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}}
+
+
+@pytest.mark.parametrize(
+    "lamp, called",
+    [
+        (lambda: LAMPS["point"] | {"intensity": 1e38}, "point light 'lamp'"),
+        (lambda: projector(np.inf), "projector 'lamp'"),
+        (lambda: projector([np.nan, 2, 2]), "projector 'lamp'"),
+    ],
+)
+def test_what_is_not_finite_is_said(lamp, called):
+    """Rationale: a render without light tracing does not make the paths that are lost, and may meet none of
+    their numbers; the maximum over colours passes over NaN. Expected: a lamp that is not finite, or beyond
+    single precision, is named by one warning for two renders, and has no share."""
+    scene, integrator = scene_of(lamp(), block=BLOCK), bdpt(light_paths=0)
+    with Warned() as warnings:
+        for seed in range(2):
+            integrator.render(scene, spp=4, seed=seed)
+    said = [text for text in warnings if "cannot be told" in text]
+    assert len(said) == 1 and f"how much light of {called} is missing" in said[0], warnings
+    assert integrator.statistics["lost_light"] == {}
+
+
+def test_what_is_not_finite_out_of_view_is_not_said():
+    """Rationale: nothing is lost of light that nobody sees. Expected: no warning of a lamp beyond single
+    precision whose light meets nothing that is seen through glass."""
+    scene = scene_of(
+        LAMPS["point"] | {"intensity": 1e38}, block=BLOCK | {"to_world": T().translate([30, 1, 0])}
+    )
+    with Warned() as warnings:
+        bdpt(light_paths=0).render(scene, spp=4)
+    assert not [text for text in warnings if "cannot be told" in text]
+
+
 def test_a_lens_finds_it():
     """Rationale: with a lens, light subpaths arrive at the sensor (t = 0). Expected: nothing is said."""
     eye = camera("thinlens", aperture_radius=0.05, focus_distance=4.0)

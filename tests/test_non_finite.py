@@ -42,6 +42,9 @@ def test_a_transform_that_is_not_finite_is_named():
     lamp = {"type": "sphere", "radius": NAN, "emitter": {"type": "area"}}
     scene = mi.load_dict({"type": "scene", "ball": lamp, "sensor": {"type": "perspective"}})
     assert suspects.not_finite(scene) == ["ball.to_world"]
+    nameless = '<shape type="sphere"><float name="radius" value="nan"/></shape>'
+    nameless = mi.load_string(f'<scene version="3.0.0">{nameless}</scene>')
+    assert suspects.not_finite(nameless) == ["to_world of an object without id (Sphere)"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mi.load_dict({"type": "bdpt"}).render(scene, spp=1)

@@ -286,6 +286,16 @@ def test_direct_is_replaced_with_its_depth(around):
     assert deeper.max_depth == 5
 
 
+@pytest.mark.parametrize("kind", ["direct_projective", "prb", "prb_basic", "prb_projective", "prbvolpath"])
+def test_integrators_that_end_paths_by_themselves_are_replaced_with_their_depth(scene, kind):
+    """Expected: the ``max_depth`` that the integrator has where the file gives none; else the file's."""
+    text = scene.read_text()
+    assert loaded(scene, f"-Dintegrator={kind}", "--integrator", "bdpt").settings.max_depth == 3
+    scene.write_text(text.replace('<integer name="max_depth" value="3"/>', ""))
+    own = loaded(scene, f"-Dintegrator={kind}").max_depth
+    assert loaded(scene, f"-Dintegrator={kind}", "--integrator", "bdpt").settings.max_depth == own
+
+
 def test_an_integrator_around_none_is_named(around, capsys):
     text = around.read_text()
     start, end = text.index('<integrator name="img"'), text.index("</integrator>") + len("</integrator>")
@@ -393,6 +403,7 @@ def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message)
             "sample_count=0: nothing is to",
         ),
         ("<emitter", "<emitter", ["--integrator", "aov"], "integrator=aov is for one around another"),
+        ("<emitter", "<emitter", ["--integrator", "aov", "-P", "aovs="], "integrator=aov is for one around"),
         ("<emitter", "<emitter", ["--integrator", "moment"], "integrator=moment is for one around another"),
     ],
 )
@@ -461,7 +472,10 @@ MISTYPED = [
     (["--integrator", "Path"], "did you mean path?"),
     (["--integrator", "prbvolpth"], "did you mean prbvolpath?"),
     (["--integrator", "xyzzy"], "integrator='xyzzy' is not a plugin; use for example bdpt"),
-    (["--integrator", "diffuse"], "integrator='diffuse' is a bsdf, no integrator; use for example bdpt"),
+    (["--integrator", "diffuse"], "integrator='diffuse' is a plugin of type bsdf, no integrator; use for"),
+    (["--integrator", "obj"], "integrator='obj' is a plugin of type shape, no integrator"),
+    (["-Dlight=abc"], '-D light=abc: could not parse RGB value "abc", in'),
+    (["-Dlight=abc", "-Dformat=abc"], '-D light=abc or -D format=abc: could not parse RGB value "abc", in'),
     (["--integrator", ""], "integrator='' names no integrator"),
     (["-Dintegrator=pth"], 'Plugin "pth" not found! Did you mean path?'),
     (["-Dlihgt=1"], "-D lihgt: no parameter of the scene; it has integrator=path, format=float32, light=2"),
@@ -482,6 +496,26 @@ def test_mistyped_names_are_answered_with_those_that_exist(scene, capsys, argume
     assert main(["render", str(scene), *arguments]) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("kind", ["diffuse", "obj", "cli_mirror"])
+def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, capsys, kind):
+    """Expected: the same of plugins in Python, whose type Mitsuba does not know before they are made."""
+    mi.set_variant("llvm_ad_rgb")
+    mi.register_bsdf("cli_mirror", lambda properties: mi.load_dict({"type": "conductor"}))
+    start, end = SCENE.index("<integrator"), SCENE.index("<sensor")
+    text = SCENE.replace(SCENE[start:end], "").replace('<default name="integrator" value="path"/>', "")
+    scene.write_text(text)
+    assert main(["render", str(scene), "--integrator", kind]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: integrator={kind!r} is a plugin of ") and error.count("\n") == 1
+
+
+def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
+    scene.write_text(SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="$light"'))
+    assert main(["render", str(scene), "-Dlight=-1"]) == 1
+    error = capsys.readouterr().err
+    assert '-D light=-1: Property "sample_count": value -1 is out of bounds' in error
 
 
 @pytest.mark.parametrize(

@@ -113,6 +113,9 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
         "floor.py x --rounds 0",
         "reference.py x --seconds nan",
         "reference.py x --spp 0",
+        "startup.py --rooms 0 --rounds 0",
+        "startup.py --rooms 0 --spp 0",
+        "startup.py --rooms -1",
         "strategies.py x --spp 0",
         "strategies.py x --seed -1",
         "strategies.py x --resolution -8",
@@ -126,6 +129,14 @@ def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command
     assert by_user(monkeypatch, script, *words) == 2
     error = capsys.readouterr().err
     assert f"argument {words[-2]}: got {words[-1]!r}, which must be" in error
+
+
+@pytest.mark.parametrize("option", ["--spp", "--rounds"])
+def test_options_of_rooms_want_rooms(here, monkeypatch, capsys, option):
+    """Rationale: scenes of many emitters or BSDFs, which are the default, have sample counts of their own.
+    Expected: the usage, that the option is of rooms, status 2."""
+    assert by_user(monkeypatch, "startup.py", option, "4") == 2
+    assert "add --rooms" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

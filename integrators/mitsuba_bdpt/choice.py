@@ -149,18 +149,23 @@ class Decision:
 
 def read_decisions(text: str) -> tuple[Decision, ...]:
     """The parameter ``decisions``: JSON as in ``statistics``, an empty list for a render without a pilot;
-    raises ``ValueError`` saying what is wrong."""
+    raises ``ValueError`` saying what is wrong, and in which entry."""
+    where, made = "", []
     try:
         entries = json.loads(text)
         if not isinstance(entries, list):
             raise TypeError("a list of decisions is needed")
-        made = tuple(_read_decision(entry) for entry in entries)
+        for number, entry in enumerate(entries):
+            where = f"entry {number}"
+            made.append(_read_decision(entry))
+        where = ""
         passes = [decision.first_pass for decision in made]
         if passes != sorted(set(passes)):
             raise ValueError(f"passes {passes} must rise")
-        return made
+        return tuple(made)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        what = f"{error} is missing" if isinstance(error, KeyError) else error
+        says = f"{where}: {error}" if where else error
+        what = f"{where} lacks {error}" if isinstance(error, KeyError) else says
         raise ValueError(
             f"bdpt: decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: "
             f"{what}"

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .objects import all_shapes, children, matrix_of, named, number, own_parameters
+from .objects import all_shapes, children, living_emitters, matrix_of, named, number, own_parameters
 from .spheres import Sphere, sphere_normal
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
@@ -132,6 +132,13 @@ def left_out(emitter, kind: int) -> list[tuple[str, str]]:
 def is_foreign(class_name: str) -> bool:
     """Whether an emitter's class is not Mitsuba's."""
     return class_name not in _KINDS
+
+
+def foreign_elsewhere(scene) -> int:
+    """How many emitters live outside of ``scene`` whose class is not Mitsuba's: virtual calls visit them
+    too."""
+    own = sum(is_foreign(emitter.class_name()) for emitter in scene.emitters())
+    return sum(map(is_foreign, living_emitters())) - own
 
 
 def needs_evaluation(class_name: str) -> bool:

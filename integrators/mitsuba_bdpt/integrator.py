@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import choice
+from .emitter_kinds import foreign_elsewhere
 from .explain import explain
 from .features import feature_names
 from .notices import warn_once
@@ -133,9 +134,25 @@ def _without_gradients(method):
     @wraps(method)
     def undisturbed(*args, **kwargs):
         with dr.suspend_grad():
-            return method(*args, **kwargs)
+            try:
+                return method(*args, **kwargs)
+            except RuntimeError as error:
+                if not isinstance(error, NotImplementedError):  # refusals, which say all
+                    _hint_at_others(error, (*args, *kwargs.values()))
+                raise
 
     return undisturbed
+
+
+def _hint_at_others(error: RuntimeError, arguments):
+    """Say with an ``error`` that it may come from the emitter of a scene that is not among ``arguments``."""
+    scene = next((value for value in arguments if isinstance(value, mi.Scene)), None)
+    count = foreign_elsewhere(scene) if scene is not None else 0
+    if count:
+        error.add_note(
+            f"bdpt: other scenes in this process have {count} foreign emitters, of plugins not "
+            "Mitsuba's, which its calls visit too: if the error is theirs, delete those scenes first"
+        )
 
 
 def _make_class():

@@ -18,8 +18,10 @@ from .similar import did_you_mean
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
 
-DEPTHS = {"direct": 2}
-"""``max_depth`` of integrators that have no such parameter, whose paths end as early."""
+_ADJOINT = ("prb", "prb_basic", "prb_projective", "prbvolpath")
+
+DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
+"""``max_depth`` of integrators whose paths end as early where the scene file gives them none."""
 
 NOT_CARRIED = {
     "moment": "second moments, which bdpt has not: its parameter variance adds the variance of each pixel",
@@ -116,6 +118,8 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     overrides = dict(options.properties)
     if options.time is not None:
         overrides["timeout"] = options.time
+    if options.integrator is not None:
+        _check_kind(options.integrator)
     config = mi.parser.ParserConfig(options.variant)
     defines = in_proportion(options.scene, dict(options.defines))
     state = mi.parser.parse_file(config, str(options.scene), **defines)
@@ -132,7 +136,7 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
             )
         overrides |= {"until_error": options.until_error, "variance": True}
     if options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator):
-        if options.integrator != "aov" or "aovs" not in overrides:
+        if options.integrator != "aov" or not overrides.get("aovs"):
             raise ValueError(
                 f"integrator={options.integrator} is for one around another, which the command line cannot "
                 "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
@@ -143,7 +147,23 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     scene = mi.parser.instantiate(config, state)
     if node is not None:
         return scene, scene.integrator()
-    return scene, mi.load_dict({"type": options.integrator or "bdpt", **overrides})
+    kind = options.integrator or "bdpt"
+    made = mi.load_dict({"type": kind, **overrides})
+    if not isinstance(made, mi.Integrator):
+        raise ValueError(_no_integrator(kind, f"of class {made.class_name()}"))
+    return scene, made
+
+
+def _check_kind(name: str) -> None:
+    """Raise ``ValueError`` if the plugin ``name`` is known to be no integrator. (What those in Python are is
+    known when they are made, and what is no plugin is answered then.)"""
+    kind = mi.PluginManager.instance().plugin_type(name)
+    if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
+        raise ValueError(_no_integrator(name, f"of type {kind.name.lower()}"))
+
+
+def _no_integrator(name: str, what: str) -> str:
+    return f"integrator={name!r} is a plugin {what}, no integrator; use for example bdpt"
 
 
 def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
@@ -210,6 +230,8 @@ def _in_words(error: str, options: Namespace) -> str | None:
         named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
         text = f"-D {', '.join(unused)}: no parameter of the scene; it has {named or 'none'}; "
         return (text + "".join(did_you_mean(name, known) for name in unused)).rstrip("; ")
+    if rejected := _rejected(error, options):
+        return rejected
     missing = re.search(r"undefined parameter: \$(\w+)", error)
     if missing:
         return f"{error}; give it a value: -D {missing[1]}=VALUE"
@@ -224,7 +246,7 @@ def _in_words(error: str, options: Namespace) -> str | None:
         return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
     other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
     if other and other[1] == options.integrator:
-        return f"integrator={other[1]!r} is a {other[2]}, no integrator; use for example bdpt"
+        return _no_integrator(other[1], f"of type {other[2]}")
     missing = re.search(r'Plugin "([^"]*)" not found', error)
     if not missing:
         return None
@@ -232,6 +254,23 @@ def _in_words(error: str, options: Namespace) -> str | None:
     if missing[1] == options.integrator:
         return f"integrator={missing[1]!r} is not a plugin; {question or 'use for example bdpt'}".rstrip()
     return f"{error} {question.capitalize()}".rstrip() if question else None
+
+
+def _rejected(error: str, options: Namespace) -> str | None:
+    """What to say of Mitsuba's ``error`` about a value, if it comes from the command line; else None."""
+    found = re.search(
+        r'could not parse ([\w ]+) value "([^"]*)".*|Property "\w+": value (\S+) is out of.*', error
+    )
+    if not found:
+        return None
+    value = found[2] if found[3] is None else found[3]
+    given = [f"-D {name}={text}" for name, text in options.defines if text == value]
+    if not given:
+        return None
+    place = re.search(r"\(line \d+, col \d+\)", error)
+    where = f" {place[0]}" if place else ""
+    # Where several have the value, Mitsuba does not tell which of them it is.
+    return f"{' or '.join(given)}: {found[0].rstrip('.')}, in {str(options.scene)!r}{where}; give it another"
 
 
 def parameters(scene: Path) -> dict[str, str]:
@@ -329,7 +368,7 @@ def integrator_properties(
     else:
         properties = mi.Properties(kind)
         properties.set_id(given.id())
-        if given.plugin_name() in DEPTHS and kind not in DEPTHS:
+        if given.plugin_name() in DEPTHS:
             properties["max_depth"] = DEPTHS[given.plugin_name()]
             properties.mark_queried("max_depth")
         for key in KEPT:

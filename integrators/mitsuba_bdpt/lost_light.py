@@ -18,22 +18,28 @@ import numpy as np
 
 from . import bsdf, rays
 from .kernel import Shared
+from .notices import warn_once
 from .objects import children, nothing_freed, own_parameters, step_by_step
 from .plan import lost_paths
 
-# Subpaths from either end, and how many of those that arrive are compared, at most: a share of 0.1 is known
-# to a fifth of it where some thousand pairs meet, and looking takes some 20 ms, once per scene.
+# Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
+# deviation (24 seeds) is 0.06 for a block of glass that fills the view, and 0.07, 0.18, 0.28 and 0.31 in the
+# four scenes of scenes/ with such light: enough to tell what is `WORTH_A_WORD`, not for a number to rely on.
+# A look takes 60 to 90 ms on two busy cores, 0.3 to 0.4 s where its kernels have to be compiled.
 SUBPATHS, COMPARED = 1 << 13, 1 << 11
 
 # Edges after which a subpath of delta events ends: through twelve panes, or reflected as often within glass.
+# (In `lamp_behind_glass` 12 find 5 % less than 24, and 48 no more; elsewhere 8 find all.)
 LONGEST = 24
 
 # Radius of the disk around a point that is seen in which light counts, in distances between such points:
-# disks overlap, so that no light falls between them, and are still small beside the image.
+# disks overlap, so that no light falls between them, and are still small beside the image. (With 0.75 noise
+# is up to 1.6 times as large; with 3, as disks reach beyond what is lit, up to 6 % less is found.)
 RADIUS = 1.5
 
 # Least cosine between the normals of two points of one surface: what arrives on the other side of an edge, or
-# of a thin wall, is light of another one. (Within a disk the normals of what is round differ by less.)
+# of a thin wall, is light of another one. (Within a disk the normals of what is round differ by less. From 0
+# to 0.99 what is found in scenes/ changes by 4 % at most.)
 SAME_SURFACE = 0.9
 
 # Share of an image's light from which on its loss is worth a word. (A caustic beneath a glass ball, seen
@@ -105,21 +111,37 @@ def lamps_and_sensor(world) -> tuple:
 
 def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
     """Mean radiance over the film that is lost, by the index of the emitter; ``max_depth`` see
-    `plan.Settings`. Of an emitter whose estimate is not finite nothing is stated: what is not finite in a
-    scene is named by `suspects`."""
+    `plan.Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says so, as of one
+    that emits into directions that are: a render that does not make such paths may meet no such number
+    itself, and `suspects` is asked only if it did."""
+    total = np.zeros(len(world.scene.emitters()))
     with nothing_freed(), step_by_step(world.emitters.evaluated):
         points, _, times = _seen(world, plan, max_depth).some()
         if points is None:
             return {}
-        light, lamp = _lit(world, plan, max_depth)
+        light, lamp, astray = _lit(world, plan, max_depth)
+        total[dr.gather(mi.UInt32, lamp, dr.compress(astray)).numpy()] = np.nan
         photons, index, more = light.some()
-        if photons is None:
-            return {}
-        found = _meetings(photons, points, max_depth) * (times * more / SUBPATHS**2)
-        lamps = dr.gather(mi.UInt32, lamp, index)
-        dr.eval(found, lamps)
-    total = np.bincount(lamps.numpy(), found.numpy())
-    return {int(i): float(total[i]) for i in np.flatnonzero(total) if np.isfinite(total[i])}
+        if photons is not None:
+            found = _meetings(photons, points, max_depth) * (times * more / SUBPATHS**2)
+            lamps = dr.gather(mi.UInt32, lamp, index)
+            dr.eval(found, lamps)
+            total += np.bincount(lamps.numpy(), found.numpy(), len(total))
+    finite = np.isfinite(total)
+    if not finite.all():
+        _warn_of_not_finite(world, np.flatnonzero(~finite))
+    return {int(i): float(total[i]) for i in np.flatnonzero(total) if finite[i]}
+
+
+def _warn_of_not_finite(world, indices):
+    """Say of which emitters, by their ``indices``, the light that is lost cannot be told."""
+    emitters = world.scene.emitters()
+    lamps = " and ".join(_called(emitters[i]) for i in indices[:NAMED])
+    text = (
+        f"bdpt: how much light of {lamps} is missing cannot be told, since the estimate is NaN or infinite; "
+        "look for such numbers, or very large ones, in the lamp and in the BSDFs that its light meets"
+    )
+    warn_once(world.scene, world.camera.sensor, text)
 
 
 def in_words(world, plan, shares: dict[int, float]) -> str:
@@ -177,9 +199,10 @@ def _two(generator):
 
 
 def _brightness(value):
-    """A spectrum as a number, in the unit of `film.Accumulator.mean`, roughly."""
+    """A spectrum as a number, in the unit of `film.Accumulator.mean`, roughly; NaN if an entry is not
+    finite, since `dr.max` passes over those that are NaN."""
     value = mi.unpolarized_spectrum(value)
-    return dr.mean(value) if mi.is_spectral else dr.max(value)
+    return dr.select(bsdf.is_finite(value), dr.mean(value) if mi.is_spectral else dr.max(value), dr.nan)
 
 
 def _carried(value):
@@ -191,19 +214,20 @@ def _carried(value):
 
 def _lit(world, plan, max_depth):
     """Where light of delta emitters arrives by delta events in a way that next-event estimation does not
-    find; and the emitters' indices."""
+    find; the emitters' indices; and the mask of subpaths whose ray is not finite, which hit nothing."""
     generator = mi.PCG32(SUBPATHS, SEED, 1)
     shared = _shared(world, generator)
     e = world.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
-    active = e.delta & bsdf.is_finite(e.weight) & ~bsdf.is_zero(e.weight)
+    active = e.delta & ~bsdf.is_zero(e.weight)  # what is not finite is kept, to be said
     ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
     weight, index = mi.Spectrum(e.weight), e.index
     ray.maxt = dr.full(mi.Float, dr.inf, SUBPATHS)  # as wide as those of the sensor, for the same kernel
     dr.make_opaque(ray, weight, active, beam, index, generator)
+    astray = active & ~(dr.all(dr.isfinite(ray.o)) & dr.all(dr.isfinite(ray.d)))
     ends = _follow(world, ray, weight, active, generator, max_depth, True)
     if plan.direct:
         ends.active &= (ends.edges > 1) | beam
-    return ends, index
+    return ends, index, astray
 
 
 def _seen(world, plan, max_depth):
@@ -251,7 +275,7 @@ def _follow(world, ray, weight, active, generator, max_depth, adjoint: bool) -> 
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
-        active &= bsdf.is_finite(weight) & ~bsdf.is_zero(weight)
+        active &= ~bsdf.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, world.emitters.shape_errors)
         edges += dr.select(active, mi.UInt32(1), 0)
         return rays.spawn(anchor, si.to_world(bs.wo), ray), weight, edges, distance, active, generator, ends
@@ -306,4 +330,5 @@ def _meetings(photons: _Ends, points: _Ends, max_depth):
 
     state = mi.UInt32(0), dr.zeros(mi.UnpolarizedSpectrum, dr.width(photons.p))
     _, total = dr.while_loop(state, lambda i, total: i < count, body, label="meetings")
-    return _brightness(total * photons.weight)
+    # One that meets nothing adds nothing, even if its weight is not finite.
+    return dr.select(bsdf.is_zero(total), 0, _brightness(total * photons.weight))

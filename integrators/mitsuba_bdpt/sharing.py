@@ -33,7 +33,10 @@ LONGEST_RUN = 16
 # A part has as many runs or more, or else runs of one pixel: few would meet at few distances.
 LEAST_RUNS = 256
 
-_FIRST_WORD = 2  # of parts 1 and on: 1 and 2 are the words of the points' own seeds, see `Points.stream`
+# Words that make other seeds of a pass's: 1 and 2 make those of the points (`Points.stream`). Parts that are
+# dealt, from 1 on, have those after them.
+_WORDS_OF_POINTS = 2
+
 _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # tell the keys of the rounds apart
 
 
@@ -50,10 +53,10 @@ class Seat:
 
 
 class Sharing:
-    """The map of a batch's camera samples to lanes. The ``total`` samples of so many ``pixels`` are numbered
-    by ``slots``, pixel by pixel with ``samples`` of each; a lane serves ``served`` of them or fewer, all in
-    different pixels. The map is another for each ``seed`` (``UInt32``), so that in the mean of several
-    renders no two pixels share much.
+    """The map of a batch's camera samples to lanes. Slots number the camera samples, pixel by pixel with
+    ``samples`` of each of the ``pixels``; there are ``total`` of them. Each of the ``lanes`` serves
+    ``served`` slots or fewer, all in different pixels. The map is another for each ``seed`` (``UInt32``), so
+    that in the mean of several renders no two pixels share much.
     """
 
     def __init__(self, pixels: int, samples: int, served: int, seed):
@@ -95,7 +98,7 @@ class Sharing:
         return self._place(seat, part, row, column, hashed)
 
     def _keys(self, part):
-        key = sobol.hash_u32(self._seed, part + _FIRST_WORD)
+        key = sobol.hash_u32(self._seed, part + _WORDS_OF_POINTS)
         return [key ^ word for word in _ROUNDS]
 
     def _place(self, seat, part, row, column, hashed):

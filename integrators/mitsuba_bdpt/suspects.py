@@ -123,9 +123,17 @@ def narrow_spots(scene) -> list[str]:
 
 def not_finite(scene) -> list[str]:
     """Names of the scene's parameters that hold NaN or infinity. (Looks at every number.)"""
-    found = []
+    found, held = [], children(scene)
     for name, value in mi.traverse(scene):
         value = getattr(value, "matrix", value)  # of transforms
         if dr.is_float_v(value) and not np.isfinite(np.array(value)).all():
-            found.append(name)
+            found.append(_in_words(name, held))
     return found
+
+
+def _in_words(name: str, held) -> str:
+    """The ``name`` of a parameter of a scene that has ``held`` these objects: Mitsuba calls one without id by
+    its address, which tells nothing."""
+    first, _, rest = name.partition(".")
+    owner = held.get(first)
+    return f"{rest} of an object {named(owner)}" if isinstance(owner, mi.Object) and not owner.id() else name
