@@ -96,9 +96,8 @@ def piloted(scene, settings) -> Counter:
 
 
 def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
-    """`measured` with each seed, of the candidates, by their names, that are among the best or ``chosen``.
-    Where those among the best are ``known``, only the best of these and the chosen are rendered, as times
-    have to be compared."""
+    """Integrators, by their names, of the candidates that are among the best or ``chosen``. Where those among
+    the best are ``known``, only of the best of these, by which the machine's speed is told, and the chosen."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.world, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
@@ -115,9 +114,15 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
         first = {n: product([measured(scene, w, FIRST_SEED, expected)]) for n, w in made.items()}
         best = np.min(list(first.values()), axis=0)
         made = {n: w for n, w in made.items() if n in chosen or (first[n] <= AMONG_BEST * best).any()}
-    return known | {
-        name: [measured(scene, way, seed, expected) for seed in range(SEEDS)] for name, way in made.items()
-    }
+    return made
+
+
+def as_fast(known: dict, found: dict) -> dict:
+    """``known`` rows with the times that they would have at the machine's present speed, which ``found``, rows
+    of some of the same choices, tell."""
+    both = known.keys() & found.keys()
+    speeds = [np.array(found[name])[:, 0].min() / np.array(known[name])[:, 0].min() for name in both]
+    return {name: np.array(rows) * [np.median(speeds), 1, 1] for name, rows in known.items()}
 
 
 def named(way: choice.Candidate) -> str:
@@ -129,18 +134,23 @@ def named(way: choice.Candidate) -> str:
 
 
 def measure(name: str, known: dict) -> dict:
-    """A row: `measured` with each seed, of the default and of fixed choices (those ``known`` are kept), and
-    how often pilots have chosen which of these."""
+    """A row: `measured` with each seed, of the default and of fixed choices (those ``known`` are kept, their
+    times scaled to the machine's present speed), and how often pilots have chosen which of these."""
     scene, depth, expected = loaded(name)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
     chosen = {named(way): n for way, n in piloted(scene, integrator.settings).most_common()}
-    found = fixed(scene, depth, expected, set(chosen), known)
-    rows, kinds = [], []
+    ways = fixed(scene, depth, expected, set(chosen), known)
+    rows, kinds, found = [], [], {way: [] for way in ways}
     for seed in range(SEEDS):
+        # In turns, since the machine's speed changes.
+        for way, by in ways.items():
+            found[way].append(measured(scene, by, seed, expected))
         rows.append(measured(scene, integrator, seed, expected))
         (made,) = integrator.statistics["decisions"] or [None]
         kinds.append(made and (made["light_paths"], made["connections"]))
+    if known:
+        found = as_fast(known, found) | found
     # One kind of decision takes other times than another: the least of each, as often as it is made.
     least = {kind: min(row[0] for row, of in zip(rows, kinds, strict=True) if of == kind) for kind in kinds}
     rows = np.array(rows)

@@ -23,6 +23,7 @@ import hashlib
 import json
 import math
 import platform
+import re
 import time
 import tomllib
 from dataclasses import asdict, dataclass
@@ -172,10 +173,12 @@ def read_toml(path: Path) -> dict:
 
 
 def write_json(path: Path, value) -> None:
-    """Write at once: a process that is killed leaves the whole file or none."""
+    """Write at once: a process that is killed leaves the whole file or none. Lists of numbers take a line."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(value, indent=1)
+    text = re.sub(r'\[\n[^][{}"]*\]', lambda found: re.sub(r"\n\s*", " ", found[0]), text)
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1) + "\n")
+        temporary.write_text(text + "\n")
 
 
 def integrator_of(words: str, depth: int):
