@@ -7,8 +7,9 @@
 For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
 inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
 ``decisions``); those which one render of a seed of its own shows to be among the best, or which are chosen,
-with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, pilot included, which
-neighbours on the machine disturb less than seconds; errors are relMSE, raw and trimmed of the worst 0.1 %.
+with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, which neighbours on
+the machine disturb less than seconds; the default's without the pilot, which later renders of a scene
+remember (docs/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
 The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
 fixed choices, with the interval that nine in ten resamplings of the seeds (the same for both sides) lie in,
 and the same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its
@@ -88,16 +89,17 @@ def by_hand(scene, depth: int, way: choice.Candidate, mean: float):
 
 def piloted(scene, settings) -> Counter:
     """How often pilots of `PILOT_SEEDS` seeds choose which candidate; nothing where no pilot is asked."""
-    tables = (
-        rendering.Render(scene, scene.sensors()[0], settings, seed, SPP).decide()
-        for seed in range(PILOT_SEEDS)
-    )
+    tables = []
+    for seed in range(PILOT_SEEDS):
+        render = rendering.Render(scene, scene.sensors()[0], settings, 0, SPP)
+        render.pilot_seed = seed
+        tables.append(render.decide())
     return Counter(table[0].candidate for table in tables if table)
 
 
 def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
     """Integrators, by their names, of the candidates that are among the best or ``chosen``. Where those among
-    the best are ``known``, only of the best of these, by which the machine's speed is told, and the chosen."""
+    the best are ``known``, only of the best, by which the machine's speed is told, and the chosen."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.world, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
@@ -118,8 +120,8 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
 
 
 def as_fast(known: dict, found: dict) -> dict:
-    """``known`` rows with the times that they would have at the machine's present speed, which ``found``, rows
-    of some of the same choices, tell."""
+    """``known`` rows with the times that they would have at the machine's present speed, which ``found``,
+    rows of some of the same choices, tell."""
     both = known.keys() & found.keys()
     speeds = [np.array(found[name])[:, 0].min() / np.array(known[name])[:, 0].min() for name in both]
     return {name: np.array(rows) * [np.median(speeds), 1, 1] for name, rows in known.items()}

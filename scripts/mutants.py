@@ -45,6 +45,27 @@ class Mutant:
 
 MUTANTS = (
     Mutant(
+        "small arrays are not kept",
+        "edits.py",
+        "kept.append(dr.copy(value))",
+        "pass",
+        ("tests/test_edits.py::test_two_edits_in_between_are_seen",),
+    ),
+    Mutant(
+        "entries of large arrays are not looked at",
+        "edits.py",
+        "marks += [width, *(repr(dr.slice(entries, i)) for i in places)]",
+        "marks += [width]",
+        ("tests/test_edits.py::test_two_edits_in_between_are_seen",),
+    ),
+    Mutant(
+        "pilots of an edited scene",
+        "rendering.py",
+        "key = of_scene, self.settings",
+        "key = self.settings",
+        ("tests/test_edits.py::test_edits_are_seen",),
+    ),
+    Mutant(
         "splats on hidden emitters",
         "connect.py",
         "        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)\n",

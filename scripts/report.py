@@ -182,8 +182,9 @@ def _chosen(row) -> str:
 
 
 def _pilot_share(row) -> float:
-    """Share of a render that its pilots and decisions took."""
-    return json.loads(row["statistics"]).get("seconds", {}).get("pilot", 0) / row["seconds"]
+    """Share that pilots and decisions have of a scene's first render, whose pilots the others remember."""
+    first = row.get("seconds_pilot") or 0.0
+    return first / (first + row["seconds"])
 
 
 def _rays_per_sample(rows) -> str:
@@ -199,7 +200,8 @@ def _rays_per_sample(rows) -> str:
 
 def choices_table(results: Results) -> str:
     """What the pilots chose, what they left out and why, and what they cost; rays per sample."""
-    head = ["scene", "chosen (number of renders)", "left out in the first render", "share of the pilot"]
+    head = ["scene", "chosen (number of renders)", "left out in the first render"]
+    head += ["share of the pilot in the first render"]
     head += ["closest hits and shadow rays per sample", f"the same, {NONE}"]
     lines = []
     for scene in results.scenes:
@@ -499,7 +501,7 @@ How much of the error single values carry: raw over trimmed relMSE at {results.d
     parts.append(
         f"""## What was skipped
 
-Decided by a pilot in each render, at {results.deciding} samples per pixel:
+Decided by a pilot in the first render of each scene, at {results.deciding} samples per pixel:
 
 {choices_table(results)}"""
     )

@@ -164,7 +164,7 @@ class Bench:
     def __init__(self, cells: Cells, output: Path):
         self.cells, self.output, self.name = cells, output, cells.subject.name
         self.resolution, self.depth = cells.where()[1:]
-        self._scenes, self._integrators, self._compile, self._spp = {}, {}, {}, {}
+        self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
 
     def scene(self, sampler: str):
         """The scene with that sampler."""
@@ -195,12 +195,18 @@ class Bench:
                 self.timed(cell, spp, 0)
                 kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
             statistics = getattr(self.integrator(cell), "statistics", None)
+            self._pilot[key] = statistics["seconds"]["pilot"] if statistics else 0.0
             self._compile[key] = (
                 statistics["seconds"]["compile"]
                 if statistics
                 else sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
             )
         return self._compile[key]
+
+    def pilot_seconds(self, cell: Cell, spp: int) -> float:
+        """Seconds of the pilots of the first render of so many samples, which later ones remember."""
+        self.compile_seconds(cell, spp)
+        return self._pilot[cell.method, spp]
 
     def spp_of(self, cell: Cell) -> int:
         """Samples of a cell: its budget, or what fits into the first method's seconds for it.
@@ -259,6 +265,7 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "spp": spp,
         "seconds": seconds,
         "seconds_compile": compile_seconds,
+        "seconds_pilot": bench.pilot_seconds(cell, spp),
         "statistics": json.dumps(statistics),
         "decisions": json.dumps(statistics.get("decisions")),
     }

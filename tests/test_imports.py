@@ -27,7 +27,7 @@ ORDER = (
     ("emitter_tables", "infinity", "sensor_records"),
     ("emitter_kinds",),
     ("spheres",),
-    ("agreement", "bsdf", "to_world", "rays", "mis", "sobol"),
+    ("agreement", "bsdf", "edits", "to_world", "rays", "mis", "sobol"),
     ("objects",),
     ("llvm", "files", "spread", "moments", "notices", "similar", "_version"),
 )

@@ -47,9 +47,10 @@ All of them are combined by multiple importance sampling.
  * - skip
    - |string|
    - ``impossible`` leaves out what the scene cannot use, draws one connection per camera vertex and drops
-     small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^17
+     small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^14
      samples or more (2^22 in scenes of ten BSDFs or more), asks a pilot what pays, or the scene alone where
-     that tells (see `choice`); ``none`` does everything.
+     that tells (see `choice`); ``none`` does everything. What a pilot finds is remembered for later renders
+     of the scene, until its parameters are edited.
  * - light_paths
    - |string| or |float|
    - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses; without one 1/4, but 1 on
@@ -112,7 +113,9 @@ the lamps or the sensor, but not of what is around them.
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
 ``statistics["decisions"]`` is what the pilot chose, ``statistics["no_pilot"]`` why none was asked, or none
-decided: an empty text where one did, and where ``decisions`` were given.
+decided: an empty text where one did, and where ``decisions`` were given. ``statistics["pilots"]``: how many
+were asked, and of how many it was remembered what they found. They draw the same numbers for all seeds, so
+that all renders of a scene decide alike.
 
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.

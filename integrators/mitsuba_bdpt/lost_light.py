@@ -17,9 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from . import bsdf, rays
+from .edits import State
 from .kernel import Shared
 from .notices import warn_once
-from .objects import children, nothing_freed, own_parameters, step_by_step
+from .objects import nothing_freed, step_by_step
 from .plan import lost_paths
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
@@ -99,14 +100,10 @@ def is_possible(world, plan, settings) -> bool:
     return not plan.arrival and bool(lost_paths(world, plan, settings))
 
 
-def lamps_and_sensor(world) -> tuple:
-    """What tells the scene's delta emitters and the sensor from others, and from themselves after an edit:
-    their numbers, but those of bitmaps."""
+def lamps_and_sensor(world) -> State:
+    """What tells the scene's delta emitters and the sensor from themselves after an edit."""
     lamps = [e for e in world.scene.emitters() if e.get_shape() is None and not e.is_environment()]
-    textures = (inner for lamp in lamps for inner in children(lamp).values() if isinstance(inner, mi.Texture))
-    owners = [*lamps, *textures, world.camera.sensor]
-    values = (value for owner in owners for value in own_parameters(owner).values())
-    return tuple(str(value) for value in values if not dr.is_tensor_v(value))
+    return State.of([*lamps, world.camera.sensor])
 
 
 def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:

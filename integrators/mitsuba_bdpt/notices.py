@@ -1,4 +1,4 @@
-"""Warnings that are said once per scene."""
+"""What is remembered of scenes from render to render: warnings that were said, what pilots found."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import OrderedDict
 
 import mitsuba as mi
 
-# Scenes of which is known what was said, the latest ones.
+# So many scenes, the latest ones.
 REMEMBERED = 64
 
 _scenes: OrderedDict[int, tuple] = OrderedDict()

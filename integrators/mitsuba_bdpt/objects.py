@@ -109,6 +109,22 @@ def own_parameters(owner) -> dict:
     }
 
 
+def all_parameters(owners):
+    """The parameters of ``owners`` and of all that they hold, each object's once."""
+    collector = _collector(mi.variant())()
+    left, seen = list(owners), {}
+    while left:
+        owner = left.pop()
+        if id(owner) in seen:
+            continue
+        seen[id(owner)] = owner  # which lives as long as its number is known
+        for name, value in collector.of(owner).items():
+            if isinstance(value, mi.Object):
+                left.append(value)
+            elif value is not None:
+                yield mi.get_property(value, collector.types[name], owner)
+
+
 def matrix_of(owner) -> np.ndarray:
     """The matrix of the parameter ``to_world`` of ``owner``: (4, 4), in double precision."""
     return _entries(own_parameters(owner)["to_world"].matrix)

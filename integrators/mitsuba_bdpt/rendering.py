@@ -15,6 +15,7 @@ import numpy as np
 
 from . import choice, lost_light, mis, pilot, points
 from ._version import __version__
+from .edits import State
 from .features import FeatureLayers, feature_names
 from .film import Accumulator
 from .kernel import COUNTERS, Kernel, trace
@@ -35,6 +36,9 @@ RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 # Pilots have the sequences that follow this number, see `sequence_seed`, and images, after changes of the
 # decision, those that follow the other one.
 PILOT_SEQUENCE, CHANGED_SEQUENCE = 1 << 16, 1 << 17
+
+# Pilots of a scene that are remembered, the latest ones.
+REMEMBERED_PILOTS = 16
 
 # Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
 FIRST_REPEAT = 32
@@ -74,6 +78,9 @@ class Render:
     """One render of ``spp`` samples per pixel: its scene, plan, accumulators and progress. Lives for one
     call."""
 
+    # What pilots draw is the same in renders of all seeds, so that all decide alike.
+    pilot_seed = 0
+
     def __init__(self, scene, sensor, settings: Settings, seed, spp: int):
         check_variant()
         check_not_frozen()
@@ -96,6 +103,7 @@ class Render:
         self._samplers, self._running = {}, []
         self.decisions, self._moments, self._threshold = [], None, None
         self._pilots, self._changes, self._next_pilot = 0, 0, FIRST_REPEAT
+        self._remembered = 0
         self._use(self.plan)
         self._counts = dict.fromkeys(COUNTERS, 0)
         self.compiled, self.cached, self.compile_seconds, self.pilot_seconds = 0, 0, 0.0, 0.0
@@ -119,11 +127,7 @@ class Render:
         self._wait()  # earlier passes are not the pilot's time
         started, compiled = time.perf_counter(), self.compile_seconds
         self._pilots += 1
-        seed = sequence_seed(self.seed, PILOT_SEQUENCE + self._pilots)
-        flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
-        with nothing_freed(), flag, step_by_step(self.world.emitters.evaluated):
-            moments = pilot.measure(self.world, self._full, self.settings, seed, count, samples / count)
-        self._wait()  # for the kernel's entry in the history
+        moments = self._pilot(count, samples / count)
         self._moments = moments if self._moments is None else self._moments.joined(moments)
         possible = choice.candidates(self.world, self._full, self.settings)
         table = choice.choose(self._moments, possible, self._has_stratified_points())
@@ -136,6 +140,25 @@ class Render:
         self._no_pilot = "" if self.decisions else SAW_NOTHING
         self.pilot_seconds += time.perf_counter() - started - (self.compile_seconds - compiled)
         return table
+
+    def _pilot(self, count: int, stands_for: float) -> Moments:
+        """What the next pilot of ``count`` samples finds, see `pilot.measure`. Where the same one was traced in
+        an earlier render, and nothing was edited since, that is remembered: it would find the same."""
+        of_scene = State.of([self.world.scene, self.sensor])
+        border = self.world.camera.region.border
+        key = of_scene, self.settings, border, self.pilot_seed, self._pilots, count, stands_for
+        known = notes(self.world.scene, self.sensor).setdefault("pilots", {})
+        self._remembered += key in known
+        if key not in known:
+            seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT_SEQUENCE + self._pilots)
+            flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
+            with nothing_freed(), flag, step_by_step(self.world.emitters.evaluated):
+                known[key] = pilot.measure(self.world, self._full, self.settings, seed, count, stands_for)
+            self._wait()  # for the kernel's entry in the history
+        known[key] = known.pop(key)  # the latest
+        while len(known) > REMEMBERED_PILOTS:
+            del known[next(iter(known))]
+        return known[key]
 
     def certainty(self) -> float:
         """`choice.certainty` of what the pilots decided."""
@@ -463,6 +486,7 @@ class Render:
             "skipped": list(self.plan.skipped),
             "decisions": [d.record() for d in self.decisions],
             "no_pilot": self._no_pilot,
+            "pilots": {"asked": self._pilots, "remembered": self._remembered},
             "passes": list(self.accumulator.passes),
             "non_finite": self._counts["non_finite"],
             "non_finite_in_pilot": self.lost_by_pilot(),

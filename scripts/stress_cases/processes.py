@@ -304,17 +304,18 @@ def _sigint_after(seconds: float):
 
 def _interrupted(times: int) -> Outcome:
     """SIGINT at some moment of a render, its pilot included, then the same again."""
+    load = partial(reference.load_scene, "cornell_box", resolution=32)  # anew: its pilot is not remembered
     # Short passes: recording them takes as long as tracing them, and may be interrupted as well.
-    scene = reference.load_scene("cornell_box", resolution=32)
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 8})
-    keywords = {"seed": 5, "spp": choice.LEAST_SAMPLES // 32**2}
-    whole = _image(bdpt, scene, **keywords)
-    decisions = _decided(bdpt)
+    keywords = {"seed": 5, "spp": 128}
+    whole = _image(bdpt, load(), **keywords)
+    decisions, scene = _decided(bdpt), load()
     started = time.process_time()
     _image(bdpt, scene, **keywords)
     seconds = time.process_time() - started
     hit, kept, worst, wrong = 0, set(), 0.0, []
     for number in range(times):
+        scene = load()
         try:
             with _sigint_after(seconds * (number + 0.5) / times):
                 bdpt.render(scene, **keywords)

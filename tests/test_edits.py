@@ -1,0 +1,139 @@
+"""What is remembered of a scene between renders: pilots, until something is edited."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import choice, pilot
+from mitsuba_bdpt.edits import State
+
+SPP = choice.LEAST_SAMPLES // 32**2
+
+
+def cornell(**changes):
+    scene = mi.cornell_box()
+    scene["sensor"]["film"] |= {"width": 32, "height": 32, "rfilter": {"type": "box"}}
+    return mi.load_dict(scene | changes)
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
+
+
+def bumpy(offset=0.0):
+    """A mesh of 400 vertices, too many to be kept."""
+    mesh = mi.Mesh("bumpy", 400, 200)
+    parameters = mi.traverse(mesh)
+    points = np.random.default_rng(1).uniform(-0.3, 0.3, (400, 3)) + offset
+    parameters["vertex_positions"] = mi.Float(points.astype(np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.arange(600) % 400)
+    parameters.update()
+    return mesh
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """Seeds of the pilots that were traced."""
+    seeds, measure = [], pilot.measure
+
+    def counted(world, plan, settings, seed, *args):
+        seeds.append(int(seed[0]))
+        return measure(world, plan, settings, seed, *args)
+
+    monkeypatch.setattr(pilot, "measure", counted)
+    return seeds
+
+
+def test_pilots_are_remembered(traced):
+    """Rationale: a pilot takes as long as a preview, and a scene is rendered more than once. Expected: of
+    renders with the seeds 0 to 3 one pilot, the same decision, and each image that of a render of the scene
+    loaded anew, which traces its own (up to the order of sums)."""
+    scene, integrator = cornell(), bdpt()
+    images, decided = [], []
+    for seed in range(4):
+        images.append(np.array(integrator.render(scene, seed=seed, spp=SPP)))
+        decided += integrator.statistics["decisions"]
+        assert integrator.statistics["pilots"] == {"asked": 1, "remembered": int(seed > 0)}
+    assert len(traced) == 1 and decided == 4 * decided[:1]
+    again = np.array(integrator.render(cornell(), seed=3, spp=SPP))
+    assert len(traced) == 2 and traced[0] == traced[1]
+    np.testing.assert_allclose(again, images[3], rtol=1e-4, atol=1e-5)
+
+
+def test_another_render_asks_another_pilot(traced):
+    """Expected: pilots of another number of samples, other parameters, another sensor, and after the first
+    one of a long render are others; then all of them are known."""
+    scene = cornell()
+    film = {"type": "hdrfilm", "width": 48, "height": 48}
+    other = mi.load_dict(mi.cornell_box()["sensor"] | {"film": film})
+    renders = [
+        (bdpt(), {"spp": SPP}),
+        (bdpt(), {"spp": 2 * SPP}),
+        (bdpt(hide_emitters=True), {"spp": SPP}),
+        (bdpt(), {"spp": SPP, "sensor": other}),
+        (bdpt(spp_per_pass=32), {"spp": 256}),
+    ]
+    for integrator, arguments in renders:
+        integrator.render(scene, **arguments)
+    assert len(traced) == len(renders) + 1 and len(set(traced)) == 2  # the last one asks twice
+    before = len(traced)
+    for integrator, arguments in renders:
+        integrator.render(scene, **arguments)
+    assert len(traced) == before
+
+
+EDITS = {
+    "light.emitter.radiance.value": lambda v: 2 * v,
+    "green.reflectance.value": lambda v: 0.5 * v,
+    "sensor.to_world": lambda v: v @ mi.ScalarTransform4f().translate([0, 0, 0.1]),
+    "sensor.x_fov": lambda v: v + 1,
+    "sensor.near_clip": lambda v: 2 * v,
+    "bumpy.vertex_positions": lambda v: v + 0.01,
+    "painted.bsdf.reflectance.data": lambda v: 0.5 * v,
+}
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_edits_are_seen(name, traced):
+    """Expected: after an edit another pilot; after an update without one none."""
+    texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
+    painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    scene, integrator = cornell(bumpy=bumpy(), painted=painted), bdpt()
+    integrator.render(scene, spp=SPP)
+    parameters = mi.traverse(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith(name))
+    parameters.update()
+    integrator.render(scene, spp=SPP)
+    assert len(traced) == 1
+    parameters[key] = EDITS[name](parameters[key])
+    parameters.update()
+    integrator.render(scene, spp=SPP)
+    assert len(traced) == 2
+
+
+def test_two_edits_in_between_are_seen():
+    """Rationale: Dr.Jit gives the numbers of freed arrays to others. Expected: after two edits in a row the
+    state is another, for small arrays, which are kept, and large ones, of which entries are looked at."""
+    for entries in (3, 30_000):
+        mesh = mi.Mesh("mesh", entries, 1)
+        parameters = mi.traverse(mesh)
+        parameters["faces"] = mi.UInt32([0, 1, 2])
+        seen = set()
+        for step in range(20):
+            for value in (step, step + 0.5):
+                parameters["vertex_positions"] = mi.Float(np.full(3 * entries, value, dtype=np.float32))
+                parameters.update()
+            seen.add(State.of([mesh]))
+        assert len(seen) == 20
+
+
+def test_nothing_large_is_kept():
+    """Rationale: what is remembered would outlive a scene that takes gigabytes. Expected: the state of a mesh
+    of 30,000 vertices keeps none of its large arrays."""
+    mesh = mi.Mesh("mesh", 30_000, 10_000)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.zeros(90_000, dtype=np.float32))
+    parameters.update()
+    state = State.of([mesh])
+    assert state == State.of([mesh]) and hash(state) == hash(State.of([mesh]))
+    assert max(dr.width(value) for value in state.kept) <= 64
