@@ -183,7 +183,9 @@ def _chosen(row) -> str:
 
 def _pilot_share(row) -> float:
     """Share that pilots and decisions have of a scene's first render, whose pilots the others remember."""
-    first = row.get("seconds_pilot") or 0.0
+    first = row.get("seconds_pilot")
+    if first is None:
+        raise Refused("rows of a version that remembered no pilots")
     return first / (first + row["seconds"])
 
 
@@ -217,7 +219,7 @@ def choices_table(results: Results) -> str:
                 f"`{scene}`",
                 "; ".join(f"{text or 'no pilot'} ({count})" for text, count in chosen),
                 "; ".join(f"{s['class']}: {s['why']}" for s in left_out) or "–",
-                f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} %",
+                said(lambda rows=rows: f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} %", str),
                 _rays_per_sample(rows),
                 _rays_per_sample(results.of(scene, NONE, results.deciding)),
             ]

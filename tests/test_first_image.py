@@ -73,8 +73,8 @@ def test_calls_of_few_questions_and_of_all(monkeypatch):
 
 def test_pilots_of_rooms():
     """Rationale: in scenes of many BSDFs the pilot's kernel takes a second to compile, longer than a preview.
-    Expected: none is asked where 2^17 samples would be enough with fewer BSDFs, and it is said why; from 2^22
-    on one is, also there."""
+    Expected: none is asked where 2^17 samples are more than enough with fewer BSDFs, and it is said why; from
+    2^22 on one is, also there."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
     few, many = (mi.load_dict(room(n, 128)) for n in (bsdf.MANY - 2, bsdf.MANY))  # the lamp has one more
     assert len(integrator.decide(few, spp=8)) == 1
@@ -97,9 +97,9 @@ def test_bitmaps_do_not_cut_kernels(kernels):
 
 
 def test_decisions_share_kernels(kernels):
-    """Rationale: pilots of other seeds choose other numbers of light subpaths and coefficients, and compiling
-    a kernel anew takes as long as a preview. Expected: one kernel for all of them, and one for each kind of
-    connections."""
+    """Rationale: pilots of other scenes, and longer ones, choose other numbers of light subpaths and
+    coefficients, and compiling a kernel anew takes as long as a preview. Expected: one kernel for all of
+    them, and one for each kind of connections."""
     scene = mi.load_dict(room(2, 16))
     ways = [
         (1, 1 / 64, "none"),

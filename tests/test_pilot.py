@@ -101,7 +101,7 @@ def moments_of(target, lanes, rounds=1, **parameters):
 
 def made_of(base, rays, light=0.0):
     """Moments of this ``base``, of which points take nothing off, and of splats, alike for all weightings."""
-    none, gain = np.zeros_like(base), np.ones(base.shape[1])
+    none, gain, rays = np.zeros_like(base), np.ones(base.shape[1]), {"evenness": 0.0} | rays
     return moments.Moments(base, none, none + light, none, gain, 1.0, rays, 4096)
 
 
@@ -165,7 +165,7 @@ def test_choice(make, light, monkeypatch):
     """Expected: path tracing alone where nothing is to be gained, light subpaths where they pay, with the
     reason in ``skipped`` and ``explain``, for pilots of five seeds. (Under a sky a pilot is asked in long
     renders only; here in this one.)"""
-    monkeypatch.setattr(choice, "CHEAP_SAMPLES", 0)
+    monkeypatch.setattr(choice, "UNIFORM_SAMPLES", 0)
     target = make(128)
     integrator = bdpt()
     for seed in range(5):
@@ -460,7 +460,7 @@ def test_an_even_sky_decides_without_a_pilot(monkeypatch):
     """Expected: under a constant sky, or a map without bright spots, a short render traces camera subpaths
     alone, also one that is too short for a pilot; its record says so and can be replayed, and it is the sky
     scene of `path` in the mean. A sun in the map (the bright pixel is 200 times the mean), another emitter,
-    or a render of 2^24 samples needs a pilot.
+    or a render of 2^24 samples (2^20 where the sky is nearly uniform) needs a pilot.
     """
     for target, alone in (
         (sky(), True),
@@ -476,10 +476,19 @@ def test_an_even_sky_decides_without_a_pilot(monkeypatch):
         assert ("even sky" in integrator.explain(target, spp=4)) == alone
     monkeypatch.setattr(pilot, "measure", None)
     integrator = bdpt()
-    integrator.render(sky(), spp=1 << 13, develop=False)
+    integrator.render(sky(), spp=1 << 9, develop=False)
     assert integrator.statistics["decisions"][0]["coefficients"]["s=1"] == choice.SKY_DIRECT
     monkeypatch.undo()
-    assert choice.by_scene(of(sky()).world, of(sky()).plan, bdpt().settings, 1 << 24) is None
+    for target, samples in (
+        (sky(), choice.UNIFORM_SAMPLES),
+        (surroundings(bright=10.0), choice.CHEAP_SAMPLES),
+    ):
+        render = of(target)
+        asked = [
+            choice.by_scene(render.world, render.plan, bdpt().settings, n) is None
+            for n in (samples - 1, samples)
+        ]
+        assert asked == [False, True]
     for bright, kappa in ((1.5, choice.SKY_DIRECT), (10.0, 1.0)):  # a map worth sampling gets its full weight
         render = of(surroundings(bright=bright))
         made = choice.by_scene(render.world, render.plan, bdpt().settings, 1 << 14)
@@ -702,7 +711,7 @@ def test_bad_decisions(text, words):
 def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     """Rationale: a sky alone is seen directly, which pilots leave out; `explain` printed a
     table of equals beside a plan that was not the first of them. Expected: no decision, and no table."""
-    monkeypatch.setattr(choice, "CHEAP_SAMPLES", 0)
+    monkeypatch.setattr(choice, "UNIFORM_SAMPLES", 0)
     scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "sensor": camera(24)})
     integrator = bdpt()
     assert "time to the same error" not in integrator.explain(scene, spp=1024)
@@ -784,6 +793,17 @@ def test_the_same_kernel_where_it_hardly_matters():
         base[:, numbers[1]] = 1 / (faster * ratio)
         table = choice.choose(made_of(base, rays), possible, True)
         assert table[0].candidate.connections == chosen and len(table) == 2
+
+
+@pytest.mark.parametrize(("gain", "kappa"), [(1.05, 1 / 2), (1.2, 1 / 16)])
+def test_coefficients_under_a_nearly_uniform_sky(gain, kappa):
+    """Expected: 1/2, which such scenes have without a pilot, unless another one gains 1.1 (`UNIFORM_GAIN`)
+    over it; the coefficient 1, of the same variance as 1/2 here, is not taken."""
+    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+    base[:, 0] = 1 / gain
+    rays = {"camera": 1.0, "shadow_s1": 1.0, "evenness": 1 / choice.UNIFORM}
+    table = choice.choose(made_of(base, rays), [choice.Candidate(i, 1, "none") for i in range(3)], True)
+    assert table[0].candidate.direct == kappa and all(row.candidate.direct < 1 for row in table)
 
 
 def test_twice_the_light_subpaths_have_to_gain():
@@ -916,7 +936,7 @@ def test_loops_are_recorded_once(parameters, capfd):
 
 
 @pytest.mark.parametrize(
-    ("gain", "stratified", "kappa"), [(1.2, True, 1), (1.5, True, 1 / 4), (1.2, False, 1 / 4)]
+    ("gain", "stratified", "kappa"), [(1.2, True, 1), (1.5, True, 1 / 2), (1.2, False, 1 / 2)]
 )
 def test_coefficients_of_direct_light_have_to_gain_much(gain, stratified, kappa):
     """Rationale: what points leave of two strategies' variances is known to a fifth. Expected: with

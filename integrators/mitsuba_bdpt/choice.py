@@ -43,29 +43,32 @@ EVEN = 100
 # other even ones. Efficiency over path with multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in
 # `open_sky`, 1.02, 1.00, 0.95 in `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`. Error of
 # plastic and metal on a floor under maps of the ratios 1.05, 5.9, 13, with 1/2 over that with 1: 0.84, 1.06,
-# 1.06.
-SKY_DIRECT, UNIFORM = 1 / 2, 2
+# 1.06. From `UNIFORM_SAMPLES` on a pilot is asked whether another one gains `UNIFORM_GAIN` over it: with 24
+# seeds 0.8 to 1.2 for 1/16 in `open_sky`, 0.8 to 1.0 in `smallvcm_cornell_sky`, 1.0 to 1.9 (renders: 2.3) in
+# `furnace_white`.
+SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_GAIN = 1 / 2, 2, 1 << 20, 1.1
 
 SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
 # What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
-# it). Fitted to all candidates in 26 scenes on two cores: off by 6 % (root mean square) for the ratios of
-# their times, which scripts/candidates.py shows.
+# it). Fitted to candidates in 29 scenes on two cores (docs/choices.json): off by 6 % (root mean square) for
+# the ratios of their times.
 COSTS = {
-    "light_path": 1.6,  # to start a light subpath
-    "far": 3.5,  # beside it, to start one from infinity
-    "light": 0.8,  # each of its rays
-    "inner": 0.6,  # to look for connections at all, per sample
-    "joined": 0.55,  # a connection that is drawn and tested
+    "light_path": 1.7,  # to start a light subpath
+    "far": 2.0,  # beside it, to start one from infinity
+    "light": 0.76,  # each of its rays
+    "inner": 0.55,  # to look for connections at all, per sample
+    "joined": 0.65,  # a connection that is drawn and tested
     "shadow_inner": 0.65,  # each that is tested, where all are
-    "diverging": 0.55,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
+    "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }
 
 # Numbers of BSDFs from which on, and up to which, the lanes of a packet take turns in evaluating theirs.
 FEW_BSDFS, MANY_BSDFS = 4, 16
 
 
-# With stratified points a coefficient of s = 1 other than 1 has to gain this factor over path tracing alone:
+# With stratified points a coefficient of s = 1 other than 1 (under a nearly uniform sky: than `SKY_DIRECT`,
+# and then `UNIFORM_GAIN`) has to gain this factor over path tracing alone:
 # it evens out two strategies whose noise good points may take off anyway, and what a pilot of 4,096 samples
 # finds of that is off by a fifth.
 DIRECT_GAIN = 1.3
@@ -81,7 +84,7 @@ LIGHT_GAIN = 1.15
 MORE_GAIN = 1.02
 
 # Among candidates whose times are within this factor of the best, that comes first whose kernel is the first
-# of these: with other seeds the same kernel is taken, which need not be compiled again.
+# of these: pilots of other numbers of samples take the same kernel, which need not be compiled again.
 KERNEL_TIE = 1.05
 KERNELS = ("none", "one")
 
@@ -317,7 +320,8 @@ def by_scene(world, full: Plan, settings: Settings, samples: int) -> Decision | 
     would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky
     wherever its light enters, caustics included, and light subpaths hardly find the way in.)"""
     contrast = world.emitters.contrast
-    if samples >= CHEAP_SAMPLES or not contrast <= EVEN:  # also if it is no number
+    most = UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES
+    if samples >= most or not contrast <= EVEN:  # also if it is no number
         return None
     if all(candidate.light_paths for candidate in candidates(world, full, settings)):
         return None
@@ -390,18 +394,30 @@ def choose(moments: Moments, possible: list[Candidate], stratified: bool) -> lis
         if math.isfinite(v)
     ]
     if stratified:
-        alone = [row.variance for row in table if not row.candidate.light_paths and row.candidate.direct == 1]
-        most = min(alone, default=math.inf) / DIRECT_GAIN
-        table = [row for row in table if row.candidate.direct == 1 or row.variance <= most]
+        table = _without_doubtful(table, moments.rays["evenness"] * UNIFORM >= 1)
     table.sort(key=lambda row: row.time * MORE_GAIN ** -math.log2(row.candidate.served))
-    tied = [row for row in table if row.candidate.light_paths and row.time <= KERNEL_TIE * table[0].time]
+    least = min((row.time for row in table), default=0.0)
+    tied = [row for row in table if row.candidate.light_paths and row.time <= KERNEL_TIE * least]
     if tied:
         _put_first(table, min(tied, key=lambda row: KERNELS.index(row.candidate.connections)))
     # Path tracing alone before what is hardly better.
     alone = next((row for row in table if not row.candidate.light_paths), None)
-    if alone is not None and alone.time <= LIGHT_GAIN * min(row.time for row in table):
+    if alone is not None and alone.time <= LIGHT_GAIN * least:
         _put_first(table, alone)
     return table
+
+
+def _without_doubtful(table: list[Choice], uniform: bool) -> list[Choice]:
+    """Without the coefficients of s = 1 that gain too little over the usual one, see `DIRECT_GAIN`, under a
+    nearly ``uniform`` sky or another one."""
+    usual, gain = (SKY_DIRECT, UNIFORM_GAIN) if uniform else (1, DIRECT_GAIN)
+
+    def is_usual(candidate):
+        return bool(candidate.light_paths) or candidate.direct == usual
+
+    alone = (row.variance for row in table if not row.candidate.light_paths and is_usual(row.candidate))
+    most = min(alone, default=math.inf) / gain
+    return [row for row in table if is_usual(row.candidate) or row.variance <= most]
 
 
 def _put_first(table: list, row):
@@ -460,7 +476,7 @@ def left_out(table: list[Choice]) -> list[dict]:
     for name, lacks in without.items():
         others = [row for row in table if not lacks(row.candidate)]
         if others and lacks(table[0].candidate):
-            ratio = others[0].time / table[0].time
+            ratio = min(row.time for row in others) / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
             if ratio < 1:
                 why = f"in the pilot it gains {1 / ratio:.2f}x at most, and a prediction is off by as much"

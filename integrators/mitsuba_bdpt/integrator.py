@@ -216,7 +216,7 @@ def _make_class():
         def decide(self, scene, sensor=0, seed=0, spp=0):
             """What the pilot of such a render chooses, as in ``statistics["decisions"]``: an empty list
             without a pilot, about which ``statistics["no_pilot"]`` says why. The parameter ``decisions`` of
-            other renders of the scene takes it as JSON."""
+            other renders of the scene takes it as JSON. All ``seed``s decide alike."""
             check_made_for(self, scene)
             sensor = _resolve(scene, sensor)
             render = Render(scene, sensor, self.settings, seed, _samples(sensor, spp, self.settings))

@@ -1,4 +1,5 @@
-"""What is remembered of scenes from render to render: warnings that were said, what pilots found."""
+"""What is remembered of scenes from render to render: warnings that were said, what pilots and looks for lost
+light have found."""
 
 from __future__ import annotations
 
@@ -8,6 +9,9 @@ import mitsuba as mi
 
 # So many scenes, the latest ones.
 REMEMBERED = 64
+
+# Findings of a kind that are remembered of each scene, the latest ones.
+FINDINGS = 16
 
 _scenes: OrderedDict[int, tuple] = OrderedDict()
 
@@ -27,6 +31,17 @@ def notes(scene, sensor) -> dict:
     while len(_scenes) > REMEMBERED:
         _scenes.popitem(last=False)
     return found
+
+
+def remembered(scene, sensor, kind: str, key, find):
+    """What ``find()`` returned when it was last called for this ``key``, and whether it need not be called
+    now; of each ``kind`` the latest `FINDINGS` are kept."""
+    known = notes(scene, sensor).setdefault(kind, {})
+    is_known, found = key in known, known.pop(key, None)
+    known[key] = found = found if is_known else find()
+    while len(known) > FINDINGS:
+        del known[next(iter(known))]
+    return found, is_known
 
 
 def warn_once(scene, sensor, text: str, about=None):

@@ -83,7 +83,7 @@ class Weighting:
 
 # In this order: each class is in use from some weighting on.
 WEIGHTINGS = (
-    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 4, 1)),
+    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
     *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
     *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
 )
@@ -288,6 +288,8 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
     pilot.evaluate(counts)
     found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
     known = {"bsdfs": world.traits.asked.count, "far": world.emitters.far_share}
+    contrast = world.emitters.contrast
+    known["evenness"] = 1 / contrast if contrast < np.inf else 0.0  # also if it is no number
     return replace(found, rays=found.rays | known)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from .spread import restored, stored
 
 # Of what a snapshot holds; another number with every change of that.
-FORMAT = 3
+FORMAT = 4
 
 # What is added up where snapshots are joined, and what is kept as the first one has it.
 _SUMMED = ("counts", "compiled", "cached", "seconds", "compile_seconds", "pilot_seconds")
