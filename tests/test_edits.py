@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import choice, pilot
-from mitsuba_bdpt.edits import State
+from mitsuba_bdpt.edits import State, _checksum
 
 SPP = choice.LEAST_SAMPLES // 32**2
 
@@ -113,7 +113,7 @@ def test_edits_are_seen(name, traced):
 
 def test_two_edits_in_between_are_seen():
     """Rationale: Dr.Jit gives the numbers of freed arrays to others. Expected: after two edits in a row the
-    state is another, for small arrays, which are kept, and large ones, of which entries are looked at."""
+    state is another, for small arrays, which are kept, and large ones, whose contents count."""
     for entries in (3, 30_000):
         mesh = mi.Mesh("mesh", entries, 1)
         parameters = mi.traverse(mesh)
@@ -125,6 +125,53 @@ def test_two_edits_in_between_are_seen():
                 parameters.update()
             seen.add(State.of([mesh]))
         assert len(seen) == 20
+
+
+@pytest.mark.parametrize("entries", [65, 66, 4097, 100_001])
+@pytest.mark.parametrize("kind", ["Float", "UInt32", "Float16", "UInt8", "Bool"])
+def test_each_entry_counts(kind, entries):
+    """Expected: arrays that differ in one entry, the first, the last or another, have other checksums, and
+    an equal one has the same."""
+    numpy_kind = {"Float": np.float32, "Float16": np.float16, "UInt8": np.uint8, "Bool": bool}.get(
+        kind, np.uint32
+    )
+    values = (np.arange(entries) % 2).astype(numpy_kind)
+    made = getattr(dr.llvm, kind)
+    found = {_checksum(made(values))}
+    for place in (0, 1, entries // 2, entries - 1):
+        edited = values.copy()
+        edited[place] = not edited[place]
+        found.add(_checksum(made(edited)))
+    assert len(found) == 5 and _checksum(made(values)) in found
+
+
+def test_edits_of_inner_texels_are_seen(traced):
+    """Rationale: a lamp's bitmap of which four entries were looked at became a hundred thousand times as
+    bright between them, and the pilot of before chose no light subpaths. Expected: another pilot after an
+    edit of inner texels; none after one back and forth, since what was found of that bitmap is remembered."""
+    data = np.full((8, 8, 3), 0.05, dtype=np.float32)
+    texture = {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest"}
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 0.9, 0]).rotate([1, 0, 0], 90).scale(0.1),
+        "emitter": {"type": "area", "radiance": texture},
+    }
+    scene, integrator = cornell(lamp=lamp), bdpt()
+    integrator.render(scene, spp=SPP)
+    parameters = mi.traverse(scene)
+    for value, pilots in ((20000, 2), (0.05, 2), (20000, 2), (30000, 3)):
+        data[2:6, 2:6] = value
+        parameters["lamp.emitter.radiance.data"] = mi.TensorXf(data)
+        parameters.update()
+        integrator.render(scene, spp=SPP)
+        assert len(traced) == pilots
+
+
+def test_edits_in_place_are_seen():
+    mesh = bumpy()
+    parameters, before = mi.traverse(mesh), State.of([mesh])
+    dr.scatter(parameters["vertex_positions"], mi.Float(7), mi.UInt32(601))
+    assert State.of([mesh]) != before
 
 
 def test_nothing_large_is_kept():
