@@ -59,6 +59,11 @@ def kind_of(emitter) -> int:
 def _tells_its_points(emitter) -> bool:
     """Whether the points that the shape of an area light samples have a density and a radiance."""
     shape = emitter.get_shape()
+    if shape is None:
+        raise NotImplementedError(
+            f"bdpt: emitter {named(emitter)} is on a shape that Mitsuba does not tell (an ellipsoidsmesh); "
+            "use shape type ellipsoids, or a mesh"
+        )
     if shape.shape_type() in _CURVES:
         raise NotImplementedError(
             f"bdpt: emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "

@@ -4,8 +4,9 @@ delta surface) and is seen through glass.
 Such a path has no two neighbours that could be joined: lamp, delta surfaces, one other surface, delta
 surfaces, sensor. `plan.lost_paths` says where they are possible; here they are estimated as a photon map does
 it, by a few thousand subpaths from either end that take delta events alone. Paths with several other
-surfaces, no two of which are neighbours, are left out, and so is the lamp itself, seen in a mirror: what is
-lost is at least this.
+surfaces, no two of which are neighbours, are left out, and so is the lamp itself, seen in a mirror. The other
+surface is taken to reflect evenly what it reflects in all, glossy ones too: of these a single view shows more
+or less.
 """
 
 from __future__ import annotations
@@ -102,16 +103,19 @@ def is_possible(world, plan, settings) -> bool:
 
 def lamps_and_sensor(world) -> State:
     """What tells the scene's delta emitters and the sensor from themselves after an edit."""
-    lamps = [e for e in world.scene.emitters() if e.get_shape() is None and not e.is_environment()]
-    return State.of([*lamps, world.camera.sensor])
+    kinds = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
+    lamps = [e for e in world.scene.emitters() if mi.has_flag(e.flags(), kinds)]
+    shapes = [e.get_shape() for e in lamps if e.get_shape() is not None]
+    return State.of([*lamps, *shapes, world.camera.sensor])
 
 
 def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
     """Mean radiance over the film that is lost, by the index of the emitter; ``max_depth`` see
     `plan.Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says so, as of one
     that emits into directions that are: a render that does not make such paths may meet no such number
-    itself, and `suspects` is asked only if it did."""
-    total = np.zeros(len(world.scene.emitters()))
+    itself, and `suspects` is asked only if it did. Of several lamps together it is the brightest colour of
+    their sum, of which each has a part by its own brightest."""
+    total = np.zeros((len(world.scene.emitters()), len(mi.UnpolarizedSpectrum())))
     with nothing_freed(), step_by_step(world.emitters.evaluated):
         points, _, times = _seen(world, plan, max_depth).some()
         if points is None:
@@ -123,11 +127,15 @@ def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
             found = _meetings(photons, points, max_depth) * (times * more / SUBPATHS**2)
             lamps = dr.gather(mi.UInt32, lamp, index)
             dr.eval(found, lamps)
-            total += np.bincount(lamps.numpy(), found.numpy(), len(total))
-    finite = np.isfinite(total)
+            for colour, values in zip(total.T, found, strict=True):
+                colour += np.bincount(lamps.numpy(), values.numpy(), len(colour))
+    finite = np.isfinite(total).all(axis=1)
     if not finite.all():
         _warn_of_not_finite(world, np.flatnonzero(~finite))
-    return {int(i): float(total[i]) for i in np.flatnonzero(total) if finite[i]}
+    total = np.where(finite[:, None], total, 0)
+    single = total.max(axis=1)
+    single *= total.sum(axis=0).max() / max(single.sum(), np.finfo(float).tiny)
+    return {int(i): float(single[i]) for i in np.flatnonzero(single)}
 
 
 def _warn_of_not_finite(world, indices):
@@ -195,13 +203,6 @@ def _two(generator):
     return mi.Point2f(generator.next_float32(), generator.next_float32())
 
 
-def _brightness(value):
-    """A spectrum as a number, in the unit of `film.Accumulator.mean`, roughly; NaN if an entry is not
-    finite, since `dr.max` passes over those that are NaN."""
-    value = mi.unpolarized_spectrum(value)
-    return dr.select(bsdf.is_finite(value), dr.mean(value) if mi.is_spectral else dr.max(value), dr.nan)
-
-
 def _carried(value):
     """What a subpath carries: the colour, or in spectral variants the mean over the wavelengths in each of
     them, since those of the other end are others."""
@@ -266,7 +267,8 @@ def _follow(world, ray, weight, active, generator, max_depth, adjoint: bool) -> 
         both = active & smooth & delta
         here = active & smooth & (~both | (generator.next_float32() < 0.5))
         weight = dr.select(both, weight * 2, weight)
-        ends = dr.select(here, _end(si, surface, ray, weight, edges, distance, here), ends)
+        reflectance = _reflectance(si, surface, generator, here)
+        ends = dr.select(here, _end(si, surface, ray, weight, edges, distance, reflectance, here), ends)
         active = active & ~here & delta & (edges < last)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -289,7 +291,19 @@ def _nowhere() -> _Ends:
     return _Ends(mi.Point3f(0), mi.Normal3f(0), no, black, mi.UInt32(0), mi.Float(0), black, no)
 
 
-def _end(si, surface, ray, weight, edges, distance, active) -> _Ends:
+def _reflectance(si, surface, generator, active):
+    """What a surface reflects of all that arrives from where ``si`` is seen: known for diffuse ones, of
+    others one sample, whose mean it is."""
+    even = surface.eval_diffuse_reflectance(si, active)
+    flags = mi.BSDFFlags.Smooth
+    context = mi.BSDFContext(mi.TransportMode.Radiance, +flags)
+    _, glossy = surface.sample(context, si, generator.next_float32(), _two(generator), active)
+    diffuse = _has(surface, mi.BSDFFlags.Diffuse)
+    # Mitsuba's answer of BSDFs that do not know their own is a value in one direction, which has no bound.
+    return _carried(dr.select(diffuse, dr.minimum(even, 1), glossy))
+
+
+def _end(si, surface, ray, weight, edges, distance, reflectance, active) -> _Ends:
     """The end of a subpath at ``si``."""
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
@@ -302,7 +316,7 @@ def _end(si, surface, ray, weight, edges, distance, active) -> _Ends:
         weight=_carried(weight),
         edges=edges,
         distance=distance,
-        reflectance=_carried(surface.eval_diffuse_reflectance(si, active) * opacity),
+        reflectance=reflectance * opacity,
         active=active & seen,
     )
 
@@ -328,4 +342,4 @@ def _meetings(photons: _Ends, points: _Ends, max_depth):
     state = mi.UInt32(0), dr.zeros(mi.UnpolarizedSpectrum, dr.width(photons.p))
     _, total = dr.while_loop(state, lambda i, total: i < count, body, label="meetings")
     # One that meets nothing adds nothing, even if its weight is not finite.
-    return dr.select(bsdf.is_zero(total), 0, _brightness(total * photons.weight))
+    return dr.select(bsdf.is_zero(total), 0, total * photons.weight)

@@ -241,7 +241,7 @@ class Pilot:
         shares = _shares(size, c) | {"light": 0}
         often = (c.s == 2) & (shares["direct"] > 0)
         return [
-            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 1))))
+            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 0))))
             for w, square in zip(WEIGHTINGS, squares, strict=True)
         ]
 
