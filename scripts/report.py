@@ -465,12 +465,9 @@ def machine(results: Results) -> str:
     return f"{text}, source {main}{named}"
 
 
-def page(results: Results, made: dict, goals: list, notes: dict) -> str:
-    """The page of all tables, as Markdown."""
-    if unknown := sorted(set(notes) - set(results.scenes)):
-        raise ValueError(f"notes.toml: {unknown[0]!r} is not among the scenes")
-    parts = [
-        f"""# Benchmark
+def _introduction(results: Results) -> str:
+    """What the figures are, and where they were measured."""
+    return f"""# Benchmark
 
 Made by `python scripts/report.py` from the data beside it. Machine and versions: {machine(results)}.
 
@@ -483,7 +480,13 @@ seconds at the largest budget; seconds are those measured, so other budgets are 
 with 1 / time. Where seeds were added until an interval was narrow enough, it is slightly too narrow (it
 holds the median in 90 % of cases, not 95 %).
 """
-    ]
+
+
+def page(results: Results, made: dict, goals: list, notes: dict) -> str:
+    """The page of all tables, as Markdown."""
+    if unknown := sorted(set(notes) - set(results.scenes)):
+        raise ValueError(f"notes.toml: {unknown[0]!r} is not among the scenes")
+    parts = [_introduction(results)]
     if goals:
         parts.append(f"## Goals\n\n{goals_table(results, goals)}\n{tried_text(goals)}")
     parts.append(

@@ -925,6 +925,18 @@ REFUSED_PARTS = {
         lambda folder: {"lamp": curve(folder) | {"emitter": AREA_LIGHT}},
         "emitter '.*' is on a curve .*use a cylinder or a mesh",
     ),
+    "mesh of ellipsoids": (
+        lambda _: {
+            "lamp": {
+                "type": "ellipsoidsmesh",
+                "centers": mi.TensorXf(np.zeros((1, 3), dtype=np.float32)),
+                "scales": mi.TensorXf(np.full((1, 3), 0.3, dtype=np.float32)),
+                "quaternions": mi.TensorXf(np.array([[0, 0, 0, 1]], dtype=np.float32)),
+                "emitter": AREA_LIGHT,
+            }
+        },
+        "emitter '.*' is on a shape that Mitsuba does not tell .*use shape type ellipsoids, or a mesh",
+    ),
     "texture beside curve": (
         lambda folder: {"lamp": {"type": "cylinder", "emitter": CHECKS}, "curve": curve(folder)},
         "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
