@@ -308,19 +308,22 @@ def test_slopes_between_decisions():
 
 
 def test_choices_and_the_cost_of_the_pilot():
-    """Two renders chose light subpaths, one path tracing alone, which says why; 0.02 of 1 second."""
+    """Two renders chose light subpaths, one path tracing alone, which says why; the first one's pilot took
+    0.25 seconds beside 1. Rows that do not know what the pilot took have no share."""
     reason = {"class": "t<=1", "level": "not worth its cost here", "why": "1.5 times"}
     alone = {
         "decisions": json.dumps([{"light_paths": 0, "connections": "none"}]),
-        "statistics": json.dumps({"seconds": {"pilot": 0.02}, "skipped": [reason]}),
+        "statistics": json.dumps({"skipped": [reason]}),
     }
-    rows = [row(seed=1, **alone), row(seed=2), row(seed=3)]
+    rows = [row(seed=seed, seconds_pilot=0.25, **more) for seed, more in ((1, alone), (2, {}), (3, {}))]
     results = Results(rows, {"box": KNOWN}, {})
     found = cells(report.choices_table(results), "`box`")
     assert found[0] == "light_paths=1/4, connections=one (2); light_paths=0, connections=none (1)"
-    assert found[1] == "t<=1: 1.5 times" and found[2] == "2.0 %"
+    assert found[1] == "t<=1: 1.5 times" and found[2] == "20.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and found[4] == "–"
-    assert report.GOALS["pilot"](results, "box") == "2.0 % at 64 spp"
+    assert report.GOALS["pilot"](results, "box") == "20.0 % at 64 spp"
+    with pytest.raises(Refused, match="remembered no pilots"):
+        report.GOALS["pilot"](Results([row(seed=1)], {"box": KNOWN}, {}), "box")
 
 
 def test_what_a_biased_integrator_lacks_is_said():
