@@ -380,18 +380,19 @@ def test_lamps_of_several_colours_are_lost_together():
     assert max(coloured.values()) < 2 * min(coloured.values())
 
 
-def test_edits_of_directional_area_lamps_are_seen():
-    """Expected: the state of lamps is another after an edit of a `directionalarea`, which has a shape."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {"type": "perspective"},
-            "lamp": {"type": "rectangle", "emitter": {"type": "directionalarea", "radiance": 1.0}},
-        }
-    )
-    world = Render(scene, scene.sensors()[0], bdpt().settings, 0, 1).world
-    before, parameters = lost_light.lamps_and_sensor(world), mi.traverse(scene)
-    assert lost_light.lamps_and_sensor(world) == before
-    parameters["lamp.emitter.radiance.value"] = 0.0
+def test_edits_of_what_is_around_a_lamp_are_seen():
+    """Rationale: a glass ball that was moved below the lamp, or walls that were painted black, left the
+    share of before. Expected: after an edit that of a scene made so (the same subpaths, an image with noise:
+    within a tenth)."""
+    ball = {"type": "sphere", "center": [5, 3, 0], "radius": 0.5, "bsdf": {"type": "dielectric"}}
+    scene, integrator = scene_of(LAMPS["point"], ball=ball, floor=floor()), bdpt()
+    integrator.render(scene, spp=16)
+    assert sum(integrator.statistics["lost_light"].values()) == 0
+    parameters = mi.traverse(scene)
+    parameters["ball.to_world"] = mi.Transform4f().translate([0.5, 1, 0]).scale(0.5)
     parameters.update()
-    assert lost_light.lamps_and_sensor(world) != before
+    shares = []
+    for made in (scene, scene_of(LAMPS["point"], ball=ball | {"center": [0.5, 1, 0]}, floor=floor())):
+        integrator.render(made, spp=16)
+        shares.append(sum(integrator.statistics["lost_light"].values()))
+    assert shares[0] == pytest.approx(shares[1], rel=0.1) and shares[1] > 0.001

@@ -107,8 +107,7 @@ decide from the rest, and one message of Mitsuba's log (``Warn``) after the rend
 hold such numbers. One before the first render of a scene names BSDFs that reflect more light than they
 receive; one after it the lamps without area of whose light more than a hundredth of the image's is missing,
 because they shine through glass on what is seen through glass. ``statistics["lost_light"]`` has the estimated
-shares by the number of the emitter; what is lost is estimated at the first render, and again after edits of
-the lamps or the sensor, but not of what is around them.
+shares by the number of the emitter; what is lost is estimated at the first render, and again after edits.
 
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 

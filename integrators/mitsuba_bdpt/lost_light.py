@@ -18,7 +18,6 @@ import mitsuba as mi
 import numpy as np
 
 from . import bsdf, rays
-from .edits import State
 from .kernel import Shared
 from .notices import warn_once
 from .objects import nothing_freed, step_by_step
@@ -99,14 +98,6 @@ class _Ends:
 def is_possible(world, plan, settings) -> bool:
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
     return not plan.arrival and bool(lost_paths(world, plan, settings))
-
-
-def lamps_and_sensor(world) -> State:
-    """What tells the scene's delta emitters and the sensor from themselves after an edit."""
-    kinds = mi.EmitterFlags.DeltaPosition | mi.EmitterFlags.DeltaDirection
-    lamps = [e for e in world.scene.emitters() if mi.has_flag(e.flags(), kinds)]
-    shapes = [e.get_shape() for e in lamps if e.get_shape() is not None]
-    return State.of([*lamps, *shapes, world.camera.sensor])
 
 
 def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
