@@ -67,10 +67,10 @@ COSTS = {
 FEW_BSDFS, MANY_BSDFS = 4, 16
 
 
-# With stratified points a coefficient of s = 1 other than 1 (under a nearly uniform sky: than `SKY_DIRECT`,
-# and then `UNIFORM_GAIN`) has to gain this factor over path tracing alone:
-# it evens out two strategies whose noise good points may take off anyway, and what a pilot of 4,096 samples
-# finds of that is off by a fifth.
+# With stratified points a coefficient of s = 1 other than 1 (under a nearly uniform sky: other than
+# `SKY_DIRECT`, and then `UNIFORM_GAIN`) has to gain this factor over path tracing alone: it evens out two
+# strategies whose noise good points may take off anyway, and what a pilot of 4,096 samples finds of that is
+# off by a fifth.
 DIRECT_GAIN = 1.3
 
 # Light subpaths have to gain this factor over path tracing alone: predictions are off by as much, and who

@@ -20,8 +20,8 @@ class State:
     """The parameters of Mitsuba's objects at one time; equal to a later one, also as a key, if nothing was
     edited in between.
 
-    ``marks``: small arrays of Dr.Jit by their number, larger ones by a checksum of their contents, all else
-    by its text. ``kept``: the small arrays.
+    ``marks``: small arrays of Dr.Jit by their number, transformations too, larger ones by a checksum of
+    their contents, all else by its text. ``kept``: what is known by its number.
     """
 
     marks: tuple
@@ -35,7 +35,7 @@ class State:
             indices = dr.detail.collect_indices(value)
             if not indices:
                 marks.append(repr(value))
-            elif dr.width(value) <= KEPT:
+            elif dr.width(value) <= KEPT or not dr.is_array_v(value):
                 marks += indices
                 kept.append(dr.copy(value))
             else:
