@@ -3,6 +3,7 @@
 import re
 import runpy
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import mutants
 import numpy as np
 import pytest
 import reference
+import versus
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -85,6 +87,9 @@ def by_user(monkeypatch, script, *arguments):
         ("sweep.py nowhere.toml", "nowhere.toml"),
         ("sweep.py words.toml", "words.toml is not TOML"),
         (f"sweep.py {SCRIPTS.parent / 'presets' / 'small.toml'} -o words.toml", "words.toml"),
+        ("versus.py nowhere", "checkout=nowhere has no integrators/mitsuba_bdpt; give a clone or a worktree"),
+        (f"versus.py {SCRIPTS.parent} --scenes nowhere", "scene='nowhere' is not in scenes/"),
+        (f"versus.py {SCRIPTS.parent} --parameters skip=some", "bdpt: skip='some' is not known"),
     ],
 )
 def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, message):
@@ -120,6 +125,8 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
         "strategies.py x --seed -1",
         "strategies.py x --resolution -8",
         "strategies.py x --exposure nan",
+        "versus.py x --spp 0",
+        "versus.py x --pairs 0.5",
     ],
 )
 def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command):
@@ -268,3 +275,27 @@ def test_equal_time_of_a_scene_file(here, capsys):
     assert "bdpt, 2 spp" in capsys.readouterr().out
     with pytest.raises(ValueError, match="has 4 x 4 pixels, the film of 'room.xml' 8 x 8"):
         equal_time.main([*arguments, "wrong.exr"])
+
+
+def test_two_checkouts_are_compared(tmp_path, capsys):
+    """Expected: this checkout makes the same images as itself; one in which light subpaths are a hundredth as
+    bright does not, and that is the exit status."""
+    other = tmp_path / "other"
+    shutil.copytree(SCRIPTS.parent / "integrators", other / "integrators")
+    options = ["--scenes", "ring_caustic", "--spp", "4", "--pairs", "1", "--same"]
+    assert versus.main([str(other), *options]) == 0
+    connect = other / "integrators" / "mitsuba_bdpt" / "connect.py"
+    text = connect.read_text()
+    connect.write_text(text.replace("def splat(", "def _splat(") + DIMMED)
+    assert versus.main([str(other), *options]) == 1
+    first, second = [line for line in capsys.readouterr().out.splitlines() if "ring_caustic" in line]
+    assert float(first.split("|")[2]) < 1e-4 < float(second.split("|")[2])
+
+
+DIMMED = """
+
+def splat(*args):
+    c, position = _splat(*args)
+    c.value *= 0.01
+    return c, position
+"""

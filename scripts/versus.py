@@ -1,0 +1,165 @@
+"""Two checkouts of the plugin on the same scenes: are images the same, and which takes longer?
+
+    git worktree add ../before v0.1.0
+    python scripts/versus.py ../before                                 # all scenes of the benchmark
+    python scripts/versus.py ../before --scenes pool veach_mis --spp 16 --pairs 12
+    python scripts/versus.py ../before --parameters skip=none          # instead of the default
+
+Each checkout renders in a process of its own, in turns, the scenes of this one at 128^2, warm. For each
+scene: the largest difference of two values of the same seed, over the image's mean (sums of floats in another
+order: below 1e-4); time, error (trimmed of the worst 0.1 %) and raw error of this checkout over the other's,
+medians over pairs of seeds for time and ratios of means for errors; their products; what the other one
+decided, and this one. The exit status is 1 with ``--same`` if an image differs by more than 1e-4 of its mean
+or a decision does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import numpy as np
+import reference
+from metrics import TRIM, rel_mse
+from mistakes import answered
+from mitsuba_bdpt.__main__ import number
+from tables import table
+
+import mitsuba as mi  # isort: skip
+
+HERE = Path(__file__).resolve().parents[1]
+
+# Of an image's mean: what sums of floats differ by in another order.
+ROUNDING = 1e-4
+
+# What each process runs: it answers each line of its input with one.
+CHILD = """
+import json, sys, time
+import mitsuba_bdpt, mitsuba as mi, drjit as dr, numpy as np
+mi.set_variant('llvm_ad_rgb')
+for line in sys.stdin:
+    asked = json.loads(line)
+    if 'scene' in asked:
+        scene = mi.load_file(asked['scene'], resolution=asked['resolution'])
+        bdpt = mi.load_dict(asked['integrator'])
+        bdpt.render(scene, seed=1 << 20, spp=asked['spp'])
+        answer = mitsuba_bdpt.__file__
+    else:
+        dr.sync_thread(); started = time.perf_counter()
+        image = np.array(bdpt.render(scene, seed=asked['seed'], spp=asked['spp']))[..., :3]
+        seconds = time.perf_counter() - started
+        np.save(asked['image'], image)
+        made = [[d['light_paths'], d['connections'], d['coefficients']] for d in bdpt.statistics['decisions']]
+        answer = [seconds, made]
+    print(json.dumps(answer), flush=True)
+"""
+
+
+class Checkout:
+    """A process that renders with the plugin of the checkout in a folder; raises ``ValueError`` if there is
+    none."""
+
+    def __init__(self, folder: Path, images: Path):
+        sources = folder / "integrators"
+        if not (sources / "mitsuba_bdpt" / "__init__.py").exists():
+            raise ValueError(f"checkout={folder} has no integrators/mitsuba_bdpt; give a clone or a worktree")
+        self._image, self._sources = images / f"{len(list(images.iterdir()))}.npy", sources.resolve()
+        self._image.touch()
+        environment = os.environ | {"PYTHONPATH": str(self._sources)}
+        command = [sys.executable, "-c", CHILD]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, env=environment, text=True, stdin=pipe, stdout=pipe)
+
+    def _ask(self, **what):
+        self._process.stdin.write(json.dumps(what) + "\n")
+        self._process.stdin.flush()
+        answer = self._process.stdout.readline()
+        if not answer:
+            raise RuntimeError(f"the process of {self._sources} has ended; its error stands above")
+        return json.loads(answer)
+
+    def load(self, name: str, integrator: dict, spp: int):
+        """Load a scene and compile."""
+        scene = str(reference.SCENES / f"{name}.xml")
+        found = self._ask(scene=scene, resolution=reference.RESOLUTION, integrator=integrator, spp=spp)
+        if not Path(found).is_relative_to(self._sources):
+            raise RuntimeError(f"{found} was imported in place of {self._sources}")
+
+    def render(self, seed: int, spp: int) -> tuple[np.ndarray, float, list]:
+        """Image, seconds, decisions."""
+        seconds, made = self._ask(seed=seed, spp=spp, image=str(self._image))
+        return np.load(self._image).astype(np.float64), seconds, made
+
+    def close(self):
+        """End the process."""
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def line(name: str, sides: list[Checkout], parameters: dict, spp: int, pairs: int) -> tuple[list[str], bool]:
+    """A scene's line of the table, and whether both checkouts made the same."""
+    depth = reference.benchmark_depth(name)
+    expected = reference.load_reference(name, reference.RESOLUTION, depth).image
+    for side in sides:
+        side.load(name, {"type": "bdpt", "max_depth": depth} | parameters, spp)
+    apart, rows, same = 0.0, [], True
+    for seed in range(pairs):
+        turn = [0, 1] if seed % 2 else [1, 0]
+        found = {number: sides[number].render(seed, spp) for number in turn}
+        (old, old_seconds, before), (new, new_seconds, now) = found[0], found[1]
+        apart = max(apart, np.abs(new - old).max() / old.mean())
+        same &= before == now
+        errors = [rel_mse(image, expected, trim) for trim in (TRIM, 0.0) for image in (old, new)]
+        rows.append([new_seconds / old_seconds, *errors])
+    rows = np.array(rows)
+    time, (old, new, old_raw, new_raw) = np.median(rows[:, 0]), rows[:, 1:].mean(axis=0)
+    figures = [time, new / old, new_raw / old_raw, time * new / old, time * new_raw / old_raw]
+    decided = " → ".join(_named(made) for made in (before, now))
+    return [f"`{name}`", f"{apart:.1g}", *(f"{x:.3g}" for x in figures), decided], bool(
+        same and apart < ROUNDING
+    )
+
+
+def _named(decisions: list) -> str:
+    if not decisions:
+        return "–"
+    share, connections, _ = decisions[-1]
+    return f"1/{round(1 / share)} {connections}" if share else "0"
+
+
+def main(arguments=None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("checkout", type=Path, help="the folder of the other one")
+    parser.add_argument("--scenes", nargs="+", help="names in scenes/ that have references")
+    parser.add_argument("--parameters", nargs="+", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--spp", type=number(int, 1), default=64)
+    parser.add_argument("--pairs", type=number(int, 1), default=8)
+    parser.add_argument("--same", action="store_true", help="fail unless images and decisions are the same")
+    options = parser.parse_args(arguments)
+    mi.set_variant("llvm_ad_rgb")
+    reference.integrator_of(" ".join(["bdpt", *options.parameters]), 1)  # checks the parameters
+    parameters = dict(map(reference.property_, options.parameters))
+    names = options.scenes or reference.read_toml(reference.BENCHMARK)["scenes"]
+    for name in names:
+        reference.benchmark_depth(name)  # known before anything is rendered
+    head = ["scene", "apart", "time", "error", "raw error", "time · error", "time · raw error", "decided"]
+    with tempfile.TemporaryDirectory() as folder:
+        sides = [Checkout(checkout, Path(folder)) for checkout in (options.checkout, HERE)]
+        lines = [line(name, sides, parameters, options.spp, options.pairs) for name in names]
+        for side in sides:
+            side.close()
+    print(table(head, [cells for cells, _ in lines]))
+    return int(options.same and not all(same for _, same in lines))
+
+
+if __name__ == "__main__":
+    sys.exit(answered(main))
