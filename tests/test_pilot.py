@@ -806,6 +806,26 @@ def test_coefficients_under_a_nearly_uniform_sky(gain, kappa):
     assert table[0].candidate.direct == kappa and all(row.candidate.direct < 1 for row in table)
 
 
+def test_recording_counts_in_short_renders():
+    """Rationale: in previews most of the time is that of recording the kernel, twice as long with light
+    subpaths. Expected: with half the variance for a third more per sample light subpaths are taken for a
+    million samples, and not for 2^16, whose cost is that of the samples and of what is fixed."""
+    light = pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, 0))
+    alone = pilot.WEIGHTINGS.index(ALONE)
+    possible = [choice.Candidate(alone, 1, "none"), choice.Candidate(light, 16, "none")]
+    rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0, "far": 0.0}
+    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+    base[:, light] = 0.5
+    for samples, lit in ((1 << 20, True), (1 << 16, False)):
+        table = choice.choose(made_of(base, rays), possible, True, samples)
+        assert bool(table[0].candidate.light_paths) == lit
+    fixed = choice.FIXED
+    extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16
+    expected = 1 + (extra + fixed["light"] / 2**16) / (4 + fixed["start"] / 2**16)
+    assert choice.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
+    assert choice.cost(possible[0], rays, 1 << 16) == 1 == choice.cost(possible[0], rays)
+
+
 def test_twice_the_light_subpaths_have_to_gain():
     """Rationale: along S the product of time and variance is flat, and pilots of other seeds wander on it.
     Expected: of four and two camera subpaths per light subpath the four, where two gain 1.01, and two where

@@ -94,8 +94,8 @@ def test_pilots_and_decisions_go_on(monkeypatch, blind):
     monkeypatch.setattr(choice, "LEAST_SAMPLES", 0)
     original = choice.choose
 
-    def changing(moments, possible, stratified):
-        table, number = original(moments, possible, stratified), moments.lanes // choice.LEAST_LANES
+    def changing(moments, *others):
+        table, number = original(moments, *others), moments.lanes // choice.LEAST_LANES
         return table[number % 2 :] if number > blind else []
 
     monkeypatch.setattr(choice, "choose", changing)
