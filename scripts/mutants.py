@@ -64,7 +64,7 @@ MUTANTS = (
     Mutant(
         "pilots of an edited scene",
         "rendering.py",
-        "key = self._state(), self.settings",
+        "key = self._scene_state(), self.settings",
         "key = self.settings",
         ("tests/test_edits.py::test_edits_are_seen",),
     ),

@@ -142,7 +142,7 @@ class Render:
     def _pilot(self, count: int, stands_for: float) -> Moments:
         """What the next pilot of ``count`` samples finds, see `pilot.measure`. Where the same one was traced
         in an earlier render, and nothing was edited since, that is remembered: it would find the same."""
-        key = self._state(), self.settings, self.pilot_seed, self._pilots, count, stands_for
+        key = self._scene_state(), self.settings, self.pilot_seed, self._pilots, count, stands_for
 
         def trace() -> Moments:
             seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT_SEQUENCE + self._pilots)
@@ -156,7 +156,7 @@ class Render:
         self._remembered += is_known
         return found
 
-    def _state(self) -> tuple:
+    def _scene_state(self) -> tuple:
         """What tells scene and sensor from themselves after an edit."""
         return State.of([self.world.scene, self.sensor]), self.world.camera.region.border
 
@@ -454,7 +454,7 @@ class Render:
         words, which are empty where it is little. Looked for once for a scene and choice, until an edit."""
         if not self.accumulator.passes or not lost_light.is_possible(self.world, self.plan, self.settings):
             return {}, ""
-        key = self._state(), self.plan.splat, self.plan.direct, self.settings.max_depth
+        key = self._scene_state(), self.plan.splat, self.plan.direct, self.settings.max_depth
         look = partial(lost_light.lost_radiance, self.world, self.plan, self.settings.max_depth)
         lost, _ = remembered(self.world.scene, self.sensor, "lost light", key, look)
         whole = number(self.accumulator.mean()) + sum(lost.values())
