@@ -52,6 +52,13 @@ MUTANTS = (
         ("tests/test_edits.py::test_two_edits_in_between_are_seen",),
     ),
     Mutant(
+        "scenes that are gone are remembered",
+        "notices.py",
+        "        del _scenes[number]  # its scene is gone",
+        "        pass",
+        ("tests/test_edits.py::test_scenes_that_are_gone_are_forgotten",),
+    ),
+    Mutant(
         "contents of large arrays do not count",
         "edits.py",
         "zlib.crc32(data.view(np.uint8))",

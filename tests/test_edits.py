@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import choice, pilot
+from mitsuba_bdpt import choice, notices, pilot
 from mitsuba_bdpt.edits import State, _checksum
 
 SPP = choice.LEAST_SAMPLES // 32**2
@@ -184,3 +184,18 @@ def test_nothing_large_is_kept():
     state = State.of([mesh])
     assert state == State.of([mesh]) and hash(state) == hash(State.of([mesh]))
     assert max(dr.width(value) for value in state.kept) <= 64
+
+
+def test_scenes_that_are_gone_are_forgotten():
+    """Rationale: what is remembered of them holds variables of Dr.Jit. Expected: with six scenes that were
+    rendered and are gone as many are known as before; one that lives is not forgotten meanwhile."""
+    scene, integrator = cornell(), bdpt()
+    integrator.render(scene, spp=SPP)
+    before, others = len(notices._scenes), [cornell() for _ in range(6)]
+    for other in others:
+        integrator.render(other, spp=SPP)
+    assert len(notices._scenes) >= before + 6
+    del other, others
+    integrator.render(scene, spp=SPP)
+    assert len(notices._scenes) <= before
+    assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}

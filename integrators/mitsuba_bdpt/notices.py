@@ -3,7 +3,9 @@ light have found."""
 
 from __future__ import annotations
 
+import sys
 from collections import OrderedDict
+from functools import cache
 
 import mitsuba as mi
 
@@ -23,6 +25,8 @@ def notes(scene, sensor) -> dict:
     others. Another one may lie where it was: what tells them apart is the filter of its sensor's film, which
     is small enough to be kept.
     """
+    for number in [n for n, held in _scenes.items() if _references(held) <= _alone()]:
+        del _scenes[number]  # its scene is gone
     mark = next(iter(scene.sensors()), sensor).film().rfilter()
     known, found = _scenes.pop(id(scene), (None, None))
     if known is not mark:
@@ -31,6 +35,17 @@ def notes(scene, sensor) -> dict:
     while len(_scenes) > REMEMBERED:
         _scenes.popitem(last=False)
     return found
+
+
+def _references(held: tuple) -> int:
+    """How many there are to the filter in an entry of `_scenes`; a film counts as one."""
+    return sys.getrefcount(held[0])
+
+
+@cache
+def _alone() -> int:
+    """`_references` where no film is left."""
+    return _references((mi.load_dict({"type": "box"}), {}))
 
 
 def remembered(scene, sensor, kind: str, key, find):
