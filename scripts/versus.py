@@ -21,6 +21,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
@@ -98,8 +99,7 @@ class Checkout:
 
     def close(self):
         """End the process."""
-        self._process.stdin.close()
-        self._process.wait()
+        self._process.communicate()
 
 
 def line(name: str, sides: list[Checkout], parameters: dict, spp: int, pairs: int) -> tuple[list[str], bool]:
@@ -152,11 +152,12 @@ def main(arguments=None) -> int:
     for name in names:
         reference.benchmark_depth(name)  # known before anything is rendered
     head = ["scene", "apart", "time", "error", "raw error", "time · error", "time · raw error", "decided"]
-    with tempfile.TemporaryDirectory() as folder:
-        sides = [Checkout(checkout, Path(folder)) for checkout in (options.checkout, HERE)]
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        sides = [
+            stack.enter_context(closing(Checkout(checkout, Path(folder))))
+            for checkout in (options.checkout, HERE)
+        ]
         lines = [line(name, sides, parameters, options.spp, options.pairs) for name in names]
-        for side in sides:
-            side.close()
     print(table(head, [cells for cells, _ in lines]))
     return int(options.same and not all(same for _, same in lines))
 
