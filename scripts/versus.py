@@ -47,7 +47,7 @@ mi.set_variant('llvm_ad_rgb')
 for line in sys.stdin:
     asked = json.loads(line)
     if 'scene' in asked:
-        scene = mi.load_file(asked['scene'], resolution=asked['resolution'])
+        scene = mi.load_file(asked['scene'], parallel=False, **asked['definitions'])
         bdpt = mi.load_dict(asked['integrator'])
         bdpt.render(scene, seed=1 << 20, spp=asked['spp'])
         answer = mitsuba_bdpt.__file__
@@ -58,7 +58,7 @@ for line in sys.stdin:
         np.save(asked['image'], image)
         made = [[d['light_paths'], d['connections'], d['coefficients']] for d in bdpt.statistics['decisions']]
         answer = [seconds, made]
-    print(json.dumps(answer), flush=True)
+    print('ANSWER', json.dumps(answer), flush=True)
 """
 
 
@@ -80,15 +80,17 @@ class Checkout:
     def _ask(self, **what):
         self._process.stdin.write(json.dumps(what) + "\n")
         self._process.stdin.flush()
-        answer = self._process.stdout.readline()
-        if not answer:
-            raise RuntimeError(f"the process of {self._sources} has ended; its error stands above")
-        return json.loads(answer)
+        for text in self._process.stdout:
+            _, found, answer = text.partition("ANSWER ")  # the rest is what Mitsuba logs
+            if found:
+                return json.loads(answer)
+        raise RuntimeError(f"the process of {self._sources} has ended; its error stands above")
 
     def load(self, name: str, integrator: dict, spp: int):
         """Load a scene and compile."""
-        scene = str(reference.SCENES / f"{name}.xml")
-        found = self._ask(scene=scene, resolution=reference.RESOLUTION, integrator=integrator, spp=spp)
+        scene = reference.scene_file(name)
+        definitions = reference.in_proportion(scene, {"resolution": reference.RESOLUTION})
+        found = self._ask(scene=str(scene), definitions=definitions, integrator=integrator, spp=spp)
         if not Path(found).is_relative_to(self._sources):
             raise RuntimeError(f"{found} was imported in place of {self._sources}")
 
@@ -157,7 +159,10 @@ def main(arguments=None) -> int:
             stack.enter_context(closing(Checkout(checkout, Path(folder))))
             for checkout in (options.checkout, HERE)
         ]
-        lines = [line(name, sides, parameters, options.spp, options.pairs) for name in names]
+        lines = []
+        for name in names:
+            lines.append(line(name, sides, parameters, options.spp, options.pairs))
+            print("  ".join(lines[-1][0]), file=sys.stderr, flush=True)
     print(table(head, [cells for cells, _ in lines]))
     return int(options.same and not all(same for _, same in lines))
 
