@@ -24,7 +24,8 @@ import drjit as dr
 import metrics
 import reference
 from mistakes import answered
-from mitsuba_bdpt import choice, pilot, rendering
+from mitsuba_bdpt.planning import choice, moments, pilot
+from mitsuba_bdpt.run import rendering
 from reference import RESOLUTION, benchmark_depth
 from timing import timed
 
@@ -51,7 +52,7 @@ def candidate(share: float, connections: str, splat: float) -> choice.Candidate:
     return choice.Candidate(pilot.WEIGHTINGS.index(weighting), round(1 / share) if share else 1, connections)
 
 
-def predicted(scene, settings) -> pilot.Moments:
+def predicted(scene, settings) -> moments.Moments:
     """What several pilots of the scene find."""
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     found = None

@@ -33,7 +33,8 @@ import numpy as np
 import reference
 from metrics import TRIM, rel_mse
 from mistakes import answered
-from mitsuba_bdpt import choice, pilot, rendering
+from mitsuba_bdpt.planning import choice, pilot
+from mitsuba_bdpt.run import rendering
 from tables import table
 
 import mitsuba as mi  # isort: skip

@@ -21,7 +21,7 @@ import reference
 from analysis import Refused
 from metrics import TRIM, rel_mse
 from mistakes import answered
-from mitsuba_bdpt.__main__ import number
+from mitsuba_bdpt.cli.arguments import number
 from reference import RESOLUTION, benchmark_depth
 from tables import table
 from timing import timed

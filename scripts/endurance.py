@@ -31,9 +31,9 @@ import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import reference
 from mistakes import answered
-from mitsuba_bdpt import __main__ as command
-from mitsuba_bdpt.mis import HEURISTICS
-from mitsuba_bdpt.render import INTERRUPTED
+from mitsuba_bdpt.cli import arguments as command
+from mitsuba_bdpt.cli.render import INTERRUPTED
+from mitsuba_bdpt.settings import HEURISTICS
 from report import replace_part, write_text
 from tables import table
 

@@ -33,7 +33,7 @@ import recording
 import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon
 from mistakes import answered
-from mitsuba_bdpt.__main__ import number
+from mitsuba_bdpt.cli.arguments import number
 from reference import benchmark_depth
 from tables import table
 

@@ -22,10 +22,12 @@ import mitsuba as mi  # isort: skip
 import drjit as dr
 import reference
 from mistakes import answered
-from mitsuba_bdpt import passes, points, rendering, sinks
-from mitsuba_bdpt.__main__ import number
-from mitsuba_bdpt.kernel import trace
-from mitsuba_bdpt.objects import step_by_step
+from mitsuba_bdpt.cli.arguments import number
+from mitsuba_bdpt.host.jit import step_by_step
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.run import rendering, schedule
+from mitsuba_bdpt.sampling import points
+from mitsuba_bdpt.transport.kernel import trace
 
 SPP = 16
 
@@ -75,14 +77,14 @@ class Pass:
         integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
         self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
         self._render.decide()
-        self._batch = passes.batches(self._render.world.camera, 0, SPP, integrator.settings)[0]
+        self._batch = schedule.batches(self._render.world.camera, 0, SPP, integrator.settings)[0]
 
     def trace(self):
         """Trace the pass as one kernel."""
         render = self._render
         seed = dr.opaque(mi.UInt32, 1)
         drawn = points.Points(render.settings.points, seed)
-        counts = trace(render.kernel, sinks.Image(render.accumulator), self._batch, drawn, SPP)
+        counts = trace(render.kernel, sink.Image(render.accumulator), self._batch, drawn, SPP)
         render.accumulator.evaluate(counts)
 
     def rays(self) -> list:

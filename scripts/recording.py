@@ -18,7 +18,12 @@ import numpy as np
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
-from mitsuba_bdpt import bsdf, connect, emitters, kernel, rendering, sinks  # isort: skip
+from mitsuba_bdpt.transport import bsdf, kernel  # isort: skip
+from mitsuba_bdpt.emitters import emitters  # isort: skip
+from mitsuba_bdpt.run import rendering  # isort: skip
+from mitsuba_bdpt.image import sink  # isort: skip
+from mitsuba_bdpt.geometry import rays  # isort: skip
+from mitsuba_bdpt.transport import connections  # isort: skip
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -53,7 +58,7 @@ class Outlier:
     t: int
 
 
-class Collector(sinks.Image):
+class Collector(sink.Image):
     """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel). Raises
     ``ValueError`` for a launch of too many ``lanes``."""
 
@@ -316,7 +321,7 @@ class Recorder:
             found.append(c)
             return total
 
-        connect.connect_all(traced, z, lane.path, dict(counters), total, add)
+        connections.connect_all(traced, z, lane.path, dict(counters), total, add)
         if traced.plan.connections == "all":
             for c in found:
                 total = self.add(traced, c, total, start, lane.shared)
@@ -342,9 +347,9 @@ class Recorder:
             ends.append(self._numbers(end, 3))
             return original(anchor, end, like)
 
-        original = connect.rays.segment_to
-        with mock.patch.object(connect.rays, "segment_to", segment_to):
-            value = connect.connect_one(traced, z, lane.path, stream, counters)
+        original = rays.segment_to
+        with mock.patch.object(rays, "segment_to", segment_to):
+            value = connections.connect_one(traced, z, lane.path, stream, counters)
         return value, ends[-1]
 
     def end(self, traced, lane, sample, total, seen, counters):

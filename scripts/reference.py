@@ -47,12 +47,12 @@ from metrics import (
 from mistakes import answered
 
 import mitsuba as mi  # isort: skip
-from mitsuba_bdpt import files, render  # isort: skip
-from mitsuba_bdpt.__main__ import number, property_  # isort: skip
-from mitsuba_bdpt.checkpoints import named_files  # isort: skip
-from mitsuba_bdpt.files import replacing  # isort: skip
-from mitsuba_bdpt.loading import in_proportion  # isort: skip
-from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
+from mitsuba_bdpt.cli import files, render  # isort: skip
+from mitsuba_bdpt.cli.arguments import number, property_  # isort: skip
+from mitsuba_bdpt.cli.checkpoints import named_files  # isort: skip
+from mitsuba_bdpt.cli.files import replacing  # isort: skip
+from mitsuba_bdpt.cli.loading import in_proportion  # isort: skip
+from mitsuba_bdpt.run.rendering import raise_interrupt  # isort: skip
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCES = ROOT / "references"
@@ -262,7 +262,7 @@ def scene_digest(name: str) -> str:
 
 def source_digest() -> str:
     """SHA-256 of the plugin's source files, shortened."""
-    return digest(*sorted(Path(mitsuba_bdpt.__file__).parent.glob("*.py")))[:12]
+    return digest(*sorted(Path(mitsuba_bdpt.__file__).parent.rglob("*.py")))[:12]
 
 
 class Halves:

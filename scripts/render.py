@@ -3,7 +3,7 @@
 import sys
 
 try:
-    from mitsuba_bdpt.__main__ import main
+    from mitsuba_bdpt.cli.arguments import main
 except ImportError as error:
     sys.exit(f"error: {error}\n(`make render` sets up a Python environment that has all it needs.)")
 

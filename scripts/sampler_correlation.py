@@ -28,7 +28,7 @@ from reference import RESOLUTION, load_reference, load_scene
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
-from mitsuba_bdpt.points import SAMPLER_TABLE, Points  # isort: skip
+from mitsuba_bdpt.sampling.points import SAMPLER_TABLE, Points  # isort: skip
 
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 COUNTS = (4, 16, 64)

@@ -38,15 +38,19 @@ def tutorial() -> str:
 
 def module(path: Path) -> str:
     """The page of a module."""
-    name = "mitsuba_bdpt" if path.stem == "__init__" else f"mitsuba_bdpt.{path.stem}"
-    return f"# {path.stem}\n\n::: {name}\n"
+    name = ".".join(["mitsuba_bdpt", *path.relative_to(PACKAGE).with_suffix("").parts])
+    return f"# {path.stem}\n\n::: {name.removesuffix('.__init__')}\n"
 
 
 def on_files(files, config):
     """Add the pages."""
     pages = {"index.md": readme(), "tutorial.md": tutorial()}
-    names = sorted(path for path in PACKAGE.glob("*.py") if path.stem != "_version")
-    pages |= {f"api/{path.stem.strip('_')}.md": module(path) for path in names}
+    paths = [path for path in sorted(PACKAGE.rglob("*.py")) if path.stem not in ("_version", "__main__")]
+    paths = [path for path in paths if path.stem != "__init__" or path.parent == PACKAGE]
+    pages |= {
+        f"api/{path.relative_to(PACKAGE).with_suffix('')}.md".replace("__init__", "init"): module(path)
+        for path in paths
+    }
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
     return files
@@ -59,7 +63,7 @@ def on_page_markdown(markdown, page, config, files):
 
     def replaced(match):
         text, target = match[1], match[2]
-        if found := re.fullmatch(r"(?:\.\./)+integrators/mitsuba_bdpt/(\w+)\.py", target):
+        if found := re.fullmatch(r"(?:\.\./)+integrators/mitsuba_bdpt/([\w/]+)\.py", target):
             return f"[{text}]({up}api/{found[1]}.md)"
         return text
 

@@ -19,7 +19,7 @@ import sys
 import tempfile
 
 from mistakes import answered
-from mitsuba_bdpt import __main__ as command
+from mitsuba_bdpt.cli import arguments as command
 from probes import numbers
 from room import MOST
 from tables import table

@@ -16,7 +16,7 @@ import numpy as np
 import reference
 from metrics import rel_mse
 from mistakes import answered
-from mitsuba_bdpt.__main__ import number
+from mitsuba_bdpt.cli.arguments import number
 from reference import RESOLUTION, benchmark_depth
 
 import mitsuba as mi  # isort: skip

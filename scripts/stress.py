@@ -20,7 +20,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
 import reference
-from mitsuba_bdpt.__main__ import number
+from mitsuba_bdpt.cli.arguments import number
 from report import replace_part, table, write_text
 from stress_cases import cases
 from stress_cases.case import Case, Outcome

@@ -47,9 +47,9 @@ from timing import timed
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
-from mitsuba_bdpt import cluster, render  # isort: skip
-from mitsuba_bdpt.files import replacing  # isort: skip
-from mitsuba_bdpt.rendering import raise_interrupt  # isort: skip
+from mitsuba_bdpt.cli import cluster, render  # isort: skip
+from mitsuba_bdpt.cli.files import replacing  # isort: skip
+from mitsuba_bdpt.run.rendering import raise_interrupt  # isort: skip
 
 CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
 FIRST_SEED = 1  # seed 0 warms up

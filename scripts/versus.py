@@ -29,7 +29,7 @@ import numpy as np
 import reference
 from metrics import TRIM, rel_mse
 from mistakes import answered
-from mitsuba_bdpt.__main__ import number
+from mitsuba_bdpt.cli.arguments import number
 from tables import table
 
 import mitsuba as mi  # isort: skip
@@ -47,7 +47,8 @@ mi.set_variant('llvm_ad_rgb')
 for line in sys.stdin:
     asked = json.loads(line)
     if 'scene' in asked:
-        scene = mi.load_file(asked['scene'], parallel=False, **asked['definitions'])
+        # With optimize Mitsuba puts objects without id in another order in each process.
+        scene = mi.load_file(asked['scene'], parallel=False, optimize=False, **asked['definitions'])
         bdpt = mi.load_dict(asked['integrator'])
         bdpt.render(scene, seed=1 << 20, spp=asked['spp'])
         answer = mitsuba_bdpt.__file__

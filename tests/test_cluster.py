@@ -14,8 +14,9 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from mitsuba_bdpt import cluster, rendering
-from mitsuba_bdpt.__main__ import main
+from mitsuba_bdpt.cli import cluster
+from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.run import rendering
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 import welch as st
-from mitsuba_bdpt.objects import step_by_step
+from mitsuba_bdpt.host.jit import step_by_step
 
 LEVEL = 1e-4
 DEPTH = 3

@@ -6,7 +6,8 @@ import subprocess
 import sys
 
 import pytest
-from mitsuba_bdpt import doctor, llvm
+from mitsuba_bdpt.cli import doctor
+from mitsuba_bdpt.host import llvm
 
 
 def command(*arguments, **env):

@@ -4,8 +4,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import choice, notices, pilot
-from mitsuba_bdpt.edits import State, _checksum
+from mitsuba_bdpt.host import notices
+from mitsuba_bdpt.host.edits import State, _checksum
+from mitsuba_bdpt.planning import choice, pilot
 
 SPP = choice.LEAST_SAMPLES // 32**2
 

@@ -10,9 +10,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-from mitsuba_bdpt import infinity, sensors
-from mitsuba_bdpt.emitters import Emitters
-from mitsuba_bdpt.objects import step_by_step
+from mitsuba_bdpt.emitters import infinity
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.host.jit import step_by_step
+from mitsuba_bdpt.sensors import kinds as sensors
 from scipy import stats
 
 COUNT = 200_000

@@ -8,15 +8,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import sensors
-from mitsuba_bdpt.emitters import Emitters
-from mitsuba_bdpt.kernel import Shared
-from mitsuba_bdpt.rays import ShapeErrors
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.geometry.rounding import ShapeErrors
+from mitsuba_bdpt.sensors import kinds as sensors
+from mitsuba_bdpt.transport.kernel import Shared
 from scene_parts import (
     EGG,
-    EMITTERS,
     T,
     emitter_part,
+    EMITTERS,
     grey,
     orthographic,
     perspective,
@@ -215,7 +215,7 @@ def test_direct_sample_agrees_with_hits(name):
     seen &= np.array(lit)
     assert seen.sum() > 500
     assert off((direct.weight * direct.pdf_w).x, radiance.x) < 0.02
-    # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rays.ShapeErrors).
+    # Hits on cylinders carry an error of Mitsuba's that grows with the distance (see rounding.ShapeErrors).
     few = {"cylinder": 0.05, "textured sphere": 0.02}.get(name, 0.01)
     assert off(direct.pdf_w, connect * to_angle) < few
     edge = dr.select(at.is_valid(), dr.rcp(dr.square(at.t)), 1)

@@ -102,7 +102,7 @@ def test_an_interrupted_run_goes_on(tmp_path):
 
 def test_an_interrupted_render_counts_its_passes(monkeypatch):
     """Expected: of a render that Ctrl-C ends the finished passes count, and no more."""
-    from mitsuba_bdpt import rendering
+    from mitsuba_bdpt.run import rendering
 
     original, calls, interruption = rendering.Render._pass, [], endurance.Interruption()
 

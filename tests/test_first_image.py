@@ -7,7 +7,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import bsdf, choice
+from mitsuba_bdpt.planning import choice
+from mitsuba_bdpt.transport import bsdf
 from room import KINDS, room
 
 ALL = [{"pass": 0, "light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, "mean": 0.5}]

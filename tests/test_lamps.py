@@ -11,9 +11,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import emitter_kinds, emitter_tables
-from mitsuba_bdpt import emitters as emitters_module
-from mitsuba_bdpt.emitters import Emitters
+from mitsuba_bdpt.emitters import emitters as emitters_module
+from mitsuba_bdpt.emitters import kinds as emitter_kinds
+from mitsuba_bdpt.emitters import tables as emitter_tables
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.geometry import smooth_meshes
 from scene_parts import T, grey
 from scipy import stats
 from test_endpoints import egg_with_coordinates
@@ -261,7 +263,7 @@ def test_another_table_of_faces_is_noticed(monkeypatch):
     mesh = ball_of_triangles((0, 1.5, 0), 0.5)
     scene = gap(lamp=mesh)
     Emitters(scene)
-    right = emitter_tables._Faces.of
+    right = smooth_meshes._Faces.of
 
     def in_double(shape):
         faces = right(shape)
@@ -273,7 +275,7 @@ def test_another_table_of_faces_is_noticed(monkeypatch):
         return faces
 
     with monkeypatch.context() as planted:
-        planted.setattr(emitter_tables._Faces, "of", in_double)
+        planted.setattr(smooth_meshes._Faces, "of", in_double)
         with pytest.raises(ValueError, match="bdpt: .*% of the points that Mitsuba samples on the mesh"):
             Emitters(scene)
     params = mi.traverse(scene)

@@ -1,4 +1,4 @@
-"""Tests of the choice of the LLVM library (``mitsuba_bdpt.llvm``).
+"""Tests of the choice of the LLVM library (``mitsuba_bdpt.host.llvm``).
 
 Every branch is tried on made-up machines: empty files stand for libraries, for only their names
 count. Tests of the real thing, what ``import mitsuba_bdpt`` does to a process, run in children.
@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from mitsuba_bdpt import llvm
+from mitsuba_bdpt.host import llvm
 
 
 @pytest.fixture

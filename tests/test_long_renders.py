@@ -10,9 +10,10 @@ from pathlib import Path, PurePath
 import numpy as np
 import OpenEXR
 import pytest
-from mitsuba_bdpt import checkpoints, rendering
-from mitsuba_bdpt.__main__ import build_parser, main
-from mitsuba_bdpt.snapshot import read
+from mitsuba_bdpt.cli import checkpoints
+from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.run.snapshot import read
 
 SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
 ARGUMENTS = ["render", str(SCENE), "-D", "resolution=16", "-P", "spp_per_pass=4", "--seed", "5"]

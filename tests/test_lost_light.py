@@ -6,8 +6,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import lost_light
-from mitsuba_bdpt.rendering import Render
+from mitsuba_bdpt.planning import lost_light
+from mitsuba_bdpt.run.rendering import Render
 from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f

@@ -10,7 +10,9 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import emitter_kinds, notices, suspects
+from mitsuba_bdpt.emitters import kinds as emitter_kinds
+from mitsuba_bdpt.host import notices
+from mitsuba_bdpt.scene import diagnostics
 from stress_cases import cases
 from stress_cases.poisons import NAN, filled, painted, room
 from stress_cases.warned import Warned
@@ -33,18 +35,18 @@ def test_what_is_not_finite_counts_as_zero(name):
 
 def test_culprits_are_named():
     """Expected: the texture that holds NaN is named, and no parameter of a sound scene."""
-    assert suspects.not_finite(filled(painted(NAN))) == ["plate.bsdf.reflectance.data"]
-    assert suspects.not_finite(room()) == []
+    assert diagnostics.not_finite(filled(painted(NAN))) == ["plate.bsdf.reflectance.data"]
+    assert diagnostics.not_finite(room()) == []
 
 
 def test_a_transform_that_is_not_finite_is_named():
     """Expected: the radius NaN of a lamp is in its ``to_world``, and NumPy says nothing of it."""
     lamp = {"type": "sphere", "radius": NAN, "emitter": {"type": "area"}}
     scene = mi.load_dict({"type": "scene", "ball": lamp, "sensor": {"type": "perspective"}})
-    assert suspects.not_finite(scene) == ["ball.to_world"]
+    assert diagnostics.not_finite(scene) == ["ball.to_world"]
     nameless = '<shape type="sphere"><float name="radius" value="nan"/></shape>'
     nameless = mi.load_string(f'<scene version="3.0.0">{nameless}</scene>')
-    assert suspects.not_finite(nameless) == ["to_world of an object without id (Sphere)"]
+    assert diagnostics.not_finite(nameless) == ["to_world of an object without id (Sphere)"]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         mi.load_dict({"type": "bdpt"}).render(scene, spp=1)
@@ -93,7 +95,7 @@ def bitmap(value, kind=np.uint8, **keys):
 def test_bytes_of_a_bitmap_are_shares_of_255(texture, said):
     """Rationale: Mitsuba keeps the bytes of 8-bit images, divides them by 255 at each look-up and undoes
     sRGB: no such texture reflects more than all. Expected: named only where numbers above 1 are kept."""
-    found = suspects.brighteners([mi.load_dict({"type": "principled", "base_color": texture})])
+    found = diagnostics.brighteners([mi.load_dict({"type": "principled", "base_color": texture})])
     assert len(found) == bool(said) and all(said in text for text in found), found
 
 
@@ -124,7 +126,7 @@ def test_the_nearest_object_with_an_id_is_named(shape, name, tmp_path, monkeypat
     twice), which names the nearest object around the number that has an id, or a bitmap's file."""
     monkeypatch.chdir(tmp_path)
     LOUD["bitmap"].write("wood.exr")
-    (text,) = suspects.brighteners([mi.load_dict({"type": "sphere", **shape})])
+    (text,) = diagnostics.brighteners([mi.load_dict({"type": "sphere", **shape})])
     assert text == f"{name} has reflectance up to 1.5"
 
 
@@ -155,7 +157,7 @@ def test_what_is_wrong_with_a_scene_is_said_once():
 def test_a_large_bitmap_is_looked_at_in_part(monkeypatch):
     """Rationale: reading all of a scene's textures takes longer than a preview. Expected: of two bitmaps of
     3 * 64^2 numbers, half of the numbers allowed each, from end to end; a row of large ones is found."""
-    monkeypatch.setattr(suspects, "_QUICKLY_READ", 2 * 3 * 64)
+    monkeypatch.setattr(diagnostics, "_QUICKLY_READ", 2 * 3 * 64)
     data = np.full((64, 64, 3), 0.5, np.float32)
     data[-1] = 3.0
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(data)}
@@ -163,7 +165,7 @@ def test_a_large_bitmap_is_looked_at_in_part(monkeypatch):
     looked = []
     nanmax = np.nanmax
     monkeypatch.setattr(np, "nanmax", lambda a, **keys: looked.append(a.size) or nanmax(a, **keys))
-    assert len(suspects.brighteners(bsdfs)) == 2
+    assert len(diagnostics.brighteners(bsdfs)) == 2
     assert looked == [3 * 64, 3 * 64]
 
 
@@ -219,7 +221,7 @@ def test_no_more_than_all_light_is_lost(angle, said):
     """Rationale: a step of the cosine over 1 - cos has no limit as the angle goes to 0. Expected: all of the
     light where the quotient is 1 or more; no word here about angles that are not finite, which count among
     such parameters; no warning of NumPy (an error in these tests) at any angle."""
-    found = suspects.narrow_spots(beside_spots(angle))
+    found = diagnostics.narrow_spots(beside_spots(angle))
     assert found == [f"spot 'lamp 0' has cutoff_angle={text}" for text in said]
 
 
@@ -232,7 +234,7 @@ def test_coefficients_of_spectra_are_no_reflectances():
         bright = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.95, np.float32))}
         loud = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 1.5, np.float32)), "raw": True}
         bsdfs = [mi.load_dict({"type": "diffuse", "reflectance": texture}) for texture in (bright, loud)]
-        assert suspects.brighteners(bsdfs[:1]) == []
-        assert "reflectance up to 1.5" in suspects.brighteners(bsdfs[1:])[0]
+        assert diagnostics.brighteners(bsdfs[:1]) == []
+        assert "reflectance up to 1.5" in diagnostics.brighteners(bsdfs[1:])[0]
     finally:
         mi.set_variant(before)

@@ -6,7 +6,7 @@ import sys
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.objects import named, own_parameters
+from mitsuba_bdpt.host.introspection import named, own_parameters
 
 OBJECTS = {
     "point": {"type": "point", "position": [1, 2, 3]},

@@ -3,9 +3,9 @@
 Three layers, from arithmetic to scenes:
 
 * `test_recursion_*`: ``mis.py`` alone, called in the order in which ``subpath.py`` and
-  ``connect.py`` call it, on random numbers of any size.
+  ``techniques.py`` call it, on random numbers of any size.
 * `test_kernel_*`: the real code, unchanged: ``kernel._light_subpath`` and ``_camera_subpath``, the
-  random walks and all functions of ``connect.py``, in a scripted world. There the scene, the BSDFs,
+  random walks and all functions of ``techniques.py``, in a scripted world. There the scene, the BSDFs,
   the emitters and the sensor are stand-ins that walk each lane along a path drawn beforehand and
   answer with densities drawn beforehand; positions and normals are real, so that cosines, distances
   and shading frames are the core's own work. Recorders around ``connect``'s functions keep the
@@ -19,6 +19,7 @@ Statistics of whole images are in ``test_strategies.py``.
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
 
 import drjit as dr
@@ -26,7 +27,13 @@ import mitsuba as mi
 import numpy as np
 import oracle
 import pytest
-from mitsuba_bdpt import bsdf, connect, emitters, kernel, mis, rays, sensor_records, sensors, sinks
+from mitsuba_bdpt import settings
+from mitsuba_bdpt.emitters import emitters
+from mitsuba_bdpt.geometry import rays, rounding
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.sensors import kinds as sensors
+from mitsuba_bdpt.sensors import records as sensor_records
+from mitsuba_bdpt.transport import bsdf, connections, kernel, light_path, mis, techniques
 from oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
@@ -49,7 +56,7 @@ def check(paths, kappa, name, weights, relative):
     return int((~keep).sum())
 
 
-@pytest.mark.parametrize("name", mis.HEURISTICS)
+@pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", COEFFICIENTS)
 def test_recursion_agrees_with_explicit_densities(name, classes):
     """Rationale: two floats per vertex must say what arrays of all densities say.
@@ -71,7 +78,7 @@ def test_recursion_agrees_with_explicit_densities(name, classes):
     assert left_out < 0.01 * total
 
 
-@pytest.mark.parametrize("name", mis.HEURISTICS)
+@pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", ["n1c1", "odd", "n0c0"])
 def test_recursion_extreme_densities(name, classes):
     """Rationale: no overflow, no underflow and no inf * 0 with densities from 1e-30 to 1e30.
@@ -99,7 +106,7 @@ def test_recursion_extreme_densities(name, classes):
             check(paths, kappa, name, recursion(paths, kappa, name), relative=1e-4)
 
 
-@pytest.mark.parametrize("name", mis.HEURISTICS)
+@pytest.mark.parametrize("name", settings.HEURISTICS)
 def test_partial_sums_survive_zero_and_infinity(name):
     """Rationale: 1e30 / 1e-30 is inf in float32, and inf times a reverse density of 0 is NaN (seen).
 
@@ -430,12 +437,12 @@ class Sensor:
 
 
 class Flat:
-    """Stand-in for `rays.ShapeErrors`: no shape is curved, or far larger than the distances to it."""
+    """Stand-in for `rounding.ShapeErrors`: no shape is curved, or far larger than the distances to it."""
 
     any = small = False
 
     def at(self, *_):
-        return rays.Errors(mi.Float(0), mi.Float(0), mi.Float(0))
+        return rounding.Errors(mi.Float(0), mi.Float(0), mi.Float(0))
 
 
 class Directly:
@@ -551,33 +558,33 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         for y in stored:
             # Other pairs are not neighbours on a path of k edges.
             if edges(y) + edges(z) + 1 == k:
-                connect.inner(kernel_, z, y)
+                connections.inner(kernel_, z, y)
         return total
 
     for function, edges_of in (
-        (connect.hit_emitter, lambda z: (0, edges(z))),
-        (connect.next_event, lambda z, *_: (1, edges(z) + 1)),
-        (connect.join_endpoints, lambda *_: (1, 1)),
-        (connect.splat, lambda y, *_: (edges(y) + 1, edges(y) + 1)),
-        (connect.arrive, lambda e, y, walk: (edges(walk) + 1, edges(walk))),
-        (connect.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),
+        (techniques.hit_emitter, lambda z: (0, edges(z))),
+        (techniques.next_event, lambda z, *_: (1, edges(z) + 1)),
+        (techniques.join_endpoints, lambda *_: (1, 1)),
+        (techniques.splat, lambda y, *_: (edges(y) + 1, edges(y) + 1)),
+        (techniques.arrive, lambda e, y, walk: (edges(walk) + 1, edges(walk))),
+        (connections.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),
     ):
-        monkeypatch.setattr(connect, function.__name__, record(function, edges_of))
-    monkeypatch.setattr(connect, "store_light_vertex", lambda kernel_, y, path: stored.append(y))
-    monkeypatch.setattr(connect, "connect_all", connect_all)
-    monkeypatch.setattr(connect, "sees_emitter", lambda kernel_, z: z.active)
+        monkeypatch.setattr(sys.modules[function.__module__], function.__name__, record(function, edges_of))
+    monkeypatch.setattr(light_path, "store_light_vertex", lambda kernel_, y, path: stored.append(y))
+    monkeypatch.setattr(connections, "connect_all", connect_all)
+    monkeypatch.setattr(techniques, "sees_emitter", lambda kernel_, z: z.active)
     monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))
 
     shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     scene.begin(from_light=True)
     monkeypatch.setattr(dr, "while_loop", python_loop(k if plan.arrival else k - 1))
-    path, _ = kernel._light_subpath(k_, sinks.Image(Nothing()), k_.points.stream(), shared, None)
+    path, _ = kernel._light_subpath(k_, sink.Image(Nothing()), k_.points.stream(), shared, None)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
     lane = kernel._Lane(place, shared, path)
     counters = dict.fromkeys(kernel.COUNTERS, u32(0))
-    kernel._camera_subpath(k_, sinks.Image(Nothing()), lane, u32(0), counters, mi.Bool(True))
+    kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), counters, mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
     return columns(result, world.n)
@@ -586,7 +593,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
 @pytest.mark.parametrize(
     "name, classes",
     [
-        *((name, "odd") for name in mis.HEURISTICS),
+        *((name, "odd") for name in settings.HEURISTICS),
         *(("balance", classes) for classes in ("n1c1", "n1c0-half", "n0c1", "n0c0")),
     ],
 )
@@ -744,7 +751,7 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
             **more,
         }
     )
-    camera = sensors.prepare(sensor, rays.ShapeErrors(mi.load_dict({"type": "scene"})))
+    camera = sensors.prepare(sensor, rounding.ShapeErrors(mi.load_dict({"type": "scene"})))
     like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(4096)
     u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]

@@ -16,9 +16,10 @@ import mitsuba as mi
 import mitsuba_bdpt
 import numpy as np
 import pytest
-from mitsuba_bdpt import connect, passes, rendering
 from mitsuba_bdpt.parameters import check_variant
-from mitsuba_bdpt.world import World
+from mitsuba_bdpt.run import rendering, schedule
+from mitsuba_bdpt.scene.prepared import World
+from mitsuba_bdpt.transport import techniques
 
 T = mi.ScalarTransform4f
 
@@ -356,7 +357,7 @@ def test_row_bands_equal_one_launch(monkeypatch):
     scene = lamp_in_a_sphere()
     bdpt = integrator(max_depth=3, skip="none", light_paths=0)
     whole = image(bdpt, scene, spp=4)
-    monkeypatch.setattr(passes, "PASS_SAMPLES", 16 * 3)
+    monkeypatch.setattr(schedule, "PASS_SAMPLES", 16 * 3)
     np.testing.assert_allclose(image(bdpt, scene, spp=4), whole, rtol=1e-4)
 
 
@@ -432,7 +433,7 @@ def test_an_interruption_while_a_kernel_is_recorded(monkeypatch):
     of the passes (radiance 1 within 5 %, see above) in the film; the next render is whole, the same as by an
     integrator that was not interrupted, up to rounding.
     """
-    original, calls = connect.splat, []
+    original, calls = techniques.splat, []
 
     def splat(*arguments):
         calls.append(arguments)
@@ -443,7 +444,7 @@ def test_an_interruption_while_a_kernel_is_recorded(monkeypatch):
     scene = lamp_in_a_sphere(size=32)
     bdpt, parameters = integrator(skip="none", spp_per_pass=4), {"seed": 2, "spp": 12}
     with monkeypatch.context() as patch:
-        patch.setattr(connect, "splat", splat)
+        patch.setattr(techniques, "splat", splat)
         with pytest.raises(KeyboardInterrupt):
             bdpt.render(scene, **parameters)
     assert bdpt.statistics["passes"] == [4]

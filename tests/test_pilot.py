@@ -14,8 +14,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import choice, kernel, mis, moments, passes, pilot, rendering, sinks
-from mitsuba_bdpt.kernel import Batch, _Places
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.planning import choice, moments, pilot
+from mitsuba_bdpt.run import rendering, schedule
+from mitsuba_bdpt.transport import kernel, mis
+from mitsuba_bdpt.transport.batch import NET, NETS, Batch, Places
 from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f
@@ -300,7 +303,7 @@ def test_pixels_of_a_pilot(chosen):
     width and of the height (parts are narrower than those); each sample is of a sequence of its own."""
     target = sky(128)
     kernel = of(target).kernel
-    place = _Places(kernel, Batch(0, chosen, 0, 2, 128 * 128), 2)
+    place = Places(kernel, Batch(0, chosen, 0, 2, 128 * 128), 2)
     slot = dr.arange(mi.UInt32, 2 * chosen)
     pixel, sample = (np.array(x) for x in place._split(slot))
     part = 128 * 128 / chosen
@@ -318,17 +321,17 @@ def test_nets_of_a_pilot():
     of the film, each net the first points of a sequence of its own."""
     kernel, nets = of(sky(128)).kernel, 50
     batch = Batch(0, 1000, 0, 2, 128 * 128, nets)
-    place = _Places(kernel, batch, 2)
-    size = moments.NETS * moments.NET
+    place = Places(kernel, batch, 2)
+    size = NETS * NET
     assert batch.size == 2000 + nets * size
     slot = dr.arange(mi.UInt32, batch.size)
     pixel = np.array(place._split(slot)[0])[2000:].reshape(nets, size)
     assert (pixel == pixel[:, :1]).all()
     np.testing.assert_array_equal(pixel[:, 0] * nets // 128**2, np.arange(nets))
     index = np.array(place.index(slot))
-    within = index[2000:].reshape(-1, moments.NET)
-    np.testing.assert_array_equal(within % 2**32, np.tile(np.arange(moments.NET), (nets * moments.NETS, 1)))
-    assert len(np.unique(index >> np.uint64(32))) == 2000 + nets * moments.NETS
+    within = index[2000:].reshape(-1, NET)
+    np.testing.assert_array_equal(within % 2**32, np.tile(np.arange(NET), (nets * NETS, 1)))
+    assert len(np.unique(index >> np.uint64(32))) == 2000 + nets * NETS
 
 
 def test_gain_of_points_is_what_nets_leave():
@@ -337,12 +340,12 @@ def test_gain_of_points_is_what_nets_leave():
     1, within five standard errors (2,000 pixels: the square of a normal number has a relative spread of
     1.4)."""
     rng = np.random.default_rng(3)
-    pixels, net = 2000, moments.NET
-    white = rng.normal(size=(pixels, moments.NETS, net, 1))
+    pixels, net = 2000, NET
+    white = rng.normal(size=(pixels, NETS, net, 1))
     calm = white - (1 - 0.1**0.5) * white.mean(axis=2, keepdims=True)
     brightness = 10 ** rng.uniform(-1, 1, (pixels, 1, 1, 1))
     values = (3 + np.concatenate([white, calm], axis=3)) * brightness
-    inverse = np.broadcast_to(brightness[:, 0] ** -2, (pixels, moments.NETS * net, 1)).reshape(-1)
+    inverse = np.broadcast_to(brightness[:, 0] ** -2, (pixels, NETS * net, 1)).reshape(-1)
     found = moments._gain(values.reshape(-1, 2), inverse)
     error = 5 * 2**0.5 / pixels**0.5
     assert found[0] >= 1 - error and found[1] == pytest.approx(0.1 / (15 / 16 + 0.1 / 16), rel=error)
@@ -402,7 +405,7 @@ def test_measured_gain_of_points(make, least, most):
     found = moments_of(target, 1 << 13, rounds=8, hide_emitters=True)
     for points in ("sobol", "independent"):
         integrator = forced(decision(ALONE, 1, "none"), points=points, hide_emitters=True)
-        renders = (integrator.render(target, seed=seed, spp=moments.NET) for seed in range(64))
+        renders = (integrator.render(target, seed=seed, spp=NET) for seed in range(64))
         images = np.stack([np.array(image)[..., :3].mean(-1) for image in renders]).astype(float)
         variances[points] = relative_variance(images, images.mean(axis=0))
     measured = variances["sobol"] / variances["independent"]
@@ -509,7 +512,7 @@ def test_why_there_is_no_pilot():
 def test_path_tracing_alone_before_what_is_hardly_better():
     """Expected: light subpaths that gain less than `LIGHT_GAIN` are left out, and it is said by how much;
     those that gain more are used."""
-    shape = (pilot.GROUPS, len(pilot.WEIGHTINGS))
+    shape = (moments.GROUPS, len(pilot.WEIGHTINGS))
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     alone, light = (pilot.WEIGHTINGS.index(w) for w in (ALONE, pilot.Weighting(1, 1, 1 / 16, 0)))
     possible = [choice.Candidate(n, s, "none") for n, s in ((alone, 1), (light, 16))]
@@ -663,8 +666,8 @@ def test_changed_decisions_change_the_points():
     late = of(cornell())
     late._adopt(replace(path, first_pass=2))  # after passes without a decision
     assert late._changes == 1
-    step = passes.Step(0, 0, 1, 64, False)
-    batch = passes.batches(render.world.camera, 0, 1, render.settings)[0]
+    step = schedule.Step(0, 0, 1, 64, False)
+    batch = schedule.batches(render.world.camera, 0, 1, render.settings)[0]
     seeds = {int(render._points(step, batch).seed[0])}
     render._changes = 0
     assert render._points(step, batch).seed[0] == 1 and seeds.isdisjoint({1})
@@ -942,10 +945,10 @@ def test_loops_are_recorded_once(parameters, capfd):
     say so, of a pass and of a pilot."""
     target, before = cornell(8), dr.log_level()
     render = of(target, **parameters)
-    drawn = render._points(passes.Step(0, 0, 1, 1, True), Batch(0, 4, 0, 1))
+    drawn = render._points(schedule.Step(0, 0, 1, 1, True), Batch(0, 4, 0, 1))
     dr.set_log_level(dr.LogLevel.Debug)
     try:
-        counts = kernel.trace(render.kernel, sinks.Image(render.accumulator), Batch(0, 4, 0, 1), drawn, 1)
+        counts = kernel.trace(render.kernel, sink.Image(render.accumulator), Batch(0, 4, 0, 1), drawn, 1)
         render.accumulator.evaluate(counts)
         if parameters.get("light_paths") != 0:  # else there is nothing to choose
             pilot.measure(render.world, render.plan, render.settings, render.seed, 64)
@@ -962,7 +965,7 @@ def test_coefficients_of_direct_light_have_to_gain_much(gain, stratified, kappa)
     """Rationale: what points leave of two strategies' variances is known to a fifth. Expected: with
     stratified points a gain of 1.2 is not taken, one of 1.5 is; with independent ones that of 1.2 is. Its
     figures are printed as they are."""
-    base = np.ones((pilot.GROUPS, len(pilot.WEIGHTINGS)))
+    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
     base[:, 1] = 1 / gain
     rays = {"camera": 1.0, "shadow_s1": 1.0}
     table = choice.choose(made_of(base, rays), [choice.Candidate(i, 1, "none") for i in range(3)], stratified)

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.points import Points, Purpose
+from mitsuba_bdpt.sampling.points import Points, Purpose
 from scipy import stats
 
 T = mi.ScalarTransform4f

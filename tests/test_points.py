@@ -1,4 +1,4 @@
-"""Which numbers a path draws: `mitsuba_bdpt.points` with Sobol' points."""
+"""Which numbers a path draws: `mitsuba_bdpt.sampling.points` with Sobol' points."""
 
 from types import SimpleNamespace
 
@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import kernel
-from mitsuba_bdpt.points import STRATIFIED, Points, Purpose
+from mitsuba_bdpt.sampling.points import STRATIFIED, Points, Purpose
+from mitsuba_bdpt.transport import batch
 
 FILM, LENS, LIGHT, BSDF = (Purpose.FILM, 0), (Purpose.APERTURE, 0), (Purpose.EMITTER, 1), (Purpose.BSDF, 1)
 POINT, DIRECTION = (Purpose.EMISSION_POINT, 0), (Purpose.EMISSION_DIRECTION, 0)
@@ -71,7 +71,7 @@ def test_samples_beyond_the_range_of_32_bits():
     image's sequence, none of 4,096 is drawn again 2^32 samples before, and their points are as even as any
     pixel's: one in each cell of 64 x 64."""
     pixels, spp = 1920 * 1080, 4096
-    place = kernel._Places(SimpleNamespace(camera=None), kernel.Batch(pixels - 1, 1, 0, spp), spp)
+    place = batch.Places(SimpleNamespace(camera=None), batch.Batch(pixels - 1, 1, 0, spp), spp)
     slot = dr.arange(mi.UInt32, spp)
     index = place.index(slot)
     expected = (pixels - 1) * spp + np.arange(spp, dtype=np.uint64)

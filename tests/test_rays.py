@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import rays, spheres
+from mitsuba_bdpt.geometry import quadrics, rays, rounding
 from welch import assert_agree, compare_images, tile_means
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -124,7 +124,7 @@ def first_hits(scene, place, n, rng, inside, distance=3.0):
 
 def anchor_of(scene, si, ray):
     """The anchor of a hit, as a subpath makes it."""
-    return rays.surface_anchor(si, ray, rays.ShapeErrors(scene))
+    return rays.surface_anchor(si, ray, rounding.ShapeErrors(scene))
 
 
 def bad_rays(kind, place, folder, n, seed=0):
@@ -454,7 +454,7 @@ def test_spheres_are_known_however_small(radius, place, flipped):
     }
     for name, keys in kinds.items():
         shape = mi.load_dict({"type": "sphere", "flip_normals": flipped} | keys)
-        sphere = spheres.Sphere.of(shape)
+        sphere = quadrics.Sphere.of(shape)
         # What Mitsuba says of a ball of that kind where nothing is rounded.
         d = mi.Vector3f(1, 0, 0)
         large = mi.load_dict({"type": "sphere", "flip_normals": flipped} | _enlarged(keys, radius, place))
@@ -478,7 +478,7 @@ def _enlarged(keys, radius, place):
 def test_spheres_are_small_in_scenes_without_bounds(extent):
     """Rationale: one vertex at infinity leaves a scene without a size; lamps on spheres were then taken for
     large, and up to 58 % too bright. Expected: small."""
-    assert spheres.is_small(spheres.Sphere([0, 0, 0], 1e-3, 1.0, False), extent)
+    assert quadrics.is_small(quadrics.Sphere([0, 0, 0], 1e-3, 1.0, False), extent)
 
 
 def test_reach_of_triangles():
@@ -492,7 +492,7 @@ def test_reach_of_triangles():
         params["vertex_positions"] = mi.Float(np.array(rows, np.float32).ravel())
         params["faces"] = mi.UInt32([0, 1, 2, 0, 2, last])
         params.update()
-        return rays.reaches(mesh).tolist()
+        return rounding.reaches(mesh).tolist()
 
     triangle = [90, 0, 0], [97, 0, -7], [90, 3, 0]
     assert reach(*triangle, [97, 9, 0]) == [7, 0]
@@ -565,7 +565,7 @@ def test_floors_along_the_axes_keep_what_is_small(kind):
     si = scene.ray_intersect(ray)
     anchor = anchor_of(scene, si, ray)
     assert int(dr.count(si.is_valid() & (dr.abs(si.p.z) < 1))[0]) == n
-    assert float(dr.max(anchor.offset)[0]) <= (side + 3) * rays.OFFSET_ULPS * 2.0**-24
+    assert float(dr.max(anchor.offset)[0]) <= (side + 3) * rounding.OFFSET_ULPS * 2.0**-24
 
 
 def grouped(shape, to_world):
@@ -604,11 +604,11 @@ def test_cylinders_in_groups_are_seen_from_afar(stretch):
     ray = mi.Ray3f(origin, dr.normalize(target - origin))
     si = scene.ray_intersect(ray)
     outside = si.is_valid() & (dr.dot(si.n, ray.d) < -0.05)
-    errors = rays.ShapeErrors(scene)
+    errors = rounding.ShapeErrors(scene)
     anchor = rays.surface_anchor(si, ray, errors)
     count = int(dr.count(outside)[0])
     assert count > 0.02 * n
-    sight, own = rays.sight(errors, rays.free_anchor(origin), anchor, rays.met(si.shape, si.instance), si)
+    sight, own = rays.sight(errors, rays.free_anchor(origin), anchor, rounding.met(si.shape, si.instance), si)
     blocked = rays.occluded(scene, sight, outside, own)
     assert int(dr.count(outside & blocked)[0]) <= 1e-3 * count
     found = scene.ray_test(rays.spawn(anchor, si.n, ray), outside)
@@ -637,8 +637,8 @@ def test_backs_of_small_shapes_are_not_seen(kind, radius, flipped):
     outwards = mi.Vector3f(dr.cos(phi) * across, dr.sin(phi) * across, 0 if kind == "cylinder" else z)
     p = mi.Point3f(outwards * radius)
     p.z += 0.5 * z if kind == "cylinder" else 0
-    errors, target = rays.ShapeErrors(scene), scene.shapes()[0]
-    number = rays.met(mi.ShapePtr(target))
+    errors, target = rounding.ShapeErrors(scene), scene.shapes()[0]
+    number = rounding.met(mi.ShapePtr(target))
     origin = mi.Point3f(8, 0, 0) + _sphere(rng)
     n_ = mi.Normal3f(-outwards if flipped else outwards)
     end = rays.sampled_anchor(p, n_, origin, errors.at(mi.ShapePtr(target)))
@@ -666,10 +666,10 @@ def test_the_inside_of_small_tubes_is_seen_through_their_end(radius, flipped):
     p = mi.Point3f(outwards.x * radius, outwards.y * radius, z)
     shift = mi.Vector3f(*(rng.next_float32() for _ in range(3)))
     origin = mi.Point3f(float(8 * np.sin(0.6)), 0, float(8 * np.cos(0.6))) + 0.2 * shift
-    errors, shape = rays.ShapeErrors(scene), mi.ShapePtr(scene.shapes()[0])
+    errors, shape = rounding.ShapeErrors(scene), mi.ShapePtr(scene.shapes()[0])
     end = rays.sampled_anchor(p, mi.Normal3f(-outwards if flipped else outwards), origin, errors.at(shape))
     like = dr.zeros(mi.SurfaceInteraction3f)
-    ray, own = rays.sight(errors, rays.free_anchor(origin), end, rays.met(shape), like)
+    ray, own = rays.sight(errors, rays.free_anchor(origin), end, rounding.met(shape), like)
     seen = ~np.array(rays.occluded(scene, ray, mi.Bool(True), own))
     p, d = np.array(p, dtype=float), np.array(origin - p, dtype=float)
     inside = (np.array(outwards) * d).sum(0) < -0.05 * np.linalg.norm(d, axis=0)

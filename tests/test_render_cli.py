@@ -18,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
-from mitsuba_bdpt import render
-from mitsuba_bdpt.__main__ import build_parser, main
-from mitsuba_bdpt.loading import in_proportion, load
+from mitsuba_bdpt.cli import render
+from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.cli.loading import in_proportion, load
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
 

@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import passes
-from mitsuba_bdpt.points import SAMPLER_TABLE, Points
+from mitsuba_bdpt.run import schedule
+from mitsuba_bdpt.sampling.points import SAMPLER_TABLE, Points
 from sampler_correlation import DEEP, FIRST, SAMPLERS, correlations, numbers, path_numbers
 from welch import assert_agree, compare_images, tile_means
 
@@ -170,7 +170,7 @@ def test_passes_and_bands_keep_what_the_sampler_spreads(monkeypatch):
     independent = noise(scene, bdpt(**DIRECT | {"points": "independent"}), 1000)
     assert independent > 1.5 * whole
 
-    monkeypatch.setattr(passes, "PASS_SAMPLES_SAMPLER", 2048)
+    monkeypatch.setattr(schedule, "PASS_SAMPLES_SAMPLER", 2048)
     cut = bdpt(spp_per_pass=5, **DIRECT)
     assert noise(scene, cut, 2000) == pytest.approx(whole, rel=0.15)
     assert cut.statistics["passes"] == [4] * 4

@@ -284,9 +284,9 @@ def test_two_checkouts_are_compared(tmp_path, capsys):
     shutil.copytree(SCRIPTS.parent / "integrators", other / "integrators")
     options = ["--scenes", "ring_caustic", "--spp", "4", "--pairs", "1", "--same"]
     assert versus.main([str(other), *options]) == 0
-    connect = other / "integrators" / "mitsuba_bdpt" / "connect.py"
-    text = connect.read_text()
-    connect.write_text(text.replace("def splat(", "def _splat(") + DIMMED)
+    module = other / "integrators" / "mitsuba_bdpt" / "transport" / "techniques.py"
+    text = module.read_text()
+    module.write_text(text.replace("def splat(", "def _splat(") + DIMMED)
     assert versus.main([str(other), *options]) == 1
     first, second = [line for line in capsys.readouterr().out.splitlines() if "ring_caustic" in line]
     assert float(first.split("|")[2]) < 1e-4 < float(second.split("|")[2])

@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-from mitsuba_bdpt import sensors
-from mitsuba_bdpt.kernel import Shared
-from mitsuba_bdpt.rays import ShapeErrors
+from mitsuba_bdpt.geometry.rounding import ShapeErrors
+from mitsuba_bdpt.sensors import kinds as sensors
+from mitsuba_bdpt.transport.kernel import Shared
 
 COUNT = 200_000
 T = parts.T

@@ -1,10 +1,10 @@
-"""Which camera samples share a light subpath (`mitsuba_bdpt.sharing`), and the noise they have in common."""
+"""Which camera samples share a light subpath, and the noise they have in common: `transport.sharing`."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.sharing import LEAST_RUNS, LONGEST_RUN, Sharing
+from mitsuba_bdpt.transport.sharing import LEAST_RUNS, LONGEST_RUN, Sharing
 from reference import load_scene
 
 PIXELS = (*range(1, 40), 97, 256, 257, 31 * 17, 997, 64 * 64, 4097, 4 * LEAST_RUNS * LONGEST_RUN + 13)

@@ -5,10 +5,10 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import choice
-from mitsuba_bdpt.passes import REPLICATES, _replicates
-from mitsuba_bdpt.snapshot import Snapshot
-from mitsuba_bdpt.spread import restored
+from mitsuba_bdpt.image.spread import restored
+from mitsuba_bdpt.planning import choice
+from mitsuba_bdpt.run.schedule import REPLICATES, _replicates
+from mitsuba_bdpt.run.snapshot import Snapshot
 
 # Sums of a pass are made by atomic additions, whose order differs from run to run.
 ROUNDING = {"rtol": 2e-4, "atol": 1e-6}

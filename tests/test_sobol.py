@@ -1,4 +1,4 @@
-"""Tests of the Owen-scrambled Sobol' points (``mitsuba_bdpt.sobol``).
+"""Tests of the Owen-scrambled Sobol' points (``mitsuba_bdpt.sampling.sobol``).
 
 All points are functions of fixed integers: no test is random from run to run (SciPy's generators
 are seeded). The statistical bounds say how rare a good generator falls outside them.
@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import sobol
+from mitsuba_bdpt.sampling import sobol
 from scipy import stats
 
 LAST = 0xFFFFFFFF

@@ -14,7 +14,7 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.strategies import strategies
+from mitsuba_bdpt.image.layers import strategies
 from welch import Comparisons, assert_agree, compare_images, tile_means, welch
 
 with warnings.catch_warnings():

@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import welch as st
-from mitsuba_bdpt.strategies import strategies
+from mitsuba_bdpt.image.layers import strategies
 
 DEPTH = 5
 SEEDS = 32

@@ -3,10 +3,10 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt import passes
-from mitsuba_bdpt.film import Replicates
-from mitsuba_bdpt.rays import ShapeErrors
-from mitsuba_bdpt.sensors import prepare
+from mitsuba_bdpt.geometry.rounding import ShapeErrors
+from mitsuba_bdpt.image.replicates import Replicates
+from mitsuba_bdpt.run import schedule
+from mitsuba_bdpt.sensors.kinds import prepare
 
 
 def scene(rfilter="box", width=12, sampler="independent"):
@@ -136,11 +136,11 @@ def test_schedule_of_replicates():
     """
     target = scene()
     settings, camera = bdpt().settings, prepare(target.sensors()[0], ShapeErrors(target))
-    steps = passes.schedule(camera, 19, settings, True)
+    steps = schedule.schedule(camera, 19, settings, True)
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
     assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)
     assert all(s.done == 0 and s.size == s.of for s in steps[2:])
-    assert [s.replicate for s in passes.schedule(camera, 19, bdpt(variance=False).settings, True)] == [0, 0]
+    assert [s.replicate for s in schedule.schedule(camera, 19, bdpt(variance=False).settings, True)] == [0, 0]
 
 
 def test_interrupted_before_there_is_a_spread():

@@ -8,9 +8,9 @@ and ``drjit``: which LLVM they use is settled when they are first imported.
 import sys as _sys
 from pathlib import Path as _Path
 
-from . import llvm as _llvm
 from ._version import __version__
-from .llvm import LLVMNotFoundError
+from .host import llvm as _llvm
+from .host.llvm import LLVMNotFoundError
 
 __all__ = ["LLVMNotFoundError", "__version__", "llvm_choice"]
 

@@ -10,19 +10,19 @@ from functools import wraps
 import drjit as dr
 import mitsuba as mi
 
-from . import choice
-from .emitter_kinds import foreign_elsewhere
-from .explain import explain
-from .features import feature_names
-from .notices import warn_once
-from .objects import all_shapes, is_instance, named
+from .emitters.kinds import foreign_elsewhere
+from .host.introspection import all_shapes, is_instance, named
+from .host.notices import warn_once
+from .image.features import feature_names
+from .image.layers import layer_names
 from .parameters import check_made_for, check_variant, integer, is_index, read_settings
-from .passes import REPLICATES
-from .plan import UNLIMITED
-from .rendering import Render
-from .snapshot import Snapshot
-from .strategies import layer_names
-from .suspects import brighteners, narrow_spots, not_finite
+from .planning import choice
+from .planning.explain import explain
+from .run.rendering import Render
+from .run.schedule import REPLICATES
+from .run.snapshot import Snapshot
+from .scene.diagnostics import brighteners, narrow_spots, not_finite
+from .settings import UNLIMITED
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
 

@@ -11,12 +11,23 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import choice, features, mis, points
-from .colour import Bands, film_colours
-from .objects import all_shapes, named
-from .plan import CONNECTIONS, DEFAULT_STORED, LIGHT_PATHS, MAX_STORED, SKIP, UNLIMITED, Settings
-from .similar import did_you_mean
-from .strategies import layer_names
+from .errors import did_you_mean
+from .host.introspection import all_shapes, named
+from .image import features
+from .image.colour import Bands, film_colours
+from .image.layers import layer_names
+from .planning import choice
+from .settings import (
+    CONNECTIONS,
+    DEFAULT_STORED,
+    HEURISTICS,
+    LIGHT_PATHS,
+    MAX_STORED,
+    POINTS,
+    SKIP,
+    UNLIMITED,
+    Settings,
+)
 
 # What numbers mean, for messages.
 MEANING = {
@@ -167,11 +178,11 @@ def read_settings(props) -> Settings:
         max_depth=UNLIMITED if max_depth < 0 else max_depth,
         rr_depth=integer(props.get("rr_depth", 5), "rr_depth", 1),
         hide_emitters=_boolean(props, "hide_emitters"),
-        heuristic=_choice(props, "heuristic", mis.HEURISTICS),
+        heuristic=_choice(props, "heuristic", HEURISTICS),
         skip=_choice(props, "skip", SKIP),
         light_paths=_light_paths(props),
         connections=_choice(props, "connections", CONNECTIONS),
-        points=_choice(props, "points", points.POINTS),
+        points=_choice(props, "points", POINTS),
         decisions=_decisions(props),
         stored_vertices=integer(
             props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED

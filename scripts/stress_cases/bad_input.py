@@ -10,7 +10,7 @@ import numpy as np
 import reference
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from mitsuba_bdpt.plan import Settings
+from mitsuba_bdpt.settings import Settings
 
 import mitsuba as mi  # isort: skip
 

@@ -13,12 +13,15 @@ from unittest.mock import patch
 
 import drjit as dr
 import numpy as np
-from mitsuba_bdpt import bsdf, connect, kernel, rays, rendering, subpath
-from mitsuba_bdpt.points import Points
+from mitsuba_bdpt.geometry import rays
+from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.sampling.points import Points
+from mitsuba_bdpt.transport import bsdf, kernel, techniques
 
 import mitsuba as mi  # isort: skip
 
 from endpoints import Camera, disks_of, dot, lamps_of, length2
+from mitsuba_bdpt.transport import connections
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
@@ -122,7 +125,7 @@ class Capture:
             patch.object(kernel, "random_walk", self._walk),
             patch.object(emitters, "sample_emission", emission),
             patch.object(emitters, "sample_direct", direct),
-            patch.object(connect, "join_endpoints", self._join_endpoints(connect.join_endpoints)),
+            patch.object(techniques, "join_endpoints", self._join_endpoints(techniques.join_endpoints)),
         ):
             stream = k.points.stream("light", mi.UInt64(lane), lane)
             shared = kernel._shared(k, stream)
@@ -132,7 +135,7 @@ class Capture:
 
     def _join_endpoints(self, original):
         def joined(k, emission, stream, counters, active):
-            u = connect._sensor_points(k, stream)
+            u = techniques._sensor_points(k, stream)
             join = k.camera.join(emission.si.p, *u)
             distant = k.camera.join_direction(emission.d, *u)
             self.endpoint[1, 1] = dr.select(emission.infinite, distant, join)
@@ -165,11 +168,11 @@ class Capture:
         dr.make_opaque(walk, self.emission)
         walked.origin = mi.Point3f(walk.previous)
         for edges in range(1, self.depth + 1):
-            vertex = subpath._arrive(k, side, walk)
-            step = subpath._interact(k, side, walk, vertex, stream)
+            vertex = walk._arrive(k, side, walk)
+            step = walk._interact(k, side, walk, vertex, stream)
             visited = self._visit_light if side.adjoint else self._visit_camera
             found = visited(edges, vertex, stream, walk)
-            after = subpath._leave(k, side, walk, vertex, step, stream)
+            after = walk._leave(k, side, walk, vertex, step, stream)
             pair = (vertex.si.wi, step.wo) if side.adjoint else (step.wo, vertex.si.wi)
             asked = densities(vertex.si, *pair)
             dr.eval(vertex, step, list(found.values()), after, asked, list(self.endpoint.values()))
@@ -187,18 +190,18 @@ class Capture:
     def _visit_light(self, edges, vertex, stream, walk):
         found, counters = {}, self._counters()
         if self.plan.arrival:
-            found[edges + 1, 0], _ = connect.arrive(self.kernel, self.emission, vertex, walk)
+            found[edges + 1, 0], _ = techniques.arrive(self.kernel, self.emission, vertex, walk)
             self.endpoint[edges + 1, 0] = self._on_lens(vertex, walk)
         if self.plan.splat:
-            found[edges + 1, 1], _ = connect.splat(self.kernel, vertex, stream, counters)
+            found[edges + 1, 1], _ = techniques.splat(self.kernel, vertex, stream, counters)
         return found
 
     def _visit_camera(self, edges, vertex, stream, walk):
         found, counters = {}, self._counters()
         if self.plan.hit:
-            found[0, edges + 1] = connect.hit_emitter(self.kernel, vertex)
+            found[0, edges + 1] = techniques.hit_emitter(self.kernel, vertex)
         if self.plan.direct:
-            found[1, edges + 1] = connect.next_event(self.kernel, vertex, counters)
+            found[1, edges + 1] = techniques.next_event(self.kernel, vertex, counters)
             self.endpoint[1, edges + 1] = mi.Point2f(self.choice)
         return found
 
@@ -222,7 +225,7 @@ class Capture:
 
     def _inner(self, s, t):
         y, z = self.walked["light"].vertices[s - 2], self.walked["camera"].vertices[t - 2]
-        c = connect.inner(self.kernel, z, y)
+        c = connections.inner(self.kernel, z, y)
         c.active &= y.hit & bsdf.connectible(y.bsdf) & bsdf.connectible(z.bsdf)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         c.active &= ~rays.occluded(self.scene, ray, c.active)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
-from mitsuba_bdpt import mis
+from mitsuba_bdpt.transport import mis
 
 import mitsuba as mi  # isort: skip
 
@@ -135,7 +135,7 @@ class Columns:
 
 class Recursion:
     """The partial sums along both subpaths of each path, and the weight of each strategy from them, in the
-    order of calls of ``subpath.py`` and ``connect.py``."""
+    order of calls of ``subpath.py`` and ``techniques.py``."""
 
     def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic):
         self.path, self.kappa, self.h = path, kappa, heuristic
@@ -199,7 +199,7 @@ class Recursion:
     # -- strategies ---------------------------------------------------------------------------
 
     def arrive(self):
-        """t = 0 (connect.arrive)."""
+        """t = 0 (techniques.arrive)."""
         x, h, k, kappa, before = self.path, self.h, self.path.k, self.kappa, self._last
         if mis.is_absent(kappa.arrival):
             return mi.Float(0)
@@ -211,7 +211,7 @@ class Recursion:
         return h.weight(kappa.arrival, light_side, mi.Float(0))
 
     def hit(self):
-        """s = 0 (connect.hit_emitter)."""
+        """s = 0 (techniques.hit_emitter)."""
         x, h, last = self.path, self.h, self.camera[-1]
         connected = dr.select(x.area, x.direct * x.cos_light[0] / x.dist2[0], x.direct)
         newest = self.kappa.endpoints * x.first if x.k == 1 else connected
@@ -219,7 +219,7 @@ class Recursion:
         return h.weight(1, mi.Float(0), camera_side)
 
     def endpoints(self):
-        """(1,1) (connect.join_endpoints)."""
+        """(1,1) (techniques.join_endpoints)."""
         x, h, kappa = self.path, self.h, self.kappa
         if mis.is_absent(kappa.endpoints):
             return mi.Float(0)
@@ -229,7 +229,7 @@ class Recursion:
         return h.weight(kappa.endpoints, light_side, h.scale(camera_side, self.arrival))
 
     def next_event(self):
-        """s = 1 (connect.next_event)."""
+        """s = 1 (techniques.next_event)."""
         x, h, k = self.path, self.h, self.path.k
         light_side = h.start(dr.select(x.unhittable, 0, x.to_light[1] / x.direct))
         density = x.ratio * x.cos_camera[0]
@@ -238,7 +238,7 @@ class Recursion:
         return h.weight(1, light_side, camera_side)
 
     def inner(self, s):
-        """s and t >= 2 (connect.inner)."""
+        """s and t >= 2 (connections.inner)."""
         x, h, k, kappa = self.path, self.h, self.path.k, self.kappa
         if mis.is_absent(kappa.inner):
             return mi.Float(0)
@@ -253,7 +253,7 @@ class Recursion:
         return h.weight(kappa.inner, light_side, camera_side)
 
     def splat(self):
-        """t = 1 (connect.splat)."""
+        """t = 1 (techniques.splat)."""
         x, h, k, kappa = self.path, self.h, self.path.k, self.kappa
         if mis.is_absent(kappa.splat):
             return mi.Float(0)

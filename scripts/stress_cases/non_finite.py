@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mitsuba_bdpt.mis import HEURISTICS
+from mitsuba_bdpt.settings import HEURISTICS
 
 import mitsuba as mi  # isort: skip
 

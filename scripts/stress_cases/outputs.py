@@ -14,7 +14,8 @@ from pathlib import Path
 from unittest import mock
 
 import reference
-from mitsuba_bdpt import __main__, files, render
+from mitsuba_bdpt.cli import arguments as __main__
+from mitsuba_bdpt.cli import files, render
 
 import mitsuba as mi  # isort: skip
 

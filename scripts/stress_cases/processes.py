@@ -17,7 +17,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import reference
-from mitsuba_bdpt import choice
+from mitsuba_bdpt.planning import choice
 
 import mitsuba as mi  # isort: skip
 

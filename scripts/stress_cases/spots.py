@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from mitsuba_bdpt import suspects
-from mitsuba_bdpt.emitters import Emitters
-from mitsuba_bdpt.kernel import Shared
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.scene import diagnostics
+from mitsuba_bdpt.transport.kernel import Shared
 
 import mitsuba as mi  # isort: skip
 
@@ -82,7 +82,7 @@ def measured(angle: float) -> tuple[list, list, list]:
         path = by_next_event(scene.emitters()[0], to_world, np.deg2rad(angle))
         off.append(path / exact(np.deg2rad(angle)) - 1)
         apart.append(by_emission(scene) / path - 1)
-        texts += suspects.narrow_spots(scene)
+        texts += diagnostics.narrow_spots(scene)
     return off, apart, texts
 
 

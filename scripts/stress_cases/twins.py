@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from mitsuba_bdpt import choice
+from mitsuba_bdpt.planning import choice
 
 import mitsuba as mi  # isort: skip
 

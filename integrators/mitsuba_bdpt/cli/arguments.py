@@ -1,0 +1,176 @@
+"""The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
+
+``render`` renders a scene file; ``explain`` says what such a render would do and what it would leave out;
+``doctor`` explains what the installation found and whether it works. What needs Mitsuba is imported inside
+`main`, because `doctor` has to run where that cannot be imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import mitsuba_bdpt
+
+from ..errors import did_you_mean
+
+PropertyValue = bool | int | float | str
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line `arguments` (default: the process's own) and return its exit status."""
+    options = build_parser().parse_args(arguments)
+    if options.command == "doctor":
+        from . import doctor
+
+        return doctor.run(options.variant)
+    if mitsuba_bdpt.failure is not None:
+        print(f"error: {mitsuba_bdpt.failure}", file=sys.stderr)
+        return 1
+    from . import render
+
+    return render.explain(options) if options.command == "explain" else render.run(options)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors ask whether another command or option was meant."""
+
+    def error(self, message: str) -> NoReturn:
+        known = [*self._option_string_actions, *self._commands()]
+        known += [name for parser in self._commands().values() for name in parser._option_string_actions]
+        wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
+        if wrong:
+            name = wrong[1] or wrong[2]
+            scene = wrong[1] and name.lower().endswith(".xml")
+            question = f"did you mean render {name}?" if scene else did_you_mean(name, known)
+            if name in known:
+                question = f"that is an option of {' and '.join(self._commands_with(name))}"
+            message = f"{message}; {question}".rstrip("; ")
+        super().error(message)
+
+    def _commands(self) -> dict[str, argparse.ArgumentParser]:
+        """The parsers of the commands, by name."""
+        kinds = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
+        return {name: parser for action in kinds for name, parser in action.choices.items()}
+
+    def _commands_with(self, option: str) -> list[str]:
+        """The commands that have this ``option``."""
+        found = [name for name, parser in self._commands().items() if option in parser._option_string_actions]
+        return found or [self.prog]
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    parser = Parser(prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3.")
+    parser.add_argument("--version", action="version", version=mitsuba_bdpt.__version__)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    help_text = "say what is installed and render a tiny image to prove that it works"
+    doctor = commands.add_parser("doctor", help=help_text, description=help_text)
+    doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
+
+    help_text = "render a Mitsuba scene file to an EXR and a PNG image"
+    add_render_arguments(commands.add_parser("render", help=help_text, description=help_text))
+
+    help_text = (
+        "say which strategies a render of a scene file uses, which it skips, and what light none finds"
+    )
+    explain = commands.add_parser("explain", help=help_text, description=help_text)
+    add_scene_arguments(explain)
+    explain.set_defaults(integrator="bdpt", time=None, until_error=None)
+    return parser
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what ``render`` and ``explain`` need of a scene; letters and ``-D``, ``-s``, ``-m`` as in
+    Mitsuba."""
+    add = parser.add_argument
+    add("scene", type=Path, help="scene file in Mitsuba's XML format")
+    add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
+    add("--spp", type=number(int, 1), help="samples per pixel; default: the scene's")
+    text = "value of a parameter $KEY of the scene; may be repeated"
+    add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
+    text = "property of the integrator, such as skip=none; may be repeated"
+    add(
+        "-P",
+        dest="properties",
+        type=property_,
+        action="append",
+        default=[],
+        metavar="K=V",
+        help=text,
+    )
+    text = "index of the sensor; default: %(default)s"
+    add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
+
+
+def add_render_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``render``."""
+    add_scene_arguments(parser)
+    add = parser.add_argument
+    text = "EXR file to write, a PNG comes beside it, folders are made; default: renders/SCENE.exr"
+    add("-o", "--output", type=Path, help=text)
+    text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
+    add("--time", type=number(float, 0), metavar="SECONDS", help=text)
+    text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
+    add("--until-error", type=number(float, 1e-12), metavar="X", help=text)
+    text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
+    add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
+    add("--resume", action="store_true", help="go on from the checkpoint of an earlier, unfinished render")
+    text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
+    add("--scheduler", metavar="ADDRESS", help=text)
+    text = "number of parts of a render on a cluster; default: 4 for each worker"
+    add("--parts", type=number(int, 1), metavar="N", help=text)
+    text = "replace the scene's integrator, keeping depth, hide_emitters, timeout, layers of aov"
+    add("--integrator", metavar="TYPE", help=text)
+    add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
+    text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
+    add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
+
+
+def number(kind: type, minimum: float, maximum: float = math.inf) -> Callable[[str], int | float]:
+    """An argparse type: a finite `kind` between `minimum` and `maximum`."""
+
+    def parse(text: str) -> int | float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = math.nan
+        if not (minimum <= value <= maximum and math.isfinite(value)):
+            most = maximum if kind is int else f"{maximum:g}"
+            limit = "" if maximum == math.inf else f" and at most {most}"
+            name = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(
+                f"got {text!r}, which must be {name} of at least {minimum:g}{limit}"
+            )
+        return value
+
+    return parse
+
+
+def definition(text: str) -> tuple[str, str]:
+    """Split ``KEY=VALUE``."""
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form KEY=VALUE")
+    return key, value
+
+
+def property_(text: str) -> tuple[str, PropertyValue]:
+    """Split ``KEY=VALUE`` and read the value as a Boolean, a whole number, a number or a string."""
+    key, value = definition(text)
+    if value in ("true", "false"):
+        return key, value == "true"
+    for kind in (int, float):
+        try:
+            return key, kind(value)
+        except ValueError:
+            continue
+    return key, value

@@ -1,0 +1,135 @@
+"""Checkpoints of ``python -m mitsuba_bdpt render``: what a render that was killed goes on from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from argparse import Namespace
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+from ..run.snapshot import Snapshot, read
+from .files import check_writable, replacing
+from .loading import elements
+
+
+def path_of(output: Path) -> Path:
+    """Where the checkpoint of an image lies: beside it."""
+    return output.with_suffix(".checkpoint.npz")
+
+
+def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
+    """Meshes, textures, spectra and scene files that a scene file names, and those that the latter name, as
+    far as they exist, each once; raises ``ValueError`` if one of the scene files is not XML. ``definitions``
+    of parameters, for names that hold some."""
+    found = {}
+    _note_files(scene, dict(definitions), [Path()], found)
+    return list(found)
+
+
+def _note_files(scene: Path, values: dict, folders: list[Path], found: dict[Path, None]) -> None:
+    """Add to ``found``, a set in the order of the files, what a scene file names, looked for as Mitsuba does:
+    beside it, then in ``folders``. ``values`` of parameters, to which its own defaults are added."""
+    folders = [scene.parent, *folders]
+
+    def resolved(name, exists):
+        return next((folder / name for folder in folders if exists(folder / name)), None)
+
+    for element in elements(scene):
+        own = {key: _substituted(text, values) for key, text in element.attrib.items()}
+        if element.tag == "default":
+            values.setdefault(own.get("name", ""), own.get("value", ""))
+        elif element.tag == "path" and (folder := resolved(own.get("value", ""), Path.is_dir)):
+            folders.insert(0, folder)
+        name = own.get("value" if own.get("name") == "filename" else "filename")
+        path = resolved(name, Path.is_file) if name else None
+        if path is None:
+            continue
+        is_new = path not in found
+        found[path] = None
+        if element.tag == "include" and is_new:
+            _note_files(path, values, folders, found)
+
+
+def _substituted(text: str, values: dict) -> str:
+    """``text`` with the values of its parameters, longer names first, as one may begin with another."""
+    for key in sorted(values, key=len, reverse=True):
+        text = text.replace(f"${key}", values[key])
+    return text
+
+
+def digest(options: Namespace) -> str:
+    """Of a scene file, the files that it names, the definitions on the command line and the sensor."""
+    found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor]).encode())
+    for path in (options.scene, *named_files(options.scene, options.defines)):
+        found.update(hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def check(options: Namespace, output: Path) -> None:
+    """Raise ``ValueError`` if a checkpoint would be overwritten unasked, ``OSError`` if none can be
+    written."""
+    path = path_of(output)
+    if options.checkpoint is not None:
+        check_writable(path)
+    if options.checkpoint is not None and path.exists() and not options.resume:
+        raise ValueError(
+            f"checkpoint={str(path)!r} of an unfinished render exists; go on by --resume, or delete it."
+        )
+
+
+def start(options: Namespace, output: Path) -> Snapshot:
+    """The snapshot to go on from; raises ``ValueError`` if there is none, or one of another scene."""
+    path = path_of(output)
+    if not path.exists():
+        raise ValueError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
+    kept = read(path)
+    if kept.progress.get("scene") != digest(options):
+        raise ValueError(
+            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
+            "it names, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
+            "or delete it."
+        )
+    return kept
+
+
+class Checkpoints:
+    """Writes the checkpoints of one render: `after_pass` every so many minutes, `write` at once."""
+
+    def __init__(self, options: Namespace, output: Path):
+        self.path, self._seconds, self._scene = path_of(output), 60 * options.checkpoint, digest(options)
+        self._last, self._report = time.monotonic(), None
+
+    def after_pass(self, report) -> None:
+        """To be called with every ``PassReport``."""
+        self._report = report
+        if time.monotonic() - self._last >= self._seconds:
+            self.write()
+
+    def write(self) -> None:
+        """Write what the last report knows, if there was one. A full disk must not cost the render: it is
+        said on standard error, and the former checkpoint stays."""
+        if self._report is None:
+            return
+        snapshot = self._report.snapshot()
+        whole = replace(snapshot, progress=snapshot.progress | {"scene": self._scene})
+        try:
+            with replacing(self.path) as temporary, temporary.open("wb") as file:
+                file.write(whole.to_bytes())
+                file.flush()
+                # Before the name, which would stand for half a file after a power cut.
+                os.fsync(file.fileno())
+        except OSError as error:
+            print(f"warning: no checkpoint {str(self.path)!r}: {error}", file=sys.stderr)
+        self._last = time.monotonic()
+
+    def end(self, finished: bool) -> None:
+        """The last checkpoint of a render that can go on; none of one that is ``finished``."""
+        if finished:
+            self.path.unlink(missing_ok=True)
+        else:
+            self.write()

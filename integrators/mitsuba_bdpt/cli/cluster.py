@@ -1,0 +1,214 @@
+"""One render on many machines: parts with seeds of their own on the workers of ``dask.distributed``.
+
+The client asks the pilot once; its decisions go to all. Each part is an independent render whose raw sums
+come back as a `Snapshot`; they are added in the order of the parts, so the image does not depend on which
+worker made which, nor on whether one of them was lost.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import uuid
+from argparse import Namespace
+from collections import deque
+from collections.abc import Callable
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..run.rendering import RAYS, PassReport
+from ..run.snapshot import Snapshot
+from .loading import load
+
+# Parts for each worker: the last one that is waited for then takes a quarter of what a worker does in all.
+PARTS_PER_WORKER = 4
+
+# Samples per pixel of a part at least: shorter point sequences are worse, and `variance` needs 8.
+LEAST_SPP = 16
+
+# Between seeds of the parts, 2^32 / golden ratio: renders whose own seeds are neighbours share none.
+STRIDE = 0x9E3779B9
+
+one_at_a_time = threading.Lock()
+
+
+def check_settings(settings) -> None:
+    """Raise ``ValueError`` for parameters that would mean something else in each part."""
+    for name in ("timeout", "until_error"):
+        value = getattr(settings, name)
+        if value > 0 or name == "timeout" and value == 0:
+            raise ValueError(f"scheduler with {name}={value} is not possible: each part would end by itself.")
+    if found := [name for name in ("duv_dx", "duv_dy") if name in settings.aovs]:
+        raise ValueError(
+            f"scheduler with aovs={settings.aovs!r} is not possible: {found[0]} depends on the samples per "
+            "pixel of a part; render it apart."
+        )
+
+
+def parts_of(spp: int, count: int, seed: int) -> list[tuple[int, int]]:
+    """Seed and samples per pixel of ``count`` parts, fewer if they would be shorter than `LEAST_SPP`."""
+    count = max(1, min(count, spp // LEAST_SPP))
+    return [((seed + i * STRIDE) % 2**32, spp // count + (i < spp % count)) for i in range(count)]
+
+
+class Merged:
+    """Snapshots of parts added up in the order of the parts, whatever the order in which they come."""
+
+    def __init__(self):
+        self.snapshot, self._next, self._waiting = None, 0, {}
+
+    def add(self, index: int, snapshot: Snapshot) -> None:
+        """Add the part number ``index``; a part that came before is ignored."""
+        if index >= self._next:
+            self._waiting[index] = snapshot
+        while self._next in self._waiting:
+            part = self._waiting.pop(self._next)
+            self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
+            self._next += 1
+
+    @property
+    def count(self) -> int:
+        """Parts that have come."""
+        return self._next + len(self._waiting)
+
+
+def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]):
+    """Render as the command line ``options`` say on the cluster ``options.scheduler``, into the sensor's
+    film; returns the statistics, whose seconds are those of the pilot and all parts together, and whether
+    Ctrl-C came: then they are of the parts before the first one that had not come. ``on_part`` is called
+    after each part. Raises what `connected` does."""
+    started, merged, interrupted = time.perf_counter(), Merged(), False
+    with connected(options.scheduler) as client:
+        job = _job(scene, integrator, options, spp)
+        asked = integrator.statistics  # before the parts, whose own take their place
+        count = options.parts or PARTS_PER_WORKER * worker_count(client)
+        parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
+        try:
+            for index, data in results(client, render_part, parts):
+                merged.add(index, Snapshot.from_bytes(data))
+                done = merged.snapshot
+                if done is not None:
+                    rays = sum(done.progress["counts"][name] for name in RAYS)
+                    seconds = time.perf_counter() - started
+                    on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
+        except KeyboardInterrupt:
+            interrupted = True
+    if merged.snapshot is None:
+        return {"passes": []}, interrupted
+    integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
+    return _with_pilot(integrator.statistics, asked), interrupted
+
+
+def _with_pilot(parts: dict, asked: dict) -> dict:
+    """Statistics of the ``parts``, which know the pilot's decisions alone, with what it left when it was
+    ``asked``; nothing where decisions were given by hand."""
+    if not asked:
+        return parts
+    sums = {
+        name: {key: number + asked[name][key] for key, number in parts[name].items()}
+        for name in ("seconds", "kernels")
+    }
+    return parts | {name: asked[name] for name in ("no_pilot", "non_finite_in_pilot", "skipped")} | sums
+
+
+def _job(scene, integrator, options: Namespace, spp: int) -> str:
+    """What a worker needs to know of each part, as JSON: the scene file by its absolute path, the options
+    that `loading.load` reads, the pilot's decisions."""
+    properties, settings = dict(options.properties), integrator.settings
+    if settings.decisions is None:  # an empty list where there is nothing to choose
+        decided = integrator.decide(scene, options.sensor, options.seed, spp)
+        properties["decisions"] = json.dumps(decided)
+    names = ("variant", "defines", "integrator", "sensor", "time", "until_error")
+    kept = {name: getattr(options, name) for name in names}
+    kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
+    return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
+
+
+def results(client, function, arguments):
+    """Index and result of ``function(*arguments[index])`` as they come from the workers of a
+    ``distributed.Client``, each index once. A worker has one call at a time; where none are left to begin,
+    idle ones take over calls that others still have, so that one slow machine does not hold up the rest: a
+    call has to give the same wherever it runs. That of a lost worker is made by another one."""
+    from distributed import as_completed
+
+    to_do, running, done = deque(range(len(arguments))), {}, set()
+    pending = as_completed()
+
+    def submit(index):
+        future = client.submit(function, *arguments[index], pure=False)
+        running[future] = index
+        pending.add(future)
+
+    def fill():
+        workers = max(1, worker_count(client))  # none for a moment: another one may come
+        while len(running) < workers and to_do:
+            submit(to_do.popleft())
+        for index in [i for i in running.values() if i not in done]:
+            if len(running) < workers and list(running.values()).count(index) == 1:
+                submit(index)
+
+    try:
+        fill()
+        while len(done) < len(arguments):
+            future = next(pending)
+            index = running.pop(future)
+            if index not in done:
+                done.add(index)
+                yield index, _result(future, index)
+            fill()
+    finally:
+        client.cancel(list(running), force=True)
+
+
+def _result(future, index: int):
+    try:
+        return future.result()
+    except Exception as error:
+        text = str(error) or type(error).__name__
+        raise RuntimeError(f"part {index} failed on the cluster: {text}") from error
+
+
+def worker_count(client) -> int:
+    """Workers that the scheduler of a ``distributed.Client`` has now."""
+    return len(client.scheduler_info(n_workers=-1)["workers"])
+
+
+@contextmanager
+def connected(address: str):
+    """A ``distributed.Client`` of the scheduler at ``address``. Raises ``ValueError`` if distributed is not
+    installed or the scheduler has no worker, ``OSError`` if there is no such scheduler."""
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ValueError(
+            "scheduler needs dask.distributed; install it with: pip install 'mitsuba-bdpt[cluster]'"
+        ) from error
+    with Client(address, timeout="20s") as client:
+        if not worker_count(client):
+            raise ValueError(f"scheduler={address!r} has no worker; start some with `dask worker`.")
+        yield client
+
+
+def render_part(job: str, seed: int, spp: int) -> bytes:
+    """On a worker: one part of a `_job`, as `Snapshot.to_bytes`. A process renders one part at a time, for
+    each takes all cores."""
+    with one_at_a_time:
+        options, scene, integrator = _loaded(job)
+        mi.set_variant(options.variant)  # of this thread
+        reports = []
+        integrator.on_pass = reports.append
+        integrator.render(scene, options.sensor, seed, spp, develop=False)
+        integrator.on_pass = None
+        return reports[-1].snapshot().image_only().to_bytes()
+
+
+@lru_cache(maxsize=1)
+def _loaded(job: str):
+    """Options, scene and integrator of a `_job`; a worker loads them once."""
+    options = Namespace(**json.loads(job))
+    options.scene = Path(options.scene)
+    return options, *load(options)

@@ -1,0 +1,158 @@
+"""``python -m mitsuba_bdpt doctor``: what is installed, and whether it works.
+
+Only the standard library and `llvm` are imported here: the report must come out where Mitsuba
+cannot be imported. Whatever may fail or abort the process runs in a child.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mitsuba_bdpt
+
+from ..host import llvm
+
+PACKAGES = ("mitsuba", "drjit", "numpy", "OpenEXR", "colour-science", llvm.WHEEL)
+TIME_LIMIT = 300
+"""Seconds for the test image: a cold start takes two or three, a busy machine longer."""
+
+PROBE = """
+import json, sys
+import mitsuba_bdpt
+import drjit as dr, mitsuba as mi
+print(json.dumps({"variants": mi.variants()}), flush=True)
+mi.set_variant(sys.argv[1])
+scene = mi.cornell_box()
+scene["integrator"] = {"type": "bdpt", "max_depth": 4}
+scene["sensor"]["film"].update(width=16, height=16)
+image = mi.render(mi.load_dict(scene), spp=16)
+print(json.dumps({
+    "llvm": ".".join(map(str, dr.detail.llvm_version())) if "llvm" in sys.argv[1] else "",
+    "mean": float(dr.mean(image, axis=None).array[0]),
+}), flush=True)
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report. `state` is ``ok``, ``note`` or ``FAIL``."""
+
+    state: str
+    subject: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.state:>4}  {self.subject:<20}{self.text}"
+
+
+def run(variant: str) -> int:
+    """Print the report for `variant`; 0 if bdpt works with it, 1 if not."""
+    findings = [*versions(), llvm_library(), kernel_cache()]
+    for finding in findings:
+        print(finding, flush=True)
+    if mitsuba_bdpt.failure is None:
+        found = render_in_child(variant)
+        print(*found, sep="\n", flush=True)
+        findings += found
+    works = all(finding.state != "FAIL" for finding in findings)
+    print("mitsuba_bdpt works." if works else "mitsuba_bdpt does not work; see FAIL above.")
+    return 0 if works else 1
+
+
+def versions() -> list[Finding]:
+    """Versions of Python, the platform, this package and those it uses."""
+    system = f"{platform.system()} {platform.machine()}"
+    findings = [
+        Finding("ok", "python", f"{platform.python_version()}, {sys.executable}"),
+        Finding("ok", "platform", f"{system}, {os.cpu_count()} processors"),
+        Finding("ok", "mitsuba-bdpt", mitsuba_bdpt.__version__),
+    ]
+    for package in PACKAGES:
+        try:
+            findings.append(Finding("ok", package, importlib.metadata.version(package)))
+        except importlib.metadata.PackageNotFoundError:
+            # The LLVM wheel exists for one platform only; `llvm_library` says if that matters.
+            needed = package != llvm.WHEEL
+            text = f"not installed; mend it with: python -m pip install {package}"
+            state = "FAIL" if needed else "note"
+            findings.append(Finding(state, package, text if needed else "not installed"))
+    return findings
+
+
+def llvm_library() -> Finding:
+    """Which LLVM library was chosen and why, or why the package cannot be imported."""
+    failure, choice = mitsuba_bdpt.failure, mitsuba_bdpt.llvm_choice
+    if failure is not None:
+        subject = "LLVM" if isinstance(failure, llvm.LLVMNotFoundError) else "import"
+        return Finding("FAIL", subject, str(failure))
+    if choice.version in llvm.KNOWN_GOOD or choice.origin == "none":
+        return Finding("ok", "LLVM", str(choice))
+    known = ", ".join(map(str, llvm.KNOWN_GOOD))
+    return Finding("note", "LLVM", f"{choice}; versions known to work: {known}")
+
+
+def kernel_cache() -> Finding:
+    """Whether Dr.Jit can keep compiled kernels for the next process."""
+    folder = Path(os.environ.get("DRJIT_CACHE_DIR") or Path.home() / ".drjit")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return Finding("ok", "kernel cache", f"{folder} is writable")
+    except OSError as error:
+        text = f"{folder} is not writable ({error.strerror}): every process compiles anew. "
+        return Finding("note", "kernel cache", text + "Set DRJIT_CACHE_DIR to a writable directory.")
+
+
+def render_in_child(
+    variant: str, start: Callable[..., subprocess.CompletedProcess] = subprocess.run
+) -> list[Finding]:
+    """Render 16x16 pixels of the Cornell box in a child process and judge how it ended."""
+    command = [sys.executable, "-c", PROBE, variant]
+    try:
+        child = start(command, capture_output=True, text=True, timeout=TIME_LIMIT)
+    except subprocess.TimeoutExpired:
+        return [Finding("FAIL", "test image", f"not finished after {TIME_LIMIT} seconds")]
+    said: dict = {}
+    for line in child.stdout.splitlines():
+        if line.startswith("{"):
+            said.update(json.loads(line))
+    findings = []
+    if "variants" in said:
+        findings.append(Finding("ok", "variants", ", ".join(said["variants"])))
+    return [*findings, judge(child, said, variant)]
+
+
+def judge(child: subprocess.CompletedProcess, said: dict, variant: str) -> Finding:
+    """Put the end of the `child`, which printed `said`, into words."""
+    last = (child.stderr.strip().splitlines() or ["it printed no error"])[-1]
+    if child.returncode < 0:
+        name = signal.Signals(-child.returncode).name
+        text = f"the process rendering it was killed by {name} ({last})."
+        if variant.startswith("llvm"):
+            text += f" The usual reason is an LLVM version that Dr.Jit cannot use. {crash_remedy()}"
+        return Finding("FAIL", "test image", text)
+    if child.returncode > 0:
+        return Finding("FAIL", "test image", last)
+    mean = said.get("mean", float("nan"))
+    # The box reflects less than its lamp emits, and no part of it is black.
+    if not 0.01 < mean < 10:
+        return Finding("FAIL", "test image", f"rendered with {variant}, but its mean is {mean:g}")
+    with_llvm = f", LLVM {said['llvm']}" if said.get("llvm") else ""
+    return Finding("ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}")
+
+
+def crash_remedy() -> str:
+    """What to do after a crash: another LLVM."""
+    if os.environ.get(llvm.VARIABLE) and mitsuba_bdpt.llvm_choice.origin == "variable":
+        return f"Unset {llvm.VARIABLE}; it names {os.environ[llvm.VARIABLE]!r}."
+    return llvm.remedy(llvm.Machine.here())

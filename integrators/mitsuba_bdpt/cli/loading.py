@@ -1,0 +1,391 @@
+"""From a command line to a scene and the integrator that renders it."""
+
+from __future__ import annotations
+
+import codecs
+import pkgutil
+import re
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mitsuba as mi
+
+from ..errors import did_you_mean
+from ..image import features
+
+KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
+"""What an integrator that replaces the scene's takes over: the same paths, in the same time."""
+
+_ADJOINT = ("prb", "prb_basic", "prb_projective", "prbvolpath")
+
+DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
+"""``max_depth`` of integrators whose paths end as early where the scene file gives them none."""
+
+NOT_CARRIED = {
+    "moment": "second moments, which bdpt has not: its parameter variance adds the variance of each pixel",
+    "stokes": "Stokes vectors, which bdpt has not: it is not polarized",
+}
+"""Integrators around another whose layers `bdpt` cannot have."""
+
+AROUND = ("aov", *NOT_CARRIED)
+"""Mitsuba's integrators around another one."""
+
+LISTED = 8
+"""Names that a message lists, at most."""
+
+# What files in other encodings than UTF-8 begin with: a byte order mark, or the first "<" of a file without.
+# Of two that fit the first counts.
+_STARTS = (
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (b"<\0\0\0", "utf-32-le"),
+    (b"\0\0\0<", "utf-32-be"),
+    (b"<\0", "utf-16-le"),
+    (b"\0<", "utf-16-be"),
+)
+
+
+def elements(file: Path) -> list[ElementTree.Element]:
+    """All elements of a scene file, in its order; raises ``ValueError`` if it is not XML."""
+    text = _decoded(file.read_bytes())
+    try:
+        # Mitsuba takes comments that hold two hyphens, XML does not.
+        return list(ElementTree.fromstring(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)).iter())
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ValueError(f"{str(file)!r} is not well-formed XML: {error}") from error
+
+
+def _decoded(data: bytes) -> str:
+    """The text of a scene file, whose encoding Mitsuba tells by its first bytes."""
+    if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)[\"']", data, re.IGNORECASE):
+        return data.decode("latin-1")
+    encoding = next((name for start, name in _STARTS if data.startswith(start)), "utf-8-sig")
+    return data.decode(encoding, errors="replace")
+
+
+def in_proportion(scene: Path, definitions: dict) -> dict:
+    """``definitions`` with the height ``resolution_y`` that belongs to the ``resolution`` among them, if the
+    scene file has such defaults and it is not given: the image keeps its proportions."""
+    if "resolution" not in definitions or "resolution_y" in definitions:
+        return definitions
+    try:
+        defaults = [element for element in elements(scene) if element.tag == "default"]
+    except ValueError:  # Mitsuba, which takes more for XML, has the last word
+        return definitions
+    # Of several with one name Mitsuba takes the first.
+    known = {element.get("name"): element.get("value", "") for element in reversed(defaults)}
+    texts = str(definitions["resolution"]), known.get("resolution", ""), known.get("resolution_y", "")
+    if not all(text.strip().isdecimal() for text in texts) or not int(texts[1]):
+        return definitions
+    asked, width, height = map(int, texts)
+    return definitions | {"resolution_y": max(round(asked * height / width), 1)}
+
+
+def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+    """Load the scene and the integrator to render it with."""
+    if options.integrator == "":
+        raise ValueError("integrator='' names no integrator; use for example bdpt, or leave it out.")
+    if options.variant not in mi.variants():
+        known = ", ".join(mi.variants())
+        question = did_you_mean(options.variant, mi.variants())
+        raise ValueError(
+            f"variant={options.variant!r} is not one of Mitsuba's: {known}; {question}".rstrip("; ")
+        )
+    check_file(options.scene)
+    try:
+        mi.set_variant(options.variant)
+    except ImportError as error:
+        raise ValueError(
+            f"variant={options.variant!r} cannot be used on this machine ({str(error).rstrip('.')}); "
+            "use an LLVM variant, for example llvm_ad_rgb."
+        ) from error
+    mi.file_resolver().prepend(str(options.scene.resolve().parent))
+    try:
+        return _load(options)
+    except RuntimeError as error:
+        better = _in_words(str(error), options)
+        if better is None:
+            raise
+        raise ValueError(better) from error
+
+
+def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+    """`load`, of a scene file that exists and with the variant set."""
+    overrides = dict(options.properties)
+    if options.time is not None:
+        overrides["timeout"] = options.time
+    if options.integrator is not None:
+        _check_kind(options.integrator)
+    config = mi.parser.ParserConfig(options.variant)
+    defines = in_proportion(options.scene, dict(options.defines))
+    state = mi.parser.parse_file(config, str(options.scene), **defines)
+    _check_root(state, options.scene)
+    _check_film_sizes(state)
+    # Nodes are in the order of the file: an integrator comes before those nested in it.
+    kind = mi.ObjectType.Integrator
+    node = next((node for node in state.nodes if node.type == kind), None)
+    if options.until_error is not None:
+        used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
+        if used != "bdpt":
+            raise ValueError(
+                f"until_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
+            )
+        overrides |= {"until_error": options.until_error, "variance": True}
+    if options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator):
+        if options.integrator != "aov" or not overrides.get("aovs"):
+            raise ValueError(
+                f"integrator={options.integrator} is for one around another, which the command line cannot "
+                "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
+            )
+    if node is not None:
+        replace_integrator(state.nodes, node, options.integrator, overrides)
+    mi.parser.transform_all(config, state)
+    scene = mi.parser.instantiate(config, state)
+    if node is not None:
+        return scene, scene.integrator()
+    kind = options.integrator or "bdpt"
+    made = mi.load_dict({"type": kind, **overrides})
+    if not isinstance(made, mi.Integrator):
+        raise ValueError(_no_integrator(kind, f"of class {made.class_name()}"))
+    return scene, made
+
+
+def _check_kind(name: str) -> None:
+    """Raise ``ValueError`` if the plugin ``name`` is known to be no integrator. (What those in Python are is
+    known when they are made, and what is no plugin is answered then.)"""
+    kind = mi.PluginManager.instance().plugin_type(name)
+    if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
+        raise ValueError(_no_integrator(name, f"of type {kind.name.lower()}"))
+
+
+def _no_integrator(name: str, what: str) -> str:
+    return f"integrator={name!r} is a plugin {what}, no integrator; use for example bdpt"
+
+
+def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
+    """Raise ``ValueError`` if the file ``scene`` holds one object that is no scene."""
+    root = state.nodes[0]
+    if root.type != mi.ObjectType.Scene:
+        held = f"{root.type.name.lower()} {root.props.plugin_name()}"
+        raise ValueError(
+            f"scene={str(scene)!r} holds a single object, {held}, and no <scene>: write one around it, with "
+            "a sensor and lights."
+        )
+
+
+def _check_film_sizes(state: mi.parser.ParserState) -> None:
+    """Raise ``ValueError`` for films without pixels, of which Mitsuba says that they see too much."""
+    for node in state.nodes:
+        for name in ("width", "height") if node.type == mi.ObjectType.Film else ():
+            if isinstance(size := node.props.get(name, 1), int) and size < 1:
+                raise ValueError(f"{name}={size} of the film must be 1 or more pixels.")
+
+
+def check_file(scene: Path) -> None:
+    """Raise ``ValueError`` if the ``scene`` file does not exist."""
+    if not scene.is_file():
+        raise ValueError(f"scene={str(scene)!r} is not a file; {_scenes_near(scene)}")
+
+
+def _scenes_near(scene: Path) -> str:
+    """What there is in place of the ``scene`` file that does not exist."""
+    folder = scene if scene.is_dir() else scene.parent
+    if not folder.is_dir():
+        return f"there is no folder {str(folder)!r}"
+    there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() == ".xml")
+    if not there:
+        return f"the folder {str(folder)!r} has no scene files (.xml)"
+    more = f" and {len(there) - LISTED} more" if len(there) > LISTED else ""
+    listed = f"the folder {str(folder)!r} has the scene files {', '.join(there[:LISTED])}{more}"
+    return f"{listed}; {did_you_mean(scene.name, there)}".rstrip("; ")
+
+
+def _files_near(scene: Path, name: str) -> str:
+    """Where Mitsuba looked for a file of the ``scene`` that does not exist, and what it may be; empty if the
+    scene file itself does not have this ``name``, of which Mitsuba may tell the last part only."""
+    try:
+        texts = [element.get("value", "") for element in elements(scene)]
+    except ValueError:  # Mitsuba takes more for XML
+        return ""
+    files = [scene.parent / text for text in texts if text == name or Path(text).name == name]
+    if not files:
+        return ""
+    folder = files[0].parent
+    if not folder.is_dir():
+        return f"; there is no folder {str(folder)!r}: names of files start at the folder of the scene file"
+    question = did_you_mean(files[0].name, sorted(path.name for path in folder.iterdir()))
+    return f"; it is not in the folder {str(folder)!r}; {question}".rstrip("; ")
+
+
+def _in_words(error: str, options: Namespace) -> str | None:
+    """What to say instead of Mitsuba's ``error`` about a name that it does not know, which is alike; None
+    for other errors."""
+    unused = [name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.M)]
+    if "unused parameters" in error and unused:
+        known = parameters(options.scene)
+        named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
+        text = f"-D {', '.join(unused)}: no parameter of the scene; it has {named or 'none'}; "
+        return (text + "".join(did_you_mean(name, known) for name in unused)).rstrip("; ")
+    if rejected := _rejected(error, options):
+        return rejected
+    missing = re.search(r"undefined parameter: \$(\w+)", error)
+    if missing:
+        return f"{error}; give it a value: -D {missing[1]}=VALUE"
+    missing = re.search(
+        r'"([^"]+)": (I/O error while attempting to open file: No such|file not found)', error
+    )
+    if missing:
+        return f"{error}{_files_near(options.scene, missing[1])}"
+    strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
+    given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
+    if given:
+        return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
+    other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
+    if other and other[1] == options.integrator:
+        return _no_integrator(other[1], f"of type {other[2]}")
+    missing = re.search(r'Plugin "([^"]*)" not found', error)
+    if not missing:
+        return None
+    question = did_you_mean(missing[1], plugins())
+    if missing[1] == options.integrator:
+        return f"integrator={missing[1]!r} is not a plugin; {question or 'use for example bdpt'}".rstrip()
+    return f"{error} {question.capitalize()}".rstrip() if question else None
+
+
+def _rejected(error: str, options: Namespace) -> str | None:
+    """What to say of Mitsuba's ``error`` about a value, if it comes from the command line; else None."""
+    found = re.search(
+        r'could not parse ([\w ]+) value "([^"]*)".*|Property "\w+": value (\S+) is out of.*', error
+    )
+    if not found:
+        return None
+    value = found[2] if found[3] is None else found[3]
+    given = [f"-D {name}={text}" for name, text in options.defines if text == value]
+    if not given:
+        return None
+    place = re.search(r"\(line \d+, col \d+\)", error)
+    where = f" {place[0]}" if place else ""
+    # Where several have the value, Mitsuba does not tell which of them it is.
+    return f"{' or '.join(given)}: {found[0].rstrip('.')}, in {str(options.scene)!r}{where}; give it another"
+
+
+def parameters(scene: Path) -> dict[str, str]:
+    """The parameters that ``-D`` can set in a scene file and those that it includes, with their defaults,
+    empty if there are none."""
+    found, files, done = {}, [scene], set()
+    while files:
+        file = files.pop(0)
+        if file in done or not file.is_file():
+            continue
+        done.add(file)
+        try:
+            there = elements(file)
+        except ValueError:  # Mitsuba takes more for XML
+            continue
+        for element in there:
+            for value in element.attrib.values():
+                found |= {name: found.get(name, "") for name in re.findall(r"\$(\w+)", value)}
+            if element.tag == "default":
+                name = element.get("name", "")
+                found[name] = found.get(name) or element.get("value", "")
+            if element.tag == "include":
+                files.append(scene.parent / element.get("filename", ""))
+    return found
+
+
+def plugins() -> list[str]:
+    """Names of the plugins of Mitsuba and of this package; others may have been registered too."""
+    modules = [module.name for module in pkgutil.iter_modules(mi.ad.integrators.__path__)]
+    files = (Path(mi.__file__).parent / "plugins").iterdir()
+    return ["bdpt", *modules, *sorted(path.stem for path in files)]
+
+
+def replace_integrator(
+    nodes: Sequence, node, kind: str | None, overrides: Mapping[str, bool | int | float | str]
+) -> None:
+    """Make the integrator ``node``, one of ``nodes``, one of another ``kind`` if that is set, with
+    ``overrides``.
+
+    Of integrators around another one (`AROUND`), with their layers, `bdpt` takes the place of all of them,
+    for it has layers of its own; others take the place of the innermost. Raises ``ValueError`` for layers
+    that cannot be kept."""
+    given = node.props
+    if kind == "bdpt" and given.plugin_name() in AROUND:
+        given, layers = _layers(nodes, node)
+        overrides = layers | overrides
+    while kind not in (None, *AROUND) and given.plugin_name() in AROUND:
+        node = _nested(nodes, node)[1]
+        given = node.props
+    node.props = integrator_properties(given, kind, overrides)
+
+
+def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
+    """The properties of the innermost integrator of ``node``, which is around others, and what `bdpt` takes
+    over from those: layers, named as in Mitsuba's film, and the outermost ``timeout``, which counts there."""
+    aovs, carried, prefix = [], {}, ""
+    while (kind := node.props.plugin_name()) in AROUND:
+        if kind in NOT_CARRIED:
+            raise ValueError(
+                f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
+                f"adds {NOT_CARRIED[kind]}; in the scene file, write the inner integrator alone."
+            )
+        aovs += [prefix + pair for pair in features.pairs(node.props.get("aovs", ""))]
+        if "timeout" in node.props:
+            carried.setdefault("timeout", node.props["timeout"])
+        name, node = _nested(nodes, node)
+        prefix += f"{name}."
+    if kind == "bdpt":
+        aovs += features.pairs(node.props.get("aovs", ""))
+    return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})
+
+
+def _nested(nodes: Sequence, node) -> tuple[str, object]:
+    """Name and node of the one integrator inside of ``node``, which is around it."""
+    held = {key: node.props[key] for key in node.props.keys()}  # noqa: SIM118 (not a dict)
+    held = {key: value for key, value in held.items() if isinstance(value, mi.Properties.ResolvedReference)}
+    found = [(key, nodes[reference.index()]) for key, reference in held.items()]
+    found = [(key, inner) for key, inner in found if inner.type == mi.ObjectType.Integrator]
+    if len(found) != 1:
+        names = ", ".join(f"{key!r} ({inner.props.plugin_name()})" for key, inner in found)
+        remedy = "leave out the others" if found else "write one inside of it"
+        raise ValueError(
+            f"integrator: the scene's integrator {node.props.plugin_name()} is around {names or 'none'}; to "
+            f"replace the one inside, there has to be just one: in the scene file, {remedy}."
+        )
+    return found[0]
+
+
+def integrator_properties(
+    given: mi.Properties, kind: str | None, overrides: Mapping[str, bool | int | float | str]
+) -> mi.Properties:
+    """The `given` properties with `overrides`, for an integrator of another `kind` if it is set."""
+    if kind is None or kind == given.plugin_name():
+        properties = mi.Properties(given)
+    else:
+        properties = mi.Properties(kind)
+        properties.set_id(given.id())
+        if given.plugin_name() in DEPTHS:
+            properties["max_depth"] = DEPTHS[given.plugin_name()]
+            properties.mark_queried("max_depth")
+        for key in KEPT:
+            if key in given:
+                properties[key] = given[key]
+                # Not every integrator has all of them; that is no mistake of the user's.
+                properties.mark_queried(key)
+    for key, value in overrides.items():
+        properties[key] = value
+    return properties
+
+
+def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
+    """The sensor with this `index`."""
+    sensors = scene.sensors()
+    if not sensors:
+        raise ValueError("The scene has no sensor; add one to the scene file.")
+    if index >= len(sensors):
+        raise ValueError(f"sensor={index} is not in the scene; the last one is {len(sensors) - 1}.")
+    return sensors[index]

@@ -1,0 +1,159 @@
+"""The one place where rays start.
+
+Mitsuba offsets ray origins by 8.9e-5 (1 + max|p|), which swallows small scenes whole and leaves
+gaps in large ones. Here the offset along the geometric normal follows from the rounding error of
+the hit itself: ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t, reach)`` with maximum norms, where ``o`` and ``t``
+belong to the ray that found ``p``, and ``reach`` is how far the numbers go that hits on its shape are
+computed from, as far as their rounding moves hits along the normal (`reaches`). It scales with the scene.
+Visibility rays end short of their target by the target's own offset, not by a fraction of the distance.
+Towards spheres and cylinders they have to end earlier; where these are so small that this would pass by what
+stands before them, the ray asks what it meets first (`sight`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .rounding import FAR, LEAST_COSINE, QUADRIC_ULPS, Errors, ShapeErrors, met, rounding_offset
+
+
+@dataclass
+class Anchor:
+    """A point that rays may start from or end at.
+
+    ``p`` position, ``n`` geometric normal of unit length (zero for a point in free space),
+    ``offset`` distance in scene units by which a ray leaves the surface along ``n``, ``curvature``
+    1 / radius on spheres and cylinders, negative where normals point inwards, 0 elsewhere.
+    """
+
+    p: object
+    n: object
+    offset: object
+    curvature: object
+
+    def towards(self, d):
+        """The start of a ray that leaves into direction ``d`` (any length)."""
+        return self.p + self.n * dr.mulsign(self.offset, dr.dot(self.n, d))
+
+
+def surface_anchor(si, ray, shape_errors: ShapeErrors) -> Anchor:
+    """Anchor of the hit ``si`` that ``ray`` found."""
+    errors = shape_errors.at(si.shape, si.is_valid(), si.instance, si.prim_index)
+    offset = rounding_offset(si.p, ray.o, si.t, errors.reach)
+    offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * errors.starts
+    return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
+
+
+def sampled_anchor(p, n, reference, errors: Errors | None) -> Anchor:
+    """Anchor of a point sampled on a shape of these ``errors``, None off shapes, to be joined with the point
+    ``reference``."""
+    offset = rounding_offset(p, reference, dr.norm(p - reference), errors.reach if errors else 0)
+    return Anchor(mi.Point3f(p), mi.Normal3f(n), offset, mi.Float(errors.ends if errors else 0))
+
+
+def free_anchor(p) -> Anchor:
+    """Anchor of a point without surface: a point light, a pinhole, a point of a lens."""
+    return Anchor(mi.Point3f(p), mi.Normal3f(0), mi.Float(0), mi.Float(0))
+
+
+def spawn(anchor: Anchor, d, like) -> mi.Ray3f:
+    """Unbounded ray from ``anchor`` along unit ``d``; time and wavelengths as in ``like``."""
+    return mi.Ray3f(anchor.towards(d), d, like.time, like.wavelengths)
+
+
+def end_point(a: Anchor, b: Anchor):
+    """Where a visibility ray from ``a`` to ``b`` ends: just before ``b``'s surface."""
+    end = b.towards(a.p - b.p)
+    # Known while the kernel is recorded: a scene without spheres and cylinders does none of what follows.
+    if b.curvature.state == dr.VarState.Literal and b.curvature[0] == 0:
+        return end
+    back = a.p - end
+    return end + back * dr.minimum(_early(back, b), 0.01)
+
+
+def _early(back, b: Anchor):
+    """The share of a ray's length, against the direction ``back``, in which it may meet the sphere or
+    cylinder of its end ``b`` already. On the far side of one so small that the ray would pass its front this
+    is half the chord at most: the front is in the way, the open end of a cylinder is not."""
+    dist = dr.norm(back)
+    along = dr.dot(b.n, back)
+    curvature = dr.abs(b.curvature)
+    # The error of t grows towards the outline, as 1 / cos.
+    cos = dr.maximum(dr.abs(along) / dist, LEAST_COSINE)
+    early = (QUADRIC_ULPS * 2.0**-24) * dist * curvature / cos
+    behind = (along * b.curvature < -2) & (dist * curvature > FAR)
+    return dr.select(behind, dr.minimum(early, dr.abs(along) / (dist * dist * curvature)), early)
+
+
+def segment_to(a: Anchor, end, like) -> mi.Ray3f:
+    """Ray from ``a`` to the point ``end``; time and wavelengths as in ``like``."""
+    o = a.towards(end - a.p)
+    between = end - o
+    dist = dr.norm(between)
+    return mi.Ray3f(o, between / dist, dist, like.time, like.wavelengths)
+
+
+def segment(a: Anchor, b: Anchor, like) -> mi.Ray3f:
+    """Ray from ``a`` that ends just before ``b``; time and wavelengths as in ``like``."""
+    return segment_to(a, end_point(a, b), like)
+
+
+@dataclass
+class Own:
+    """What a visibility ray ends at, by its number (see `met`), and the distance ``t`` from which on it may
+    meet it."""
+
+    number: object
+    t: object
+
+
+def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, like):
+    """Ray from ``a`` to ``b`` on the shape of this ``number``, and an `Own` for `occluded`: None unless
+    ``shape_errors`` are small."""
+    if not shape_errors.small:
+        return segment(a, b, like), None
+    end = b.towards(a.p - b.p)
+    ray = segment_to(a, end, like)
+    return ray, Own(number, ray.maxt * (1 - _early(a.p - end, b)))
+
+
+def occluded(scene, ray, active, own: Own | None = None):
+    """Whether any surface, null surfaces included (as in ``path``), blocks ``ray``; ``own`` is what it ends
+    at, where it can be met too early."""
+    if own is None:
+        return scene.ray_test(ray, active=active)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    return pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t))
+
+
+def intersect_past_emitters(scene, shape_errors, ray, active, coherent):
+    """First hit along ``ray`` on a shape that does not emit, and the ray that found it.
+
+    This is how ``path`` treats camera rays under ``hide_emitters``.
+    """
+
+    def body(ray, pi, active):
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)
+        onward = mi.Ray3f(ray)
+        onward.o = surface_anchor(si, ray, shape_errors).towards(ray.d)
+        # maxt bounds a segment: what was travelled is taken off (infinity stays infinity).
+        onward.maxt = ray.maxt - dr.dot(onward.o - ray.o, ray.d)
+        onward = dr.select(active, onward, ray)
+        found = scene.ray_intersect_preliminary(onward, coherent=coherent, active=active)
+        pi = dr.select(active, found, pi)
+        return onward, pi, active & on_emitter(pi)
+
+    def on_emitter(pi):
+        return pi.is_valid() & (pi.shape.emitter() != dr.zeros(mi.EmitterPtr))
+
+    pi = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
+    ray, pi, _ = dr.while_loop(
+        (mi.Ray3f(ray), pi, active & on_emitter(pi)),
+        lambda ray, pi, active: active,
+        body,
+        label="past emitters",
+    )
+    return pi, ray

@@ -1,0 +1,92 @@
+"""What ``to_world`` may do to shapes that emit or measure: their points are sampled, and found by rays."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ..host.introspection import inverse_of, matrix_of, named
+
+# Relative; single precision and its products are far below.
+_TOLERANCE = 1e-3
+
+
+def check_to_world(shape, owner: str):
+    """Raise ``ValueError`` if ``shape``, on which ``owner`` is, has a ``to_world`` with which Mitsuba samples
+    other points or normals than rays find, or with another density than it states: `path` is wrong there too.
+    Meshes are right with every matrix."""
+    check = _CHECKS.get(shape.shape_type())
+    if check is None:
+        return
+    matrix, inverse = matrix_of(shape)[:3, :3], inverse_of(shape)[:3, :3]
+    # What is not finite is counted as such.
+    reason = check(matrix, inverse) if np.isfinite([matrix, inverse]).all() else None
+    if reason is not None:
+        kind = shape.class_name().lower()
+        raise ValueError(f"bdpt: {owner} is on a {kind} ({named(shape)}) whose to_world {reason}")
+
+
+def _disk(matrix, inverse):
+    """Rays find a disk by the inverse of the matrix that samples it; it may shear, and stretch."""
+    if np.linalg.det(matrix) == 0:
+        return None  # no area: said elsewhere
+    true = np.linalg.inv(matrix)
+    if np.all(np.linalg.norm(inverse - true, axis=1) <= _TOLERANCE * np.linalg.norm(true, axis=1)):
+        return None
+    return (
+        "has another inverse than Mitsuba takes it to have, so that rays find the shape elsewhere than its "
+        "sampled points are: rotate about an axis that is not of length 1 makes such a matrix, and shears; "
+        "give rotate an axis of length 1"
+    )
+
+
+def _rectangle(matrix, inverse):
+    """Rays find the corners of a rectangle; its normal alone is by the inverse."""
+    normal, true = inverse[2], np.cross(matrix[:, 0], matrix[:, 1])
+    across = np.linalg.norm(np.cross(normal, true))
+    if across <= _TOLERANCE * np.linalg.norm(normal) * np.linalg.norm(true):
+        return None
+    return (
+        "turns its normal out of the right angle to its plane: rotate about an axis that is not of length 1 "
+        "does; give rotate an axis of length 1"
+    )
+
+
+def _sphere(matrix, inverse):
+    size = np.linalg.norm(matrix[:, 0])
+    if np.allclose(matrix.T @ matrix, size**2 * np.eye(3), rtol=0, atol=_TOLERANCE * size**2):
+        return None
+    return (
+        f"stretches or shears it (the lengths of its columns are {_lengths(matrix)}): Mitsuba finds a sphere "
+        "and samples an ellipsoid; use one scale, give rotate an axis of length 1, or use a mesh"
+    )
+
+
+def _cylinder(matrix, inverse):
+    if np.linalg.det(matrix) < 0:
+        return (
+            "mirrors it, which turns the normals of half of Mitsuba's calls, so that one lets the light out "
+            "and the other in; leave out the negative scale (flip_normals turns normals)"
+        )
+    lengths = np.linalg.norm(matrix, axis=0)
+    angles = matrix.T @ matrix - np.diag(lengths**2)
+    round_ = abs(lengths[0] - lengths[1]) <= _TOLERANCE * lengths[0]
+    if round_ and np.all(np.abs(angles) <= _TOLERANCE * np.outer(lengths, lengths)):
+        return None
+    return (
+        f"squashes or shears it (the lengths of its columns are {_lengths(matrix)}): Mitsuba takes its "
+        "points to be evenly spread and its area to be that of a round one; give rotate an axis of length 1, "
+        "and x and y the same scale, or use a mesh"
+    )
+
+
+def _lengths(matrix) -> str:
+    return ", ".join(f"{x:.4g}" for x in np.linalg.norm(matrix, axis=0))
+
+
+_CHECKS = {
+    mi.ShapeType.Rectangle.value: _rectangle,
+    mi.ShapeType.Disk.value: _disk,
+    mi.ShapeType.Sphere.value: _sphere,
+    mi.ShapeType.Cylinder.value: _cylinder,
+}

@@ -1,0 +1,189 @@
+"""Raw accumulators, and how they become the film.
+
+Camera samples go into one block with Mitsuba's filter weights W, splats (t <= 1) into another. The
+weight that a splat must be divided by is analytic, W' = spp * integral of the filter over the region
+that camera samples cover; it enters the film as W * splat / W', so that `Film.develop` does the
+right thing for every filter, crop window and border. Putting both kinds into one block, as Mitsuba's
+``ptracer`` does, is biased for every filter but the box: E[1/W] > 1/E[W].
+"""
+
+from __future__ import annotations
+
+from functools import reduce
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .block import Block
+from .layers import layer_names, strategies, strategy_count, strategy_index
+from .replicates import Replicates
+
+# The blocks of sums, as `Snapshot.arrays` calls them.
+_NAMES = ("camera", "light", "strategies")
+
+
+class Accumulator:
+    """Collects the samples of one render.
+
+    ``film`` Mitsuba's film; ``colour`` what it keeps of a spectrum, see `colour`; ``border`` how many
+    pixels camera samples reach beyond the crop window; ``depth`` the largest path length of the strategy
+    images, 0 for none; ``variance`` whether the layers of the variance are wanted, see
+    `close_replicate`; ``features`` the `FeatureLayers` that camera samples bring along, or ``None``.
+    """
+
+    def __init__(self, film, colour, border: int, depth: int, variance: bool = False, features=None):
+        self.film, self.colour, self.features = film, colour, features
+        self.border = border
+        self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        self.depth = depth
+        self.size = [int(x) for x in film.crop_size()]
+        self.offset = [int(x) for x in film.crop_offset()]
+        self.rfilter = film.rfilter()
+        self.replicates = Replicates() if variance else None
+        names = features.names if features else []
+        colour.prepare(layer_names(depth, variance, names, colour.names))
+        self._colours = len(colour.names)
+        self._weight = self._colours + self.alpha  # where W lies among the camera samples' sums
+        self._channels = self._weight + 1 + len(names)
+        self.camera = self._block(self._channels, dr.ReduceMode.Local, mi.ArrayXf)
+        # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
+        self.light = self._block(self._colours, dr.ReduceMode.Direct, mi.ArrayXd)
+        # One strip of rows per strategy, far enough apart for the filter.
+        self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
+        rows = strategy_count(depth) * self._stride
+        self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if depth else None
+        self._done = (None, ())
+        self._share = [self._covered(n) for n in self.size]
+
+    def _block(self, channels: int, mode, packet, height: int | None = None):
+        size = [self.size[0], height or self.size[1]]
+        return Block(size, self.offset, channels + channels % 2, self.rfilter, mode, packet)
+
+    def put_camera(self, position, colours, alpha, features, active):
+        """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
+        values = [*colours, *([alpha] if self.alpha else []), mi.Float(1), *features]
+        self.camera.put(position, values, active)
+
+    def put_light(self, position, colours, active):
+        """Add a splat at a continuous film position."""
+        self.light.put(position, [*colours], active)
+
+    def put_strategy(self, position, weighted, unweighted, s, t, active):
+        """Add to the technique images of the strategy (s, t)."""
+        values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
+        self.strategies.put(position, values, active, strategy_index(s, t) * self._stride)
+
+    def evaluate(self, *others):
+        """Run what was recorded since the last call as one kernel, ``others`` with it."""
+        dr.eval([b.data for b in self._blocks()], *others)
+
+    def _blocks(self):
+        return [b for b in (self.camera, self.light, self.strategies) if b is not None]
+
+    @property
+    def passes(self) -> tuple:
+        """Samples per pixel of each pass that is in the sums."""
+        return self._done[1]
+
+    def close_pass(self, spp: int):
+        """Add the sums of a pass with ``spp`` samples per pixel to those of all, in double precision."""
+        blocks = self._blocks()
+        sums = [mi.Float64(b.data) for b in blocks]
+        before, passes = self._done
+        if before is not None:
+            sums = [a + b for a, b in zip(before, sums, strict=True)]
+        dr.eval(sums)
+        self._done = (sums, (*passes, spp))  # at once: Ctrl-C may come between any two steps
+        for b in blocks:
+            b.clear()
+
+    def store(self) -> tuple[tuple, dict, dict | None]:
+        """What a `Snapshot` needs: passes, arrays (of Dr.Jit or NumPy, none of which changes any more), and
+        numbers about the replicates, if there are any."""
+        sums, passes = self._done
+        arrays, replicates = self.replicates.store() if self.replicates else ({}, None)
+        return passes, arrays | dict(zip(_NAMES, sums or [], strict=False)), replicates
+
+    def ends_replicates(self) -> bool:
+        """Whether all passes belong to whole replicates."""
+        return self.replicates is not None and self.replicates.spp == sum(self.passes) > 0
+
+    def restore(self, passes: tuple, arrays: dict, replicates: dict | None):
+        """Go on from what `store` gave after these ``passes``."""
+        sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
+        for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
+            if len(s) != len(block.data):
+                raise ValueError(f"bdpt: the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
+        self._done = (sums, tuple(passes))
+        if self.replicates is not None:
+            self.replicates.restore(replicates, arrays)
+
+    def close_replicate(self):
+        """Count what was added since the last call as one independent replicate of the image."""
+        sums, passes = self._done
+        self.replicates.add([np.array(s) for s in sums[:2]], sum(passes), self._image)
+
+    def error(self) -> float:
+        """Estimated relMSE of the image, see `Replicates.error`."""
+        return self.replicates.error(sum(self.passes), np.array(self.colour.unit))
+
+    def _image(self, camera, light, spp: int):
+        """Image (height, width, colours) of sums over ``spp`` samples per pixel."""
+        w, h = self.size
+        camera, light = camera.reshape(h, w, -1), light.reshape(h, w, -1)
+        weight, n = camera[..., self._weight, None], self._colours
+        return camera[..., :n] / weight + light[..., :n] / self._splat_weight(spp)[..., None]
+
+    def mean(self):
+        """Mean of the image so far (largest colour, each in its unit), for the scale of roulette: a
+        ``Float64`` of width 1, for which nobody has waited yet."""
+        blocks = zip(self._done[0][:2], (self.camera, self.light), strict=True)
+        camera, light = (
+            [dr.sum(sums[i :: block.channels]) for i in range(self._colours)] for sums, block in blocks
+        )
+        weight = dr.sum(self._done[0][0][self._weight :: self.camera.channels])
+        splat_weight = float(self._splat_weight(sum(self.passes)).sum())
+        weight, splat_weight = dr.maximum(weight, 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
+        colours = zip(camera, light, self.colour.unit, strict=True)
+        return reduce(dr.maximum, [(c / weight + y / splat_weight) / unit for c, y, unit in colours])
+
+    def _splat_weight(self, spp: int):
+        """W', shape (height, width)."""
+        x, y = self._share
+        return spp * y[:, None] * x[None, :]
+
+    def _covered(self, n: int):
+        """Integral of the one-dimensional filter about each pixel over the camera samples' region."""
+        if self.rfilter.is_box_filter():
+            return np.ones(n)  # camera samples are put at the pixel itself: each weighs 1
+        radius, steps = self.rfilter.radius(), 4096
+        edges = np.linspace(-radius, radius, 2 * steps + 1)
+        middle = (edges[1:] + edges[:-1]) / 2
+        density = np.array(self.rfilter.eval(mi.Float(middle)), dtype=np.float64)
+        cumulative = np.concatenate([[0], np.cumsum(density * np.diff(edges))])
+        centre = np.arange(n) + 0.5
+        high = np.interp(n + self.border - centre, edges, cumulative)
+        return high - np.interp(-self.border - centre, edges, cumulative)
+
+    def finish(self):
+        """Store the result of the passes so far in the film."""
+        w, h = self.size
+        sums, passes = self._done
+        if not passes:
+            return
+        camera, light = (np.array(s).reshape(h, w, -1) for s in sums[:2])
+        n, last = self._colours, self._weight + 1
+        colours, weight, features = camera[..., : last - 1], camera[..., last - 1 : last], camera[..., last:]
+        to_film = weight / self._splat_weight(sum(passes))[..., None]
+        colours[..., :n] += light[..., :n] * to_film
+        layers = [features[..., : self._channels - last]]
+        if self.replicates is not None:
+            layers.append(self.replicates.variance(sum(passes), (h, w, n)) * weight)
+        if self.depth:
+            tall = np.array(sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
+            for index, (_, _, t) in enumerate(strategies(self.depth)):
+                layers.append(tall[index] * (to_film if t <= 1 else 1))
+        values = np.concatenate(self.colour.stored(colours, weight, layers), axis=-1).astype(np.float32)
+        block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
+        self.film.put_block(block)

@@ -1,0 +1,80 @@
+"""Independent images of one render, and the error that they tell."""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+
+from .spread import Spread, restored, stored
+
+
+class Replicates:
+    """Independent images of the scene, in turn in one of two `Spread`: what one half of them says about the
+    error can be put beside what the other says about the image."""
+
+    def __init__(self):
+        self.halves, self._sums = (Spread(), Spread()), None
+
+    @property
+    def count(self) -> int:
+        """How many images."""
+        return sum(half.count for half in self.halves)
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel of all of them."""
+        return sum(half.spp for half in self.halves)
+
+    def add(self, sums, spp: int, develop):
+        """Add an image: ``sums`` and ``spp`` are those of all images so far, ``develop(camera, light,
+        spp)`` makes an image of the difference."""
+        new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
+        n, halves = spp - self.spp, list(self.halves)
+        which = self.count % 2
+        halves[which] = halves[which].joined(Spread.of(develop(*new, n), n))
+        self.halves, self._sums = tuple(halves), sums
+
+    def store(self) -> tuple[dict, dict]:
+        """Arrays of a `Snapshot`, and the numbers that `restore` needs beside them."""
+        arrays, progress = stored(self.halves)
+        if self.count:
+            arrays |= {f"replicates.last.{i}": sums for i, sums in enumerate(self._sums)}
+        return arrays, progress
+
+    def restore(self, progress: dict, arrays: dict):
+        """Go on from what `store` gave."""
+        self.halves = restored(progress, arrays)
+        if self.count:
+            self._sums = [arrays[n] for n in sorted(arrays) if n.startswith("replicates.last.")]
+
+    def variance(self, spp: int, shape=()):
+        """Variance of the mean of ``spp`` samples per pixel (those of a replicate that was not
+        finished included); infinite, in the given shape, with fewer than two replicates."""
+        if self.count < 2:
+            return np.full(shape, np.inf)
+        first, second = self.halves
+        both = first.joined(second)
+        return both.variance() * (both.spp / spp)
+
+    def error(self, spp: int, unit) -> float:
+        """Estimated relMSE of the mean of ``spp`` samples per pixel, colours in multiples of ``unit``;
+        infinite with fewer than two replicates in a half.
+
+        The variance that one half shows is divided by r^2 + 0.01 mean(image)^2 with r from the other half:
+        beside a mean that has the same firefly no value could count for more than 1. The noise of r alone
+        would add 1 + V max(3 r^2 - e, 0) / (r^2 + e)^2 in the mean (second order; where it would take away,
+        nothing is added), with V the variance of r and e = 0.01 mean(image)^2; it is divided by that.
+        """
+        first, second = self.halves
+        if min(first.count, second.count) < 2:
+            return inf
+        epsilon = 0.01 * (first.joined(second).mean / unit).mean() ** 2 + 1e-150  # whose square is not 0 yet
+        found = 0.0
+        for own, other in ((first, second), (second, first)):
+            variance = own.variance() / unit**2 * (own.spp / spp)
+            square, noise = (other.mean / unit) ** 2, other.variance() / unit**2
+            below = square + epsilon
+            surplus = 1 + noise * np.maximum(3 * square - epsilon, 0) / below**2
+            found += float((variance / (below * surplus)).mean()) / 2
+        return found

@@ -1,0 +1,85 @@
+"""Where a kernel puts its contributions: into the image. (A pilot has another sink, see `pilot`.)
+
+A sink has ``alpha``, whether the last event of a camera subpath matters, and the methods of `Image`:
+``begin`` and ``add`` for what a camera subpath finds, ``connect`` for its inner connections, ``end`` when it
+is done, ``splat`` for contributions with t <= 1.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport import connections, contribution
+
+
+class Image:
+    """Adds contributions to a film's raw sums (an `Accumulator`).
+
+    What a camera subpath finds goes through a running ``total``, which begins as `begin` says; splats go to
+    the film at once.
+    """
+
+    def __init__(self, film):
+        self._film = film
+        self.alpha = film.alpha
+
+    def begin(self):
+        """Nothing found yet."""
+        return dr.zeros(mi.Spectrum)
+
+    def add(self, kernel, c, total, start, shared):
+        """Add a contribution with t >= 2 to the ``total`` of a camera subpath."""
+        if kernel.strategy_images:
+            self._put_strategy(c, start.counted, shared)
+        return total + c.weighted()
+
+    def connect(self, kernel, z, lane, stream, counters, total, start):
+        """Join the camera vertex ``z`` with the light vertices of its lane."""
+        if kernel.plan.connections == "all":
+
+            def add(c, visible, total):
+                c.active = visible
+                return self.add(kernel, c, total, start, lane.shared)
+
+            return connections.connect_all(kernel, z, lane.path, counters, total, add)
+        return total + connections.connect_one(kernel, z, lane.path, stream, counters)
+
+    def splat(self, kernel, c, position, shared, counters):
+        """Add a contribution with t <= 1; colours that are not finite (`contribution.finite` has seen the
+        contribution, not what the film makes of it) count as zero."""
+        value = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
+        finite = dr.all(dr.isfinite(value))
+        contribution.count(counters, "non_finite", c.active & ~finite)
+        self._film.put_light(position, value, c.active & finite)
+        if kernel.strategy_images:
+            self._put_strategy(c, position, shared)
+
+    def end(self, kernel, lane, sample, total, seen, counters):
+        """Add a camera sample; colours that are not finite, sums of finite ones, count as zero."""
+        film, shared, start = self._film, lane.shared, sample.start
+        features, finite = [], mi.Bool(True)
+        if film.features is not None:
+            features, finite = film.features.sample(
+                kernel.points, sample.stream, start.position, sample.u_lens, shared.time, sample.covered
+            )
+        colours = film.colour(total * shared.weight, shared.wavelengths)
+        shown = dr.all(dr.isfinite(colours))
+        alpha = _alpha(kernel, seen)
+        film.put_camera(start.counted, dr.select(shown, colours, 0), alpha, features, sample.covered)
+        for mask in (finite, shown):
+            contribution.count(counters, "non_finite", sample.covered & ~mask)
+
+    def _put_strategy(self, c, position, shared):
+        weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
+        unweighted = self._film.colour(c.value * shared.weight, shared.wavelengths)
+        finite = dr.all(dr.isfinite(weighted)) & dr.all(dr.isfinite(unweighted))
+        self._film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
+
+
+def _alpha(kernel, seen):
+    """Alpha of a camera sample, as in `path`: a visible environment covers the image."""
+    opaque = seen
+    if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
+        opaque = kernel.max_depth >= 1
+    return dr.select(opaque, mi.Float(1), mi.Float(0))

@@ -1,0 +1,79 @@
+"""What a render does and does not do, and why, in words."""
+
+from __future__ import annotations
+
+from ..settings import Settings
+from ..transport.plan import Plan
+from .choice import LIGHT_GAIN
+from .possible import lost_paths
+
+
+def subpaths(count: int) -> str:
+    """So many camera subpaths, in words."""
+    return f"{count} camera subpaths" if count > 1 else "camera subpath"
+
+
+def explain(world, p: Plan, settings: Settings, table, certainty: float = 0.0, lost_by_pilot: int = 0) -> str:
+    """Text about the strategies in use and those that are skipped.
+
+    ``table`` is a pilot's, see `choice.choose`, and `choice.certainty`; empty without one. ``lost_by_pilot``:
+    how many of its values were not finite."""
+    used = [
+        name
+        for name, on in (
+            ("s=0 (camera subpath hits an emitter)", p.hit),
+            ("s=1 (next-event estimation)", p.direct),
+            ("t=1 (light vertex seen by the sensor)", p.splat),
+            ("(1,1) (emitter point seen by the sensor)", p.endpoints),
+            ("t=0 (light subpath hits the sensor)", p.arrival),
+            (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
+        )
+        if on
+    ]
+    lines = [
+        f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.served)}"
+        if p.light
+        else f"heuristic {settings.heuristic}, no light subpaths"
+    ]
+    lines += [f"used: {name}" for name in used]
+    lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
+    if (p.splat or p.arrival or p.connections != "none") and settings.stored_vertices < settings.max_depth:
+        lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
+    lines += [f"lost: {text}" for text in lost_paths(world, p, settings)]
+    if world.emitters.evaluated:
+        lines.append(
+            "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
+            "one kernel"
+        )
+    if lost_by_pilot:
+        lines.append(f"not finite: {lost_by_pilot} values of the pilot, which decided from the rest")
+    return "\n".join(lines + _pilot(settings, table, certainty))
+
+
+def _pilot(settings: Settings, table, certainty: float) -> list[str]:
+    """What the pilot found: the best of each combination and number of light subpaths."""
+    if not table:
+        return []
+    lines = [
+        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, with "
+        "what points take off it):"
+    ]
+    shown = set()
+    for row in table:
+        candidate = row.candidate
+        key = candidate.combination, candidate.connections, candidate.served
+        if key in shown:
+            continue
+        shown.add(key)
+        light = f"light_paths=1/{candidate.served}" if candidate.light_paths else "light_paths=0"
+        lines.append(
+            f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections} "
+            f"({row.cost:.2f}, {row.variance:.3g})"
+        )
+    lines.append(
+        f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
+        f"most {LIGHT_GAIN:g} times as long as the best"
+    )
+    if settings.heuristic != "balance":
+        lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
+    return lines

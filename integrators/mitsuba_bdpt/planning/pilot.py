@@ -1,0 +1,335 @@
+"""A pilot: a few thousand bidirectional samples that tell the variance of every way to render.
+
+Whether light subpaths and inner connections pay is decided per image (`choose`), by cost times
+variance of each `Candidate`: path tracing alone, with light tracing, with inner connections, each with
+several numbers S of camera subpaths per light subpath and several coefficients.
+
+All variances come from the *same* samples, which use every strategy (S = 1, all inner connections, balance
+heuristic with kappa = 1), so that a candidate is not judged by the samples that it would have
+missed. For a contribution f / p of the pilot with weight w and shares s_i of the classes i in the sum of
+all densities, and a candidate with counts n_i and coefficients kappa_i (E. Veach 1997, section 9.2),
+
+* the candidate's own estimate of the path is (w f / p) kappa_own / (n_own sum_i kappa_i s_i);
+* its second moment is the pilot's mean of (w f / p)^2 sum_i (kappa_i^2 s_i / n_i) / (sum_i kappa_i s_i)^2.
+
+To the second moments come the products of different contributions within a camera sample, and off goes the
+squared mean of the pixel, estimated without bias from two independent samples of it. The samples use
+neither roulette on connections nor the draw of one connection; what the draw adds to the variance is known
+from the unshadowed contributions.
+
+Points that are better than independent ones take off most of the variance of camera samples in smooth regions
+(to a hundredth under a sky), hardly any where a path is rarely found, and little of that of splats, which
+land in pixels by chance. How much is measured: half of the samples lie in pairs of nets of one pixel,
+which give the variance of a net's mean beside that of its samples (`moments.Moments.gain`).
+
+All is relative to the brightness of the place: a splat in a shadow weighs as much as that pixel is dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..sampling.points import Points
+from ..transport import connections, mis
+from ..transport.batch import NET, NETS, Batch
+from ..transport.kernel import COUNTERS, Kernel, trace
+from . import moments
+from .moments import FINE, GROUPS, PER_PIXEL, Moments
+
+# A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
+# many as a sample of the pilot stands for: what a render is not likely to meet is missing from its image, not
+# noise. (Reflections of the sun made path tracing alone in `window_room` look 1.1 to 16 times as slow as the
+# best; so it is 1.1 to 2.3. 64 would say 1.1, as renders show, but the same of rooms with a small caustic.)
+RAREST = 1024
+
+# The square of what a weighting cannot make counts so many times in its moments, and one whose relative
+# variance comes out beyond `moments.RULED_OUT` is ruled out: it misses a millionth of a pixel or more. (Any
+# miss must not do so: between points of one plane rounding leaves cosines of 1e-20, contributions of 1e-40,
+# and densities that single precision takes for 0.)
+LOST = 1e30
+
+# Of a pilot's camera samples one in so many is in a net.
+NET_SHARE = 2
+
+# Light subpaths for each camera sample of a pilot, most of them without one: they are cheap, and few of them
+# meet a small thing that casts a caustic (of 4,096 from a lamp over a small glass cube, about six).
+LIGHT_TIMES = 4
+
+# Paths of light tracing that camera subpaths make less than once in so many times as the pilot are too rare
+# for points to help: fewer than one falls into a net.
+SELDOM = 16
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """Coefficients kappa of the classes `mis.CLASSES`, relative to the densities of one sample each."""
+
+    hit: float
+    direct: float
+    light: float
+    inner: float
+
+    def of(self, kind: str) -> float:
+        """kappa of a class."""
+        return getattr(self, kind)
+
+    @property
+    def combination(self) -> str:
+        """``n0c0`` path tracing alone, ``n1c0`` with light tracing, ``n1c1`` with inner connections."""
+        return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
+
+
+# In this order: each class is in use from some weighting on.
+WEIGHTINGS = (
+    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
+    *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
+    *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
+)
+_USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
+
+
+def _slices(parts: dict) -> dict:
+    """Where the columns of each part are."""
+    ends = np.cumsum(list(parts.values())).tolist()
+    return {name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)}
+
+
+# Of `kernel.COUNTERS`, what light subpaths count alone.
+_OF_LIGHT = ("light", "shadow_t1")
+
+
+def _even(n: int) -> int:
+    return n + n % 2
+
+
+# What a lane keeps: for each weighting its estimate, and the second moments of its contributions without
+# t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
+# with inner connections what drawing one adds; then the number of its vertices that were joined; its tile.
+_PARTS = {
+    "estimate": len(WEIGHTINGS),
+    "moment": len(WEIGHTINGS),
+    "light": _USERS["light"],
+    "draw": _USERS["inner"],
+}
+_COLUMNS = _even(sum(_PARTS.values()) + 2)
+# The size of splats, their second moments without t <= 1, those of them that are rare (see `SELDOM`), and
+# their second moments by t <= 1.
+_SPLAT_PARTS = {
+    "size": 1,
+    "moment": len(WEIGHTINGS),
+    "rare": len(WEIGHTINGS),
+    "light": _USERS["light"],
+}
+_SPLAT_COLUMNS = _even(sum(_SPLAT_PARTS.values()))
+
+
+class Pilot:
+    """Sink (see `sinks`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
+    follow one another each `PER_PIXEL` are of the same pixel, in nets each `batch.NETS` times
+    `batch.NET`."""
+
+    alpha = False
+
+    def __init__(self, region, batch: Batch, rarest: float):
+        self._region, self._lanes = region, batch.lanes
+        self._first_net = batch.pixels * batch.samples
+        self._least = dr.opaque(mi.Float64, 1 / rarest)
+        self._samples = dr.zeros(mi.Float64, batch.size * _COLUMNS)
+        self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * _SPLAT_COLUMNS)
+        dr.make_opaque(self._samples, self._splats)
+
+    def begin(self):
+        """Nothing found yet."""
+        return {name: _none(n) for name, n in _PARTS.items()} | {"joined": mi.UInt32(0)}
+
+    def add(self, kernel, c, total, start, shared):
+        """Add a contribution with t >= 2."""
+        own, squares = self._parts(self._size(c), c)
+        new = {"estimate": own, **squares}
+        return total | {name: _sums(total[name], more) for name, more in new.items()}
+
+    def connect(self, kernel, z, lane, stream, counters, total, start):
+        """Join the camera vertex ``z`` with all light vertices of its lane."""
+
+        def add(c, visible, total):
+            own, squares = self._parts(self._size(c), c)
+            seen = {"visible": own, **squares}
+            new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
+            return {name: _sums(total[name], more) for name, more in new.items()}
+
+        tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
+        found = {"unshadowed": _none(_PARTS["draw"]), "visible": _none(_PARTS["draw"])}
+        found |= {name: total[name] for name in ("moment", "light")}
+        found = connections.connect_all(kernel, z, lane.path, counters, found, add)
+        unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
+        # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
+        # sizes times that of the visible ones, where that of all connections is the square of the latter.
+        draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
+        joined = total["joined"] + dr.select(counters["shadow_inner"] > tested, mi.UInt32(1), 0)
+        # In the order of `begin`, as a loop's state has to be.
+        return total | found | {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+
+    def splat(self, kernel, c, position, shared, counters):
+        """Add a contribution with t <= 1."""
+        size = self._size(c)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(position)
+        _, found = self._parts(size, c)
+        found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
+        columns = [x for name in _SPLAT_PARTS for x in found[name]]
+        _add(self._splats, _SPLAT_COLUMNS, columns, row, size > 0)
+
+    def end(self, kernel, lane, sample, total, seen, counters):
+        """Add a camera sample."""
+        columns = [x for name in _PARTS for x in total[name]]
+        slot = dr.arange(mi.UInt32, self._lanes)
+        columns += [mi.Float64(total["joined"]), mi.Float64(self._tile(sample.start.position))]
+        _add(self._samples, _COLUMNS, columns, slot, sample.covered)
+
+    def evaluate(self, counts):
+        """Run what was recorded, and ``counts`` with it."""
+        dr.eval(self._samples, self._splats, counts)
+
+    def moments(self, counts: dict) -> Moments:
+        """What was found; ``counts`` what the lanes counted."""
+        rows = np.array(self._samples).reshape(-1, _COLUMNS)
+        columns = [rows[:, part] for part in _slices(_PARTS).values()]
+        joined, tiles = rows[:, sum(_PARTS.values()) :][:, :2].T
+        columns.append(tiles.astype(int))
+        independent, nets = (
+            moments.Samples(*(column[part] for column in columns))
+            for part in (slice(self._first_net), slice(self._first_net, None))
+        )
+        sums = np.array(self._splats).reshape(GROUPS, FINE**2, _SPLAT_COLUMNS)
+        splats = moments.Splats(sums, self._lanes, **_slices(_SPLAT_PARTS))
+        rays = {
+            name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
+        }
+        rays["joined"] = joined.mean()
+        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
+
+    def _parts(self, size, c):
+        """A contribution ``c`` of this weighted ``size``: its estimates, of the weightings that have its
+        class, and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
+        shares = _shares(size, c)
+        lost = LOST * dr.square(size)
+        own, squares, lights = [], [], []
+        for w in WEIGHTINGS:
+            total = _dot(w, shares, 1)
+            # With inner connections every class is in use; what cannot make the path is ruled out.
+            possible = mi.Bool(True) if w.inner else total > 0
+            # How often it makes the path when the pilot does once: see `RAREST`.
+            seldom = dr.maximum(1, self._least / _dot(w, shares, 0))
+            scale = size / (total * seldom)
+            square = dr.square(scale) * seldom
+            moment = dr.select(possible, square * _dot(w, shares | {"light": 0}, 2), lost)
+            if w.of(c.kind):
+                estimate = scale if w.of(c.kind) == 1 else w.of(c.kind) * scale
+                own.append(estimate)
+                if c.kind != "light":
+                    moment -= dr.square(estimate)
+            squares.append(moment)
+            if w.light:
+                lights.append(dr.select(possible, square * (w.light**2 * shares["light"]), 0))
+        return own, {"moment": squares, "light": lights}
+
+    def _rare(self, size, c, squares) -> list:
+        """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that
+        camera subpaths make too rarely for points to help, see `SELDOM`. (Not light that comes from a lamp
+        without a detour: every camera sample finds it with s = 1, if that can find it at all.)"""
+        shares = _shares(size, c) | {"light": 0}
+        often = (c.s == 2) & (shares["direct"] > 0)
+        return [
+            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 0))))
+            for w, square in zip(WEIGHTINGS, squares, strict=True)
+        ]
+
+    def _size(self, c):
+        """Weighted size of a contribution that counts, in double precision: its square, in any unit of
+        radiance, is too large or too small for single (at 1e12 outliers are, at 1e20 all).
+
+        Emitters seen directly do not count: relative to what is around them their edges would outweigh all
+        else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
+        (1,1) finds and path tracing alone hardly.
+        """
+        return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
+
+    def _tile(self, position):
+        uv = dr.clip(self._region.to_uv(position), 0, 1)
+        xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
+        return xy.y * FINE + xy.x
+
+
+def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
+    """Run a pilot of about ``lanes`` camera samples, spread over the image, each of which ``stands_for`` so
+    many of the render."""
+    everything = replace(
+        plan,
+        connections="none" if plan.connections == "none" else "all",
+        served=1,
+        splat_coefficient=1.0,
+        direct_coefficient=1.0,
+        roulette=False,
+    )
+    kernel = Kernel(world, everything, settings, mis.ByClass())
+    region = world.camera.region
+    pixels = int(region.size.prod())
+    stratified = settings.points != "independent"
+    nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
+    lanes -= nets * NETS * NET
+    samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
+    chosen = min(lanes // samples, pixels)
+    batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
+    pilot = Pilot(region, batch, max(stands_for, RAREST))
+    # What is not in nets are independent numbers: the squared mean follows from products of samples.
+    points = Points("sobol" if stratified else "independent", seed)
+    counts = trace(kernel, pilot, batch, points, samples)
+    pilot.evaluate(counts)
+    found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
+    known = {"bsdfs": world.traits.asked.count, "far": world.emitters.far_share}
+    contrast = world.emitters.contrast
+    known["evenness"] = 1 / contrast if contrast < np.inf else 0.0  # also if it is no number
+    return replace(found, rays=found.rays | known)
+
+
+def _add(target, columns: int, values, row, active):
+    """Add ``values`` to a row of ``target``; as a packet, which takes an even number of them. (`dr.scatter`
+    would evaluate what was recorded so far.)"""
+    packet = mi.ArrayXd(values + [mi.Float64(0)] * (columns - len(values)))
+    dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
+
+
+def _shares(size, c) -> dict:
+    """Shares of the classes in the sum of all densities; where there is nothing they may be 0 / 0."""
+    return dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
+
+
+def _mean_colour(c):
+    """Mean of the colours of a contribution, in double precision, which adds up unlike the largest."""
+    colours = [mi.Float64(dr.abs(colour)) for colour in mi.unpolarized_spectrum(c.value)]
+    return sum(colours) / len(colours) * mi.Float64(c.weight)
+
+
+def _none(n: int) -> list:
+    return [mi.Float64(0) for _ in range(n)]
+
+
+def _sums(total: list, more: list) -> list:
+    """``total`` with ``more``, which has an entry for the last weightings only, added to these. What gets
+    nothing is left as it is: loops do not hold it, see `subpath.Walk`."""
+    first = len(total) - len(more)
+    return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
+
+
+def _dot(w: Weighting, shares, power: int):
+    """sum_i kappa_i^power share_i over the classes in use."""
+    terms = [(w.of(kind) and w.of(kind) ** power, share) for kind, share in shares.items()]
+    used = [
+        share if factor == 1 else factor * share
+        for factor, share in terms
+        if factor and not mis.is_absent(share)
+    ]
+    return sum(used[1:], used[0])

@@ -1,0 +1,149 @@
+"""What a render does and does not need: the strategies in use, their counts and coefficients."""
+
+from __future__ import annotations
+
+from ..settings import DEFAULT_STORED, Settings
+from ..transport.plan import Plan
+
+
+def plan(world, settings: Settings) -> Plan:
+    """Decide from the scene alone what is impossible, and apply the parameters given by hand."""
+    emitters, camera = world.emitters, world.camera
+    skipped = []
+
+    def skip(name, level, why):
+        skipped.append({"class": name, "level": level, "why": why})
+        return False
+
+    hit = emitters.hittable or skip("s=0", "impossible", "no emitter that a ray can hit")
+
+    def possible(name, needed, where, why):
+        """A class that joins surfaces, on paths of ``needed`` edges or more."""
+        why = _why_not(world, settings.max_depth, needed) or ("" if where else why)
+        return skip(name, "impossible", why) if why else True
+
+    joinable = camera.joinable and emitters.traced
+    direct = possible("s=1", 2, emitters.direct, "next-event estimation can choose no emitter")
+    splat = possible("t=1", 2, joinable, camera.reason or _UNTRACED)
+    inner = possible("inner", 3, emitters.traced, _UNTRACED)
+    why = _why_not_endpoints(emitters, camera, settings)
+    endpoints = skip("(1,1)", "impossible", why) if why else True
+    why = _why_not_arrival(emitters, camera, settings)
+    arrival = skip("t=0", "impossible", why) if why else True
+    for name, why in emitters.left_out:
+        skip(name, "impossible", why)
+
+    light_paths, connections = _defaults(settings)
+    if light_paths == 0:
+        splat = endpoints = arrival = inner = False
+        skip("t=0, t=1, (1,1), inner", "by hand", "light_paths=0")
+    if inner and connections == "none":
+        inner = skip("inner", "by hand", "connections=none")
+    if light_paths and settings.stored_vertices < min(settings.max_depth, DEFAULT_STORED):
+        skip(
+            f"t=0, t=1 and inner for paths longer than {settings.stored_vertices} edges",
+            "by hand",
+            f"stored_vertices={settings.stored_vertices}: such paths use s=0 and s=1",
+        )
+    return Plan(
+        hit=hit,
+        direct=direct,
+        splat=splat,
+        endpoints=endpoints,
+        arrival=arrival,
+        connections=connections if inner else "none",
+        served=round(1 / light_paths) if splat or arrival or endpoints or inner else 1,
+        splat_coefficient=1.0 if settings.skip == "none" else 0.25,
+        direct_coefficient=1.0,
+        roulette=settings.skip != "none" and not settings.strategy_images,
+        hide_emitters=settings.hide_emitters,
+        skipped=tuple(skipped),
+    )
+
+
+def _defaults(settings: Settings):
+    """``light_paths`` and ``connections`` in effect: given by hand, or by ``skip``."""
+    everything = settings.skip == "none"
+    light_paths, connections = settings.light_paths, settings.connections
+    if light_paths == "auto":
+        light_paths = 1 if everything else 1 / 4
+    if connections == "auto":
+        connections = "all" if everything else "one"
+    if settings.strategy_images and connections == "one":
+        connections = "all"  # a drawn connection is no estimate of each strategy by itself
+    return light_paths, connections
+
+
+_UNTRACED = "no light subpath can start from the emitters"
+
+
+def _why_not(world, depth, needed) -> str:
+    """Why no path of ``needed`` edges can be made by joining surfaces; empty if nothing forbids it."""
+    if depth < needed:
+        return f"max_depth={depth} allows no such path"
+    if world.emitters.count == 0:
+        return "the scene has no emitter"
+    if not world.surfaces:
+        return "the scene has no surface"
+    return "" if world.smooth else "no surface has a lobe that is not delta"
+
+
+def _why_no_light(emitters, settings: Settings) -> str:
+    """Why no path reaches the sensor at all; empty if one may."""
+    if settings.max_depth < 1:
+        return "max_depth=0 allows no path"
+    return "" if emitters.count else "the scene has no emitter"
+
+
+def _why_not_endpoints(emitters, camera, settings: Settings) -> str:
+    """Why (1,1) is impossible; empty if it is not."""
+    if not camera.joinable:
+        return camera.reason
+    if settings.hide_emitters:
+        return "hide_emitters: emitters are not seen directly"
+    if emitters.count and not emitters.joinable:
+        return "no point of the emitters can be joined with the sensor"
+    if emitters.count and camera.delta and not emitters.hittable:
+        return "delta emitters are not seen by a sensor without area (measure zero)"
+    if emitters.count and camera.parallel and not emitters.finite_hittable:
+        return "a direction of the surroundings is not that of the sensor's rays (measure zero)"
+    return _why_no_light(emitters, settings)
+
+
+def _why_not_arrival(emitters, camera, settings: Settings) -> str:
+    """Why t=0 is impossible; empty if it is not."""
+    if not camera.area:
+        return camera.no_area
+    if settings.hide_emitters and emitters.on_shapes:
+        return "hide_emitters: camera rays pass through emitting shapes, which block light subpaths"
+    if emitters.count and not emitters.traced:
+        return _UNTRACED
+    return _why_no_light(emitters, settings)
+
+
+def lost_paths(world, p: Plan, settings: Settings) -> list[str]:
+    """Paths that no strategy in use can make, one text each."""
+    emitters, camera = world.emitters, world.camera
+    lost = []
+    deltas = world.delta and emitters.unhittable
+    starts = ["delta emitter, delta surfaces"] * deltas + ["directionalarea"] * emitters.beams
+    if not p.arrival:  # t = 0 finds all that follow
+        for start in starts:
+            if not p.splat:
+                lost.append(f"{start}, a surface that the sensor sees (needs t=1)")
+            if p.connections == "none":
+                lost.append(
+                    f"{start}, two other surfaces or more, delta surfaces or none, sensor "
+                    "(needs inner connections)"
+                )
+        if deltas:
+            lost.append(
+                "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
+                "neighbours can be joined)"
+            )
+        if not camera.delta and (deltas or emitters.beams):
+            lost.append(f"{' or '.join(starts)}, sensor (needs t=0)")
+    if starts and p.light and settings.stored_vertices < settings.max_depth:
+        longest = settings.stored_vertices
+        lost.append(f"{' or '.join(starts)}, ... on paths longer than {longest} edges (stored_vertices)")
+    return lost

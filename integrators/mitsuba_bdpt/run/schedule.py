@@ -1,0 +1,98 @@
+"""Which samples are traced when: a render as a sequence of passes, a pass as one or several launches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..sensors.records import Sensor
+from ..settings import Settings
+from ..transport.batch import Batch
+
+# Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
+# a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
+PASS_SAMPLES = 1 << 21
+
+# Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
+# every pass and does not average out (constant radiance, 2^12: 4e-6; 2^16: 5e-5; 2^20: 1e-3).
+MOST_SPP = 1 << 12
+
+# With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
+PASS_SAMPLES_SAMPLER = 1 << 20
+
+# Independent images whose spread gives the variance: as few as the contract allows, since each has a
+# point sequence of its own and short sequences are worse.
+REPLICATES = 8
+
+# Samples per pixel of each of the first `REPLICATES` under ``until_error``.
+FIRST_REPLICATE = 4
+
+
+def _most_samples(settings: Settings) -> int:
+    """Samples in one launch."""
+    return PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
+
+
+def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
+    """Samples per pixel of each pass, in order, ``spp`` in all; the first is 1 if ``small_first``."""
+    limit = _most_samples(settings)
+    width, height = (int(x) for x in camera.region.size)
+    # One row of pixels fits into four launches' worth, see `batches`.
+    most = min(MOST_SPP, max(4 * limit // width, 1))
+    size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
+    sizes = []
+    if settings.points == "sampler":
+        # Stratified samplers number the samples of a pixel; passes must cut them evenly.
+        size = next(n for n in range(min(size, spp), 0, -1) if spp % n == 0)
+    elif small_first and spp > 1:
+        sizes, spp = [1], spp - 1
+    return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
+
+
+@dataclass(frozen=True)
+class Step:
+    """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate, whose last it
+    may be; ``replicate`` counts the independent images that `variance` needs, else 0."""
+
+    replicate: int
+    done: int
+    size: int
+    of: int
+    last: bool
+
+
+def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[Step]:
+    """All passes of a render of ``spp`` samples per pixel; ``small_first`` see `pass_sizes`."""
+    parts = [spp]
+    if settings.variance:
+        parts = _replicates(spp, bool(settings.until_error))
+    steps = []
+    for replicate, part in enumerate(parts):
+        done = 0
+        for size in pass_sizes(camera, part, settings, small_first and replicate == 0):
+            steps.append(Step(replicate, done, size, part, done + size == part))
+            done += size
+    return steps
+
+
+def _replicates(spp: int, growing: bool) -> list[int]:
+    """Samples per pixel of the replicates: `REPLICATES` of them, or, if ``growing``, groups of so many, each
+    group as large as all before it, so that half of the samples lie in few long sequences."""
+    sizes = []
+    while (left := spp - sum(sizes)) > 0:
+        group = min(left, max(sum(sizes), REPLICATES * FIRST_REPLICATE)) if growing else left
+        sizes += [group // REPLICATES + (i < group % REPLICATES) for i in range(min(group, REPLICATES))]
+    return sizes
+
+
+def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):
+    """Cut a pass into bands of rows that one kernel launch can take."""
+    limit = _most_samples(settings)
+    width, height = (int(x) for x in camera.region.size)
+    rows = (
+        height
+        if settings.spp_per_pass == 0 and width * height * samples <= limit
+        else max(1, min(height, 4 * limit // max(width * samples, 1)))
+    )
+    return [
+        Batch(y * width, min(rows, height - y) * width, first_sample, samples) for y in range(0, height, rows)
+    ]

@@ -1,0 +1,54 @@
+"""What a render knows of its scene and sensor before it decides anything."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..emitters.emitters import Emitters
+from ..host.introspection import all_shapes, children, is_instance
+from ..sensors.kinds import prepare
+from ..transport import bsdf
+
+
+class World:
+    """A scene seen by one of its sensors; lives for one render.
+
+    ``emitters`` and ``camera`` are the two kinds of endpoints, ``smooth``, ``delta`` and ``refracts``:
+    whether some BSDF has such a lobe; ``traits`` see `bsdf.Traits`.
+    """
+
+    def __init__(self, scene, sensor):
+        self.scene = scene
+        self.surfaces = bool(scene.shapes())
+        self.emitters = Emitters(scene)
+        self.camera = prepare(sensor, self.emitters.shape_errors, self.surfaces)
+        found = bsdfs(scene)
+        _prepare_bitmaps(found)
+        self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
+        self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
+        self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
+        self.traits = bsdf.Traits.of(found)
+
+
+def _prepare_bitmaps(found):
+    """Ask the bitmaps of BSDFs something.
+
+    Mitsuba makes of them what kernels read when they are first asked, and that runs what was recorded so far:
+    the first pass would be two kernels, and the second one a third.
+    """
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    held = (v for owner in bsdf.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
+    for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
+        for ask in (texture.eval, texture.eval_1, texture.eval_3):
+            try:
+                ask(si)
+                break
+            except RuntimeError:  # what it is asked depends on its channels, on ``raw`` and on the variant
+                continue
+
+
+def bsdfs(scene):
+    """The BSDFs of all shapes, those of shape groups included; that of an instance is never met."""
+    found = [s.bsdf() for s in all_shapes(scene) if not is_instance(s)]
+    return [b for b in found if b is not None]

@@ -1,0 +1,75 @@
+"""Camera endpoints: which treatment each kind of sensor gets."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..geometry.to_world import check_to_world
+from ..host.introspection import children, named, number
+from . import cameras
+from .others import Distant, IrradianceMeter, Opaque, Orthographic
+from .records import Sensor
+
+UNTARGETED = "target = none"
+
+
+def prepare(sensor, shape_errors, bounded=True) -> Sensor:
+    """The sensor for one render of a scene that has surfaces (``bounded``) or none. Kinds that light vertices
+    cannot be joined with take part by camera subpaths alone, and say why. Raises ``NotImplementedError`` for
+    what Mitsuba itself cannot render."""
+    kind = sensor.class_name()
+    if kind in cameras.KINDS:
+        return cameras.Camera(sensor, [sensor])
+    if kind == "OrthographicCamera":
+        return Orthographic(sensor)
+    if kind == "BatchSensor":
+        return _batch(sensor)
+    if kind == "IrradianceMeter":
+        return _meter(sensor, shape_errors)
+    if kind == "RadianceMeter":
+        return Opaque(
+            sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
+        )
+    if kind == "DistantSensorImpl":
+        # Only its text tells the three kinds apart.
+        if UNTARGETED in str(sensor):
+            return Distant(sensor) if bounded else Opaque(sensor, "the scene has no surface")
+        return Opaque(sensor, "the target of a distant sensor is out of a plugin's reach")
+    return Opaque(sensor, f"of the class {kind} nothing but its camera rays is known")
+
+
+def _batch(sensor) -> Sensor:
+    views = [view for view in children(sensor).values() if isinstance(view, mi.Sensor)]
+    if sensor.film().sample_border():
+        raise NotImplementedError(
+            f"bdpt: film of batch sensor {named(sensor)} has sample_border, which has no meaning beside "
+            "the views of a batch; set it to false"
+        )
+    if mi.is_spectral and any("srf" in children(view) for view in views):
+        raise NotImplementedError(
+            f"bdpt: a view of batch sensor {named(sensor)} has an srf of its own, but wavelengths are "
+            "sampled before the view is known; render the views one by one"
+        )
+    kinds = {view.class_name() for view in views}
+    if len(kinds) == 1 and kinds <= set(cameras.KINDS):
+        return cameras.Camera(sensor, views)
+    return Opaque(sensor, "the views of the batch are not all perspective or all thinlens", views)
+
+
+def _meter(sensor, shape_errors) -> Sensor:
+    film = sensor.film()
+    if film.sample_border():
+        raise NotImplementedError(
+            f"bdpt: film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
+            "its shape; set it to false"
+        )
+    shape = sensor.get_shape()
+    if number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
+        raise NotImplementedError(
+            f"bdpt: irradiance meter {named(sensor)} is on a {shape.class_name()} ({named(shape)}), of which "
+            "Mitsuba samples no points; put it on another shape"
+        )
+    check_to_world(shape, f"irradiance meter {named(sensor)}")
+    if tuple(film.size()) != (1, 1):
+        return Opaque(sensor, "the film has more than one pixel: which of them a point belongs to is unknown")
+    return IrradianceMeter(sensor, shape_errors)

@@ -1,0 +1,238 @@
+"""Sensors that are no pinhole and no lens: parallel ones, meters, and those that only Mitsuba knows."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..geometry import rays
+from ..geometry.quadrics import Sphere, sphere_normal
+from ..geometry.smooth_meshes import SmoothMeshes
+from ..host.introspection import number
+from .records import Arrival, CameraJoin, CameraStart, Sensor, view_at
+
+
+class _Parallel(Sensor):
+    """Sensors all of whose rays have one direction ``axis``: a join is a projection along it.
+
+    z_0 has the density ``density`` (over the area across the axis), and W_e = density: camera subpaths start
+    with weight 1.
+    """
+
+    parallel = True
+    _axis = _density = None  # set by the subclasses
+    no_area = "its rays have one direction, which a light subpath takes with probability zero"
+
+    def _starting(self, o, reach, like) -> CameraStart:
+        return CameraStart(
+            ray=mi.Ray3f(o, mi.Vector3f(self._axis), reach, like.time, like.wavelengths),
+            p=mi.Point3f(o),
+            pdf_w=self._density,
+            weight=mi.Float(1),
+            arrival=mi.Float(0),
+        )
+
+    def _joining(self, z0, position, valid) -> CameraJoin:
+        return CameraJoin(
+            p=mi.Point3f(z0),
+            anchor=rays.free_anchor(z0),
+            d=-self._axis,
+            dist2=mi.Float(1),
+            importance=self._density,
+            pdf_w=self._density,
+            arrival=mi.Float(0),
+            position=position,
+            reach=mi.Float(dr.inf),
+            valid=valid,
+        )
+
+
+class Orthographic(_Parallel):
+    """An orthographic camera. Mitsuba's has no ``sample_direction``; everything follows from its rays."""
+
+    def __init__(self, sensor):
+        super().__init__(sensor)
+        ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.Point2f(0.5))
+        o, d = (np.array(v, dtype=np.float64) for v in (ray.o, ray.d))
+        origin, axis = o[:, 0], d[:, 0] / np.linalg.norm(d[:, 0])
+        basis = np.stack([o[:, 1] - origin, o[:, 2] - origin, axis], axis=1)
+        rows = np.linalg.inv(basis)
+        vector = mi.Vector3f
+        self._origin, self._axis = dr.opaque(mi.Point3f, origin.tolist()), dr.opaque(vector, axis.tolist())
+        self._along = [dr.opaque(vector, basis[:, i].tolist()) for i in (0, 1)]
+        self._rows = [dr.opaque(vector, row.tolist()) for row in rows]
+        self._reach = dr.opaque(mi.Float, number(dr.slice(ray.maxt, 0)))
+        self._density = dr.opaque(mi.Float, 1 / (abs(np.linalg.det(basis)) * self.region.share))
+
+    def _start(self, uv, u_lens, like) -> CameraStart:
+        return self._starting(self._on_near_plane(uv), self._reach, like)
+
+    def _on_near_plane(self, uv):
+        return self._origin + self._along[0] * uv.x + self._along[1] * uv.y
+
+    def join(self, p, u_lens, u_film) -> CameraJoin:
+        from_origin = p - self._origin
+        x, y, depth = (dr.dot(row, from_origin) for row in self._rows)
+        uv = mi.Point2f(x, y)
+        valid = self.region.contains(uv) & (depth >= 0) & (depth <= self._reach)
+        return self._joining(self._on_near_plane(uv), self.region.to_position(uv), valid)
+
+
+class Distant(_Parallel):
+    """A distant sensor without target: its rays cover a disk about the scene. Its film has one pixel, and a
+    position on the film means nothing."""
+
+    needs_aperture_sample = True
+    needs_film_sample = True
+
+    def __init__(self, sensor):
+        super().__init__(sensor)
+        u = mi.Point2f([0.5, 1, 0.5], [0.5, 0.5, 1])  # the middle and two points of the rim
+        ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f(0.5), u)
+        o, d = (np.array(v, dtype=np.float64) for v in (ray.o, ray.d))
+        axis, across = d[:, 0] / np.linalg.norm(d[:, 0]), o[:, 1:] - o[:, :1]
+        vector = mi.Vector3f
+        self._origin = dr.opaque(mi.Point3f, o[:, 0].tolist())
+        self._axis = dr.opaque(vector, axis.tolist())
+        self._across = [dr.opaque(vector, across[:, i].tolist()) for i in (0, 1)]
+        radius2 = float((across**2).sum(0).mean())
+        self._radius2 = dr.opaque(mi.Float, radius2)
+        self._density = dr.opaque(mi.Float, 1 / (np.pi * radius2))
+
+    def _start(self, uv, u_lens, like) -> CameraStart:
+        disk = mi.warp.square_to_uniform_disk_concentric(u_lens)
+        o = self._origin + self._across[0] * disk.x + self._across[1] * disk.y
+        return self._starting(o, mi.Float(dr.inf), like)
+
+    def join(self, p, u_lens, u_film) -> CameraJoin:
+        from_origin = p - self._origin
+        depth = dr.dot(from_origin, self._axis)
+        aside = from_origin - self._axis * depth
+        z0 = self._origin + aside
+        valid = (depth >= 0) & (dr.squared_norm(aside) <= self._radius2)
+        return self._joining(z0, self.region.anywhere(u_film), valid)
+
+
+class IrradianceMeter(Sensor):
+    """An irradiance meter with one pixel: z_0 uniform on its shape (area measure), directions by the cosine
+    with the shading normal, W_e = 1 / area * (cosine with the shading over that with the geometric normal).
+
+    The film position chooses z_0, as in Mitsuba.
+    """
+
+    needs_aperture_sample = True
+    delta = False
+    needs_film_sample = True
+
+    def __init__(self, sensor, shape_errors):
+        super().__init__(sensor)
+        self._shape, self._shape_errors = sensor.get_shape(), shape_errors
+        self._smooth_mesh = SmoothMeshes.of([sensor])
+        sphere = Sphere.of(self._shape)
+        self._sphere = sphere if sphere is not None and sphere.turned else None
+        self._density = dr.opaque(mi.Float, 1 / number(self._shape.surface_area()))
+        # A light subpath tells its point of the shape, but not the film position that chooses it.
+        self.area = self.region.box
+        self.no_area = "with a filter other than box the film position of a point of its shape is unknown"
+
+    def _sample(self, u, like, reference=None):
+        """A point of the shape, and its anchor for rays to and from ``reference`` (the point itself)."""
+        ps = self._shape.sample_position(like.time, u)
+        if self._sphere is not None:
+            ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
+        n = ps.n
+        if self._smooth_mesh is not None:
+            n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
+        errors = self._shape_errors.at(mi.ShapePtr(self._shape))
+        return ps, rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
+
+    def _start(self, uv, u_lens, like) -> CameraStart:
+        ps, anchor = self._sample(uv, like)
+        local = mi.warp.square_to_cosine_hemisphere(u_lens)
+        d = mi.Frame3f(ps.n).to_world(local)
+        pdf_w = local.z * dr.inv_pi
+        return CameraStart(
+            ray=mi.Ray3f(rays.spawn(anchor, d, like)),
+            p=mi.Point3f(ps.p),
+            pdf_w=pdf_w,
+            weight=mi.Float(dr.pi),
+            arrival=dr.pi / self._density if self.area else mi.Float(0),  # cos / (density * cos / pi)
+        )
+
+    def join(self, p, u_lens, u_film) -> CameraJoin:
+        ps, anchor = self._sample(u_film, self._like(), p)
+        to_z0 = ps.p - p
+        dist2 = dr.squared_norm(to_z0)
+        d = to_z0 * dr.rsqrt(dist2)
+        return self._joining(ps, mi.Vector3f(d), dist2, anchor, u_film)
+
+    def join_direction(self, d, u_lens, u_film) -> CameraJoin:
+        ps, anchor = self._sample(u_film, self._like())
+        return self._joining(ps, mi.Vector3f(d), mi.Float(1), anchor, u_film)
+
+    def _joining(self, ps, d, dist2, anchor, u_film) -> CameraJoin:
+        cos = dr.dot(ps.n, -d)
+        return CameraJoin(
+            p=mi.Point3f(ps.p),
+            anchor=anchor,
+            d=d,
+            dist2=dist2,
+            importance=cos,
+            pdf_w=cos * dr.inv_pi,
+            arrival=cos / (dist2 * self._density) if self.area else mi.Float(0),
+            position=self.region.to_position(u_film),
+            reach=mi.Float(dr.inf),
+            valid=cos > 0,
+        )
+
+    def _like(self):
+        return dr.zeros(mi.Interaction3f)  # shapes do not move: any time will do
+
+    def arrive(self, walk, vertex, distant) -> Arrival:
+        si = vertex.si
+        cos = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0)
+        return Arrival(
+            dist2=dr.squared_norm(si.p - walk.previous),
+            cos=cos,  # as in `start` and `join`: weights of all strategies have the same idea of it
+            pdf_area=self._density,
+            pdf_w=cos * dr.inv_pi,
+            importance=self._density * cos / vertex.cos,
+            position=self.region.to_position(mi.Point2f(0.5)),
+            active=vertex.hit & (cos > 0) & (si.shape == mi.ShapePtr(self._shape)),
+        )
+
+
+class Opaque(Sensor):
+    """A sensor, or several side by side, of which only Mitsuba's own camera rays are used."""
+
+    needs_aperture_sample = True
+    joinable = False
+
+    def __init__(self, sensor, reason: str, views=None):
+        super().__init__(sensor)
+        self.reason = self.no_area = reason
+        self._views = views or [sensor]
+
+    def _start(self, uv, u_lens, like) -> CameraStart:
+        index, x = view_at(uv.x, len(self._views))
+        uv = mi.Point2f(x, uv.y)
+        chosen = None
+        for i, view in enumerate(self._views):
+            ray, weight = view.sample_ray_differential(like.time, like.u_wavelength, uv, u_lens)
+            sampled = mi.Ray3f(ray.o, ray.d, ray.maxt, like.time, like.wavelengths), mi.Spectrum(weight)
+            chosen = (
+                sampled
+                if i == 0
+                else tuple(dr.select(index == i, new, old) for new, old in zip(sampled, chosen, strict=True))
+            )
+        ray, weight = chosen
+        # The share of the wavelengths joins when the sample is added to the film.
+        weight = dr.select(like.weight != 0, weight / like.weight, 0)
+        return CameraStart(
+            ray=ray,
+            p=mi.Point3f(ray.o),
+            pdf_w=mi.Float(1),
+            weight=weight,
+            arrival=mi.Float(0),
+        )

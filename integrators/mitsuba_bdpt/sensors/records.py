@@ -1,0 +1,169 @@
+"""What every kind of sensor tells a kernel: starts of camera subpaths, joins, arrivals of light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..geometry import rays
+
+
+@dataclass
+class CameraStart:
+    """Start of a camera subpath: ``ray`` (for cameras on the near plane), ``p`` of z_0, ``pdf_w`` density of
+    the direction given z_0 (solid angle; of a parallel sensor, whose direction is fixed, the density of z_0
+    over the area across it), ``weight`` W_e cos / all densities, ``arrival`` cos / (density of z_0 *
+    ``pdf_w``), what t = 0 begins with (0 without area), ``position`` on the film in pixels, ``counted``
+    where the filter counts it (a box filter: at the pixel's corner, as Mitsuba does)."""
+
+    ray: object
+    p: object
+    pdf_w: object
+    weight: object
+    arrival: object
+    position: object = None
+    counted: object = None
+
+
+@dataclass
+class CameraJoin:
+    """z_0 joined with a point of the scene.
+
+    ``p`` of z_0; ``anchor`` where visibility ends (for cameras on the near plane); ``d`` unit direction from
+    the point to z_0; ``dist2`` squared distance to z_0 (1 to a parallel sensor); ``importance``
+    W_e cos / density of z_0;
+    ``pdf_w`` as in `CameraStart`, towards the point; ``arrival`` cos / (dist2 * density of z_0), which makes
+    a density of directions at the point the ratio of t = 0 and t = 1 (0 without area); ``position`` on the
+    film in pixels; ``reach`` length of camera rays along ``-d``; ``valid``: seen by the film, and within the
+    clip planes.
+    """
+
+    p: object
+    anchor: rays.Anchor
+    d: object
+    dist2: object
+    importance: object
+    pdf_w: object
+    arrival: object
+    position: object
+    reach: object
+    valid: object
+
+
+@dataclass
+class Arrival:
+    """A light subpath that hits the sensor at z_0: ``dist2`` of its last edge, ``cos`` at z_0,
+    ``pdf_area`` density of z_0 (area measure) and ``pdf_w`` (solid angle) of the way back in camera
+    subpaths, ``importance`` W_e, ``position`` on the film in pixels, ``active``. ``surroundings`` see
+    `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light comes from infinity, None where
+    the subpath's own ray has said so."""
+
+    dist2: object
+    cos: object
+    pdf_area: object
+    pdf_w: object
+    importance: object
+    position: object
+    active: object
+    surroundings: object = None
+
+
+class Region:
+    """The film region that camera samples cover: the crop window, with ``sample_border`` and its border.
+
+    ``crop_size``, ``crop_offset``, ``size`` (width, height) in pixels; ``border`` in pixels; ``box``: whether
+    the filter is one; ``share``: area over that of the crop window.
+    """
+
+    def __init__(self, film):
+        self.border = film.rfilter().border_size() if film.sample_border() else 0
+        self.box = film.rfilter().is_box_filter()
+        self.crop_size = np.array(film.crop_size(), dtype=int)
+        self.crop_offset = np.array(film.crop_offset(), dtype=int)
+        self.size = self.crop_size + 2 * self.border
+        self.share = float(np.prod(self.size / self.crop_size))
+        margin = self.border / self.crop_size
+        self.low = dr.opaque(mi.Point2f, (-margin).tolist())
+        self.high = dr.opaque(mi.Point2f, (1 + margin).tolist())
+        self._width = dr.opaque(mi.UInt32, int(self.size[0]))
+        self._first = dr.opaque(mi.Point2i, (self.crop_offset - self.border).tolist())
+        self._size = dr.opaque(mi.Point2f, self.crop_size.astype(float).tolist())
+        self._offset = dr.opaque(mi.Point2f, self.crop_offset.astype(float).tolist())
+
+    def pixel(self, index):
+        """Film pixel of the ``index``-th pixel of the region (row by row), as ``mi.Point2i``."""
+        y = index // self._width
+        x = index - y * self._width
+        return mi.Point2i(mi.Int32(x), mi.Int32(y)) + self._first
+
+    def to_uv(self, position):
+        """Film position in the unit square of the crop window (beyond it in the border)."""
+        return (position - self._offset) / self._size
+
+    def to_position(self, uv):
+        """The reverse of `to_uv`."""
+        return mi.Point2f(uv) * self._size + self._offset
+
+    def anywhere(self, u):
+        """Film position that ``u`` in [0, 1)^2 chooses uniformly."""
+        return self.to_position(self.low + u * (self.high - self.low))
+
+    def contains(self, uv):
+        """Mask: within the region."""
+        return dr.all((uv >= self.low) & (uv < self.high))
+
+
+def view_at(x, count: int):
+    """Which of ``count`` views side by side ``x`` in [0, 1) is in, and its place within that view."""
+    index = dr.minimum(mi.UInt32(x * count), count - 1)
+    return index, x * count - mi.Float(index)
+
+
+class Sensor:
+    """What the kernel may ask of a sensor; made anew for each render.
+
+    ``region`` of the film; ``needs_aperture_sample``: whether z_0 needs a random point; ``delta``: a join
+    with a delta emitter has measure zero; ``parallel``: all camera rays have one direction; ``joinable``:
+    whether vertices of light subpaths can be joined with it, if not ``reason`` says why; ``area``: whether a
+    light subpath can hit it (t = 0), if not ``no_area`` says why; ``needs_film_sample``: whether a join needs
+    a second random point.
+    """
+
+    needs_aperture_sample = False
+    delta = True
+    parallel = False
+    joinable = True
+    area = False
+    needs_film_sample = False
+    reason = ""
+    no_area = "the sensor has no area that light could hit"
+
+    def __init__(self, sensor):
+        self.sensor = sensor
+        self.region = Region(sensor.film())
+
+    def start(self, pixel, u_film, u_lens, like) -> CameraStart:
+        """Start of a camera subpath through ``pixel``; ``like`` carries time and wavelengths."""
+        position = mi.Point2f(pixel) + u_film
+        start = self._start(self.region.to_uv(position), u_lens, like)
+        counted = mi.Point2f(pixel) if self.region.box else position
+        return replace(start, position=position, counted=counted)
+
+    def _start(self, uv, u_lens, like) -> CameraStart:
+        """`start` at a point of the crop window's unit square, without ``position`` and ``counted``."""
+        raise NotImplementedError
+
+    def join(self, p, u_lens, u_film) -> CameraJoin:
+        """Join the scene point ``p`` with z_0, chosen by ``u_lens`` and, if it is needed, ``u_film``."""
+        raise NotImplementedError
+
+    def join_direction(self, d, u_lens, u_film) -> CameraJoin:
+        """As `join`, with light that travels along ``d`` from infinity; ``dist2`` is 1."""
+        raise NotImplementedError
+
+    def arrive(self, walk, vertex, distant) -> Arrival:
+        """Where the last edge of a light subpath hits the sensor; ``distant``: it comes from infinity."""
+        raise NotImplementedError

@@ -1,0 +1,352 @@
+"""Evaluation of Mitsuba's BSDFs in both directions, and the one home of the adjoint factor.
+
+Directions: ``c`` points towards the camera's side of a vertex, ``l`` towards the light's side, both
+away from the surface. On camera subpaths Mitsuba's ``si.wi`` is ``c``. On light subpaths ``si.wi``
+is ``l``, and the BSDF is evaluated in *radiance* mode with the two swapped, times the ratio of
+geometric cosines |n.c| / |n.l|: exact for bump and normal maps, interpolated normals and hair,
+where Mitsuba's importance mode with Veach's correction (thesis, eq. 5.19) is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from ..host.introspection import children
+
+# Plugins whose sample() returns the density of the lobe that was picked, not that of pdf().
+# Plugins that are not Mitsuba's own are treated like them.
+_SAMPLED_PDF_IS_PDF = frozenset(
+    "SmoothDiffuse SmoothConductor RoughConductor SmoothDielectric RoughDielectric ThinDielectric "
+    "SmoothPlastic RoughPlastic PolarizedPlastic Principled PrincipledThin Hair "
+    "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
+)
+
+
+@dataclass
+class Evaluation:
+    """``value`` f |cos| (light subpaths: adjoint factor included), densities in solid angle.
+
+    ``pdf_fwd_w`` of leaving into the new direction, ``pdf_rev_w`` of the reverse.
+    """
+
+    value: object
+    pdf_fwd_w: object
+    pdf_rev_w: object
+
+
+@dataclass
+class Step:
+    """A sampled direction. Densities in solid angle; ``pdf_*`` are unset where ``delta``."""
+
+    wo: object
+    weight: object
+    pdf_fwd_w: object
+    pdf_rev_w: object
+    cos_out: object
+    delta: object
+    null: object
+    eta: object
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`."""
+
+    full_pdf: bool
+    round_trip: bool
+    asked: Asked
+
+    @staticmethod
+    def of(bsdfs) -> Traits:
+        """Of BSDFs that one virtual call may visit."""
+        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs))
+
+
+# From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands
+# over the interaction once, which saves 6 % of the time in a Cornell box; but each place that makes one has
+# functions of its own, one per BSDF, where the same few questions, asked anywhere, are compiled once. (Rooms
+# of 10 and of 27 materials take the same time either way. What diverging lanes cost in a decision is another
+# matter, see `choice.MANY_BSDFS`.)
+MANY = 10
+
+
+class Asked:
+    """Virtual calls of these BSDFs alone, which are `MANY` or not. (Mitsuba's visit all of the process, and a
+    kernel holds a function for each of them: those inside of others, which no ray meets, and those of other
+    scenes.)"""
+
+    def __init__(self, bsdfs):
+        by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
+        self._bsdfs = list(by_id.values())
+        self.many = len(by_id) >= MANY
+        numbers = [0] * (max(by_id, default=0) + 1)
+        for number, index in enumerate(by_id):
+            numbers[index] = number
+        self._numbers = mi.UInt32(numbers)
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._bsdfs)
+
+    def __call__(self, bsdf, question, *args):
+        """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask. A BSDF itself, in
+        place of a pointer, answers without a call."""
+        # Run step by step, calls of functions of ours fail for `plastic`; its own methods do not.
+        if isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
+            return question(bsdf, *args)
+        number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
+        return dr.switch(number, [partial(question, b) for b in self._bsdfs], *args)
+
+    def together(self, bsdf, questions, *args):
+        """Answers of ``questions(bsdf, *args)``, which asks through this object: in one call, or where there
+        are `MANY` BSDFs in one for each question."""
+        return questions(bsdf, *args) if self.many else self(bsdf, questions, *args)
+
+
+def _registry_id(bsdf) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
+
+
+@dataclass
+class Target:
+    """A local direction ``wo`` in which a BSDF is evaluated where ``active``; ``cos_ratio``, for light
+    vertices, |n.wo| / |n.wi| with the geometric normal."""
+
+    wo: object
+    active: object
+    cos_ratio: object = None
+
+
+def with_wi(si, wi):
+    """A copy of ``si`` that is seen from ``wi``. (Assigning to ``si.wi`` changes aliases.)"""
+    other = mi.SurfaceInteraction3f(si)
+    other.wi = wi
+    return other
+
+
+def connectible(bsdf):
+    """Mask: the BSDF has a lobe that is not delta."""
+    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+
+
+def evaluate(bsdf, si, wo, active, traits: Traits) -> Evaluation:
+    """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
+    return _evaluation(*_evaluated(bsdf, si, wo, active, traits.asked))
+
+
+def _evaluated(bsdf, si, wo, active, asked: Asked):
+    """Value, and densities of ``wo`` and of the reverse, the other direction being ``si.wi``."""
+
+    def ask(self, si, wo, active):
+        ctx = mi.BSDFContext()
+        value, pdf = self.eval_pdf(ctx, si, wo, active)
+        return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active)
+
+    return asked(bsdf, ask, si, wo, active)
+
+
+def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
+    """The value is NaN, so that whoever uses it counts it, also where a density is not finite: no weight
+    follows from that. (Where the value is 0 it does not matter.)"""
+    finite = dr.isfinite(pdf_fwd_w + pdf_rev_w)
+    return Evaluation(dr.select(finite | is_zero(value), value, dr.nan), pdf_fwd_w, pdf_rev_w)
+
+
+def evaluate_adjoint(bsdf, si, wo, active, traits: Traits, cos_ratio=None) -> Evaluation:
+    """BSDF of a light vertex towards the local direction ``wo`` (to the camera's side).
+
+    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal,
+    which is computed unless given.
+    """
+    if cos_ratio is None:
+        cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
+    return _adjoint(cos_ratio, *_evaluated_adjoint(bsdf, si, wo, active, traits.asked))
+
+
+def _evaluated_adjoint(bsdf, si, wo, active, asked: Asked):
+    """As `_evaluated`, with the directions swapped."""
+    value, pdf_rev_w, pdf_fwd_w = _evaluated(bsdf, with_wi(si, wo), si.wi, active, asked)
+    return value, pdf_fwd_w, pdf_rev_w
+
+
+def _adjoint(cos_ratio, value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
+    return _evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
+
+
+def geometric_cos(si, w):
+    """Absolute cosine between the local direction ``w`` and the geometric normal."""
+    return dr.abs(dr.dot(si.n, si.to_world(w)))
+
+
+def sample(
+    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
+) -> tuple[Step, Evaluation | None]:
+    """Continue a camera subpath where ``active``: the `Step`. ``u1`` picks the lobe, ``u2`` the direction.
+
+    With a ``target`` also its `Evaluation`. Returns both, None for the latter without a target.
+    """
+
+    def questions(bsdf, si, u1, u2, sampled, *joined):
+        drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
+        return drawn, _evaluated(bsdf, si, *joined, traits.asked) if target else None
+
+    drawn, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
+    step = _step(si, drawn, drawn.weight)
+    if traits.round_trip:  # no alternative that would have to make this event from the other side
+        step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
+    return step, _evaluation(*evaluated) if target else None
+
+
+def sample_adjoint(
+    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
+) -> tuple[Step, Evaluation | None]:
+    """Continue a light subpath; the adjoint factor is part of ``weight``, and of the evaluation's ``value``.
+    Arguments and results as of `sample`."""
+
+    def questions(bsdf, si, u1, u2, sampled, *joined):
+        drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
+        weight = _adjoint_weight(bsdf, si, drawn, sampled, traits)
+        return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits.asked) if target else None
+
+    drawn, weight, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
+    cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
+    step = _step(si, drawn, dr.select(is_zero(weight), 0, weight * cos_ratio))
+    return step, _adjoint(target.cos_ratio, *evaluated) if target else None
+
+
+def _answers(questions, asked: Asked, target, bsdf, *args):
+    """Answers of ``questions(bsdf, *args)``, the last of ``args`` a mask; direction and mask of a ``target``
+    follow."""
+    joined = (target.wo, target.active) if target else ()
+    mask = args[-1] | target.active if target else args[-1]
+    # The last argument is the call's mask.
+    return asked.together(bsdf, lambda bsdf, *args: questions(bsdf, *args[:-1]), *args, *joined, mask)
+
+
+def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
+    """Weight of a sample of a light subpath without the ratio of geometric cosines."""
+    bs, delta = drawn.bs, mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
+    f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits.asked))
+    # The radiance that a camera subpath carries, without its factor eta^-2.
+    eta2 = dr.square(bs.eta)
+    delta_weight = drawn.back / eta2 if traits.round_trip else drawn.weight * eta2
+    weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.pdf_fwd_w)
+    # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
+    return dr.select((drawn.pdf_fwd_w == 0) | is_zero(drawn.weight), 0, weight)
+
+
+@dataclass
+class _Drawn:
+    """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode: its ``weight``, densities (that of the
+    event where it is delta) and, if `Traits.round_trip`, the weight ``back`` of a delta event made from its
+    other end, 0 if it does not lead back."""
+
+    bs: object
+    weight: object
+    pdf_fwd_w: object
+    pdf_rev_w: object
+    back: object
+
+
+def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
+    """A direction that Mitsuba's ``sample`` draws, with its densities both ways, in one virtual call."""
+
+    def ask(self, si, u1, u2, active):
+        ctx = mi.BSDFContext()
+        bs, weight = self.sample(ctx, si, u1, u2, active)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        smooth = active & ~delta
+        pdf_fwd_w = bs.pdf
+        if traits.full_pdf:
+            full = smooth & ~(bs.pdf == 0)
+            pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
+        pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
+        back = _back(self, si, bs, u1, u2, active & delta) if traits.round_trip else mi.Spectrum(0)
+        return bs, weight, pdf_fwd_w, pdf_rev_w, back
+
+    return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
+
+
+def brightest(value):
+    """The largest entry of a spectrum, in size; one that is NaN counts only where all others do."""
+    return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
+
+
+def is_zero(value):
+    """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
+    return dr.all(mi.unpolarized_spectrum(value) == 0)
+
+
+def is_finite(value):
+    """Mask: no entry of a spectrum is NaN or infinite."""
+    return dr.all(dr.isfinite(mi.unpolarized_spectrum(value)))
+
+
+def _back(bsdf, si, bs, u1, u2, active):
+    """The weight of a delta event sampled from its other end, 0 if it does not lead back."""
+    back, weight = bsdf.sample(mi.BSDFContext(), with_wi(si, bs.wo), u1, u2, active)
+    return dr.select(dr.squared_norm(back.wo - si.wi) < 1e-4, weight, 0)
+
+
+def _event_cos_ratio(si, bs):
+    """|m.l| / |m.c| about the normal m of a delta event, which under a bump or normal map is not
+    the shading frame's. Reflection and null: 1. Refraction: m along eta_c c + eta_l l.
+    """
+    m = bs.eta * bs.wo + si.wi  # bs.eta = eta_c / eta_l when sampling from l
+    ratio = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
+    refracted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
+    refracted &= dr.abs(bs.eta - 1) > 1e-5  # equal indices: straight on, and m is zero
+    return dr.select(refracted, ratio, 1)
+
+
+def _step(si, drawn: _Drawn, weight) -> Step:
+    """The step that a sample stands for, of this ``weight``."""
+    bs = drawn.bs
+    delta, cos_out = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), geometric_cos(si, bs.wo)
+    # A direction that is NaN hits nothing, and nobody would know.
+    finite = dr.isfinite(dr.select(delta, cos_out, cos_out + drawn.pdf_fwd_w + drawn.pdf_rev_w))
+    finite &= is_finite(drawn.weight) & dr.isfinite(bs.eta)  # roulette asks for eta
+    return Step(
+        wo=bs.wo,
+        weight=dr.select(finite | is_zero(drawn.weight), weight, dr.nan),
+        pdf_fwd_w=drawn.pdf_fwd_w,
+        pdf_rev_w=drawn.pdf_rev_w,
+        cos_out=cos_out,
+        delta=delta,
+        null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
+        eta=bs.eta,
+    )
+
+
+def needs_full_pdf(bsdfs) -> bool:
+    """Whether some BSDF's sample() may report another density than its pdf().
+
+    A mixture that reports the picked lobe's density gives an unbiased ``weight`` but cannot serve
+    in the weights of multiple importance sampling, nor as divisor of a full evaluation.
+    """
+    return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in nested(bsdfs))
+
+
+def needs_round_trip(bsdfs) -> bool:
+    """Whether a delta event may exist from one end only: under a bump or normal map.
+
+    Mitsuba's maps drop sampled directions (not incident ones) on different sides of the surface and
+    of the perturbed normal, and turn the normal towards the incident direction.
+    """
+    return any(
+        b.class_name() in ("BumpMap", "NormalMap") and mi.has_flag(b.flags(), mi.BSDFFlags.Delta)
+        for b in nested(bsdfs)
+    )
+
+
+def nested(bsdfs):
+    """``bsdfs`` and every BSDF inside them (two-sided, mask, blend, bump and normal maps)."""
+    found = list(bsdfs)
+    for bsdf in found:  # grows on the way
+        found += [value for value in children(bsdf).values() if isinstance(value, mi.BSDF)]
+    return found

@@ -1,0 +1,146 @@
+"""Inner connections: s and t at least 2."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays, rounding
+from ..sampling.points import Purpose
+from . import bsdf, mis
+from .contribution import Contribution, _counts, _one, _roulette, _size, count, finite
+from .light_path import LightPath, read_light_vertex
+from .walk import Vertex, newest_coefficient
+
+
+def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
+    """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41).
+
+    ``active`` where the contribution is not zero.
+    """
+    h = kernel.heuristic
+    k = z.edges + y.edges + 1
+    active = z.hit & (k <= kernel.last_inner)
+    between = y.si.p - z.si.p
+    dist2 = dr.squared_norm(between)
+    active &= dist2 > 0
+    inverse = dr.rcp(dist2)
+    d = between * dr.sqrt(inverse)
+    wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
+    cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
+    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active, kernel.traits)
+    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y / y.cos)
+    value = (z.throughput * f_z.value) * (f_y.value * y.throughput) * inverse
+    active &= ~bsdf.is_zero(value)
+
+    light_side = mis.alternatives(
+        h,
+        y.partial,
+        newest_coefficient(kernel, kernel.kappa.direct, y.edges),
+        f_y.pdf_rev_w,
+        f_z.pdf_fwd_w * cos_y * inverse,
+    )
+    camera_side = mis.alternatives(
+        h,
+        z.partial,
+        newest_coefficient(kernel, kernel.kappa.splat, z.edges),
+        f_z.pdf_rev_w,
+        f_y.pdf_fwd_w * cos_z * inverse,
+    )
+    weight, shares = h.weigh(kernel.kappa.inner, light_side, camera_side)
+    active &= _counts(kernel, value, weight)
+    return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
+
+
+def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
+    """Join ``z`` with every stored light vertex, a visibility ray each.
+
+    ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
+    ``visible``: it is active and nothing is in between.
+    """
+
+    def body(slot, total, nonzero, lost):
+        y = read_light_vertex(kernel, path, slot)
+        counted = {"non_finite": lost}
+        c = finite(inner(kernel, z, y), counted)
+        nonzero = nonzero + _one(c.active)
+        ray, own = _sight(kernel, z, y)
+        visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
+        return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
+
+    candidates = candidate_count(kernel, z, path)
+    _, total, nonzero, lost = dr.while_loop(
+        (mi.UInt32(0), total, mi.UInt32(0), mi.UInt32(0)),
+        lambda slot, *_: slot < candidates,
+        body,
+        label="inner connections",
+    )
+    counters["non_finite"] += lost
+    counters["evaluated"] += candidates
+    counters["zero"] += candidates - nonzero
+    counters["shadow_inner"] += nonzero
+    return total
+
+
+def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
+    """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
+
+    The draw is a running one over all candidates; the estimate is that of all of them. One random
+    number serves the whole draw: what is left of it after each decision is uniform again.
+    """
+
+    def body(slot, chosen, total, end, u, nonzero, lost):
+        y = read_light_vertex(kernel, path, slot)
+        counted = {"non_finite": lost}
+        c = finite(inner(kernel, z, y), counted)
+        value = c.weighted()
+        size = _size(value)
+        before, total = total, total + size
+        # What is left of the number after the decision, u / share or (u - share) / (1 - share).
+        u_total = u * total
+        take = u_total < size
+        rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
+        u = dr.select(total > 0, rest, u)
+        chosen = dr.select(take, value, chosen)
+        # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
+        end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
+        return slot + 1, chosen, total, end, u, nonzero + _one(c.active), counted["non_finite"]
+
+    candidates = candidate_count(kernel, z, path)
+    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
+    small = kernel.shape_errors.small
+    none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.UInt32(0) if small else mi.Point3f(z.si.p)
+    _, chosen, total, end, u, nonzero, lost = dr.while_loop(
+        (*none, u, mi.UInt32(0), mi.UInt32(0)),
+        lambda slot, *_: slot < candidates,
+        body,
+        label="draw an inner connection",
+    )
+    counters["evaluated"] += candidates
+    counters["zero"] += candidates - nonzero
+    counters["non_finite"] += lost
+    # In this order: the draw may hit a tiny one, for which total / size is infinite.
+    value = (chosen / _size(chosen)) * total
+    active = total > 0
+    active, survival = _roulette(kernel, value, u, active, counters)
+    count(counters, "shadow_inner", active)
+    own = None
+    if small:
+        y = read_light_vertex(kernel, path, end)
+        ray, own = _sight(kernel, z, y)
+    else:
+        ray = rays.segment_to(z.anchor, end, z.si)
+    active &= ~rays.occluded(kernel.scene, ray, active, own)
+    return dr.select(active, value / survival, 0)
+
+
+def _sight(kernel, z: Vertex, y: Vertex):
+    """`rays.sight` from ``z`` to the light vertex ``y``."""
+    return rays.sight(kernel.shape_errors, z.anchor, y.anchor, rounding.met(y.si.shape, y.si.instance), z.si)
+
+
+def candidate_count(kernel, z: Vertex, path: LightPath):
+    """Number of light vertices to try at ``z``: slot i holds y_{i+1} or a later one, and paths have at
+    most `Kernel.last_inner` edges."""
+    possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)
+    return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

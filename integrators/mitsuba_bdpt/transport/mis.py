@@ -1,0 +1,206 @@
+"""Multiple importance sampling of all strategies (s, t) by recursive partial sums.
+
+Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland
+University, 2012, without merging; equation numbers below are the report's. Each subpath carries
+two floats, ``d_vcm`` and ``d_vc``, from which the weight of any strategy follows at once:
+
+* ``d_vcm`` stands for the *newest* alternative strategy: the one that makes the subpath's last
+  vertex from the other side. It has to be multiplied by the density with which that happens.
+* ``d_vc`` stands for all older alternatives. It has to be multiplied by that same density and by
+  the reverse density (solid angle) of the vertex before the last.
+
+What differs from the report: (1) each strategy class has a coefficient kappa with which it enters
+every weight, w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know yet which class its
+newest alternative will belong to, so the coefficient joins when a strategy is evaluated or when
+the term is folded into ``d_vc``, never when it is stored. (2) Sums are kept in linear units and
+combined by the heuristic (``a + b``, ``hypot``, ``max`` or a count); squares are never stored, so
+ratios of densities over 60 orders of magnitude stay finite. (3) The density of next-event
+estimation may depend on the vertex that is lit; see ``emitters``.
+
+Everything here is arithmetic on floats of any width; it knows no scene. A coefficient or partial sum that
+is the Python number 0 belongs to classes that are not in use: nothing is computed for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..settings import HEURISTICS
+
+# Classes whose coefficients a render may choose: s = 0, s = 1 (t >= 2), t <= 1, s and t >= 2.
+CLASSES = ("hit", "direct", "light", "inner")
+
+# A strategy beyond this ratio has a weight below 1e-37, the smallest that float32 tells from zero;
+# without the bound, infinity times a following reverse density of zero would be NaN.
+SATURATION = 1e37
+
+
+@dataclass
+class Partial:
+    """Partial sums of one subpath; see the module's description."""
+
+    d_vcm: object
+    d_vc: object
+
+
+def is_absent(x) -> bool:
+    """Whether ``x`` stands for classes of strategies that are not in use."""
+    return isinstance(x, (int, float)) and x == 0
+
+
+def choose(mask, a, b):
+    """``dr.select`` of two coefficients or partial sums; 0 where both classes are not in use."""
+    return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
+
+
+def times(coefficient, density):
+    """A coefficient times a density that enter a partial sum together."""
+    return 0 if is_absent(coefficient) else coefficient * density
+
+
+class Heuristic:
+    """How alternatives are combined: ``balance``, ``power`` (exponent 2), ``maximum``, ``uniform``.
+
+    Raises ``ValueError`` for any other name.
+    """
+
+    def __init__(self, name: str):
+        if name not in HEURISTICS:
+            raise ValueError(f"heuristic={name!r} is not known; use one of {', '.join(HEURISTICS)}")
+        self.name = name
+
+    def scale(self, x, factor):
+        """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
+        if is_absent(x) or is_absent(factor):
+            return 0
+        if self.name == "uniform":  # counts strategies: only whether a density is zero matters
+            return dr.select(factor > 0, x, 0)
+        # The factor as well: 0 times an infinite product of densities would be NaN.
+        return dr.minimum(x * dr.minimum(factor, SATURATION), SATURATION)
+
+    def combine(self, a, b):
+        """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
+        if is_absent(a) or is_absent(b):
+            return b if is_absent(a) else a
+        if self.name == "power":
+            total = dr.hypot(a, b)
+        elif self.name == "maximum":
+            total = dr.maximum(a, b)
+        else:
+            total = a + b
+        return dr.minimum(total, SATURATION)
+
+    def zero(self):
+        """An empty partial sum."""
+        return mi.Float(0)
+
+    def present(self, x):
+        """A partial sum to which classes in use may be added."""
+        return self.zero() if is_absent(x) else x
+
+    def start(self, inverse_density):
+        """Partial sum of one strategy whose ratio is ``inverse_density`` so far."""
+        if self.name == "uniform":
+            return dr.select(inverse_density > 0, 1.0, 0.0)
+        return dr.minimum(inverse_density, SATURATION)
+
+    def weigh(self, coefficient, light_side, camera_side):
+        """`weight`, and the classes' shares of it, which only `ByClass` knows."""
+        return self.weight(coefficient, light_side, camera_side), None
+
+    def weight(self, coefficient, light_side, camera_side):
+        """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
+
+        ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
+        alternatives with fewer and with more light vertices (eq. 37).
+        """
+        if self.name == "maximum":
+            # Of equal ones, that with the fewest light vertices counts. Rounding must not decide:
+            # each strategy computes the ratio by itself. (Of three, each within 1e-4 of the next, none
+            # may count.)
+            near = coefficient * (1 + 1e-4)
+            best = (near >= camera_side) & (coefficient > light_side * (1 + 1e-4))
+            return dr.select(best, 1.0, 0.0)
+        others = self.combine(light_side, camera_side)
+        if is_absent(others):
+            return mi.Float(1)
+        if self.name == "uniform":
+            return dr.rcp(1 + others)
+        ratio = others / coefficient
+        return dr.rcp(1 + (dr.square(ratio) if self.name == "power" else ratio))
+
+
+class ByClass(Heuristic):
+    """The balance heuristic with partial sums split by classes of strategies: `CLASSES`, one entry each.
+
+    Coefficients are vectors with one entry that is not 0, so that every term finds its place.
+    """
+
+    def __init__(self):
+        super().__init__("balance")
+
+    def zero(self):
+        return mi.Vector4f(0)
+
+    def weigh(self, coefficient, light_side, camera_side):
+        """Weight of the strategy at hand, and the share of each class in the sum of all strategies."""
+        total = self.combine(self.combine(light_side, camera_side), coefficient)
+        shares = total / dr.sum(total)
+        return dr.sum(coefficient) / dr.sum(total), shares
+
+
+def arrive(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
+    """Convert to the area measure at a new vertex (the part of eqs. 31-35 that is known at the hit).
+
+    ``dist2`` squared length of the edge (1 where the edge keeps another measure: the first edge
+    from an emitter at infinity), ``cos`` absolute geometric cosine at the new vertex.
+    """
+    return Partial(
+        d_vcm=heuristic.scale(partial.d_vcm, dist2 / cos),
+        d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
+    )
+
+
+def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partial:
+    """Fold the newest alternative and take a sampled direction (eqs. 34, 35; delta events 53, 54).
+
+    ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
+    ``pdf_fwd_w`` and ``pdf_rev_w`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``.
+    """
+    older = heuristic.combine(
+        heuristic.scale(partial.d_vcm, coefficient),
+        heuristic.scale(partial.d_vc, step.pdf_rev_w),
+    )
+    # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its probabilities from either
+    # side are the same for Mitsuba's BSDFs and left out. So is the ratio of the solid angles on the two sides
+    # of a refraction, (eta_l/eta_c)^2 cos_l/cos_c: weights are those of densities that leave it out, the same
+    # ones whichever strategy asks, so they sum to 1 and nothing is biased; they are exactly the balance
+    # heuristic's for reflections and where these ratios multiply to 1.
+    kept = 0
+    if not is_absent(older):
+        kept = dr.select(
+            step.delta,
+            heuristic.scale(partial.d_vc, step.cos_out),
+            heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
+        )
+    return Partial(
+        d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
+        d_vc=kept,
+    )
+
+
+def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev_w, density):
+    """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40, 41, 44-47).
+
+    ``coefficient`` of the newest alternative's class; ``pdf_rev_w`` solid-angle density of sampling
+    the vertex before the last from the last; ``density`` of making the last vertex from the other
+    side, in the measure in which ``d_vcm`` is stored (area, or solid angle at infinity).
+    """
+    total = heuristic.combine(
+        heuristic.scale(partial.d_vcm, coefficient),
+        heuristic.scale(partial.d_vc, pdf_rev_w),
+    )
+    return heuristic.scale(total, density)

@@ -1,0 +1,36 @@
+"""Which strategies a render uses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Strategy classes in use for one scene and sensor.
+
+    Classes: ``hit`` s=0, ``direct`` s=1 with t>=2, ``splat`` t=1 with s>=2, ``endpoints`` (1,1),
+    ``arrival`` t=0, ``inner`` s,t>=2. ``served``: camera subpaths per light subpath (S).
+    ``connections``: ``all``, ``one`` or ``none``. ``splat_coefficient``: kappa of t=1 over its count;
+    ``direct_coefficient``: kappa of s=1.
+    ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
+    left out.
+    """
+
+    hit: bool
+    direct: bool
+    splat: bool
+    endpoints: bool
+    arrival: bool
+    connections: str
+    served: int
+    splat_coefficient: float
+    direct_coefficient: float
+    roulette: bool
+    hide_emitters: bool
+    skipped: tuple = field(default=())
+
+    @property
+    def light(self) -> bool:
+        """Whether light subpaths are traced at all."""
+        return self.splat or self.arrival or self.connections != "none" or self.endpoints

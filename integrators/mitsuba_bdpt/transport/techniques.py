@@ -1,0 +1,225 @@
+"""One function per class of strategies: the path it builds, its contribution and its weight.
+
+All return a `Contribution`: the full *unweighted* estimate f / p of the strategy, divided by the
+class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone.
+Densities and cosines are geometric, throughputs contain everything up to and including the edge to
+the vertex. Equation numbers: Georgiev 2012, see `mis`.
+
+What a lane accumulates (``counters``, a dictionary, and ``path``) is changed in place: these are state of the
+loops around, and each statement binds a new array to a name.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from ..sampling.points import Purpose
+from . import bsdf, mis
+from .contribution import Contribution, _counts, _roulette, count
+from .walk import Vertex, newest_coefficient
+
+
+def sees_emitter(kernel, z: Vertex):
+    """Mask: the camera subpath has hit an emitter that may be seen."""
+    active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
+    if kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
+        active &= z.hit | z.seen
+    return active
+
+
+def hit_emitter(kernel, z: Vertex) -> Contribution:
+    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43)."""
+    h, emitters = kernel.heuristic, kernel.emitters
+    t = z.edges + 1
+    active = sees_emitter(kernel, z)
+    radiance = emitters.emitted(z.si, active)
+    active &= ~bsdf.is_zero(radiance)
+    connect, first, second = emitters.hit_densities(z.si, z.previous, active)
+    directly = z.edges == 1
+    endpoints = mis.times(kernel.kappa.endpoints, first)
+    if kernel.camera.parallel:  # (1,1) would need just this direction
+        endpoints = mis.choose(z.hit, endpoints, 0)
+    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, connect))
+    older = dr.select(kernel.within_store(z.edges), first * second, 0)
+    if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
+        older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
+    camera_side = h.combine(
+        h.scale(z.partial.d_vcm, newest),
+        h.scale(z.partial.d_vc, older),
+    )
+    weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
+    value = _known(z.throughput * radiance, connect, first, second)
+    return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
+
+
+def _known(value, *densities):
+    """``value``, NaN where one of the ``densities`` of other strategies is not finite: no weight follows."""
+    finite = mi.Bool(True)
+    for density in densities:
+        finite &= dr.isfinite(density)
+    return dr.select(finite, value, dr.nan)
+
+
+def choose_emitter(kernel, z: Vertex, stream):
+    """Sample an emitter for the camera vertex ``z``: an `emitters.Direct` and the `bsdf.Target` in which it
+    lies."""
+    active = z.hit & (z.edges + 1 <= kernel.max_depth) & bsdf.connectible(z.bsdf)
+    u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
+    e = kernel.emitters.sample_direct(z.si, u, active)
+    return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
+
+
+def next_event(kernel, z: Vertex, counters) -> Contribution:
+    """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
+    h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.joinable
+    k = z.edges + 1
+    value = _known(z.throughput * f.value * e.weight, e.emission_ratio)
+    active = active & ~bsdf.is_zero(value)
+
+    light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
+    older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
+    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    newest = mis.choose(kernel.within_store(k), newest, 0)
+    camera_side = mis.alternatives(
+        h,
+        mis.Partial(z.partial.d_vcm, older),
+        newest,
+        f.pdf_rev_w,
+        e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
+    )
+    weight, shares = h.weigh(kernel.kappa.direct, light_side, camera_side)
+    active &= _counts(kernel, value, weight)
+
+    to_infinity = rays.spawn(z.anchor, e.d, z.si)
+    to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
+    ray = dr.select(e.infinite, to_infinity, to_point)
+    count(counters, "shadow_s1", active)
+    active &= ~rays.occluded(kernel.scene, ray, active, own)
+    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct")
+
+
+def join_endpoints(kernel, emission, stream, counters, active):
+    """(1,1): a sampled emitter point seen directly by the sensor.
+
+    Returns the `Contribution` and the film position.
+    """
+    h = kernel.heuristic
+    u = _sensor_points(kernel, stream)
+    join = kernel.camera.join(emission.si.p, *u)
+    if kernel.camera.parallel:
+        active &= ~emission.infinite  # measure zero
+    else:
+        join = dr.select(emission.infinite, kernel.camera.join_direction(emission.d, *u), join)
+    active &= join.valid & ~(emission.pdf_first == 0) & ~emission.beam
+    if kernel.camera.delta:
+        active &= ~emission.delta  # measure zero: `path` sees nothing either
+    radiance = kernel.emitters.radiance_towards(emission, join.d, active)
+    cos = dr.select(emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d)))
+    geometry = cos / join.dist2
+    value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
+    active &= ~bsdf.is_zero(value)
+    # s = 0: the camera hits the same point.
+    ratio = join.pdf_w * geometry / emission.pdf_first
+    light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
+    camera_side = 0
+    if kernel.plan.arrival:
+        towards = kernel.emitters.direction_density(emission, join.p, join.d, active)
+        covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
+        towards = dr.select(covered, towards, 0)
+        camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
+    weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
+    active &= _counts(kernel, value, weight)
+
+    ray = rays.segment(emission.anchor, join.anchor, emission.si)
+    # From the sensor into the distance, for light from infinity.
+    away = rays.spawn(join.anchor, -join.d, emission.si)
+    away.maxt = join.reach  # camera rays see the surroundings behind the far plane
+    ray = dr.select(emission.infinite, away, ray)
+    count(counters, "shadow_t1", active)
+    active &= ~rays.occluded(kernel.scene, ray, active)
+    return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active, shares, "light"), join.position
+
+
+def look_at_sensor(kernel, y: Vertex, stream):
+    """Join the light vertex ``y`` with the sensor: what `Sensor.join` returns, and the `bsdf.Target` in which
+    that lies."""
+    active = y.hit & bsdf.connectible(y.bsdf) & (y.edges <= kernel.last_splat)
+    join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.edges))
+    active &= join.valid
+    if kernel.plan.hide_emitters:
+        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)
+    cos_ratio = dr.abs(dr.dot(y.si.n, join.d)) / y.cos
+    return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
+
+
+def splat(kernel, y: Vertex, stream, counters):
+    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47).
+
+    Returns the `Contribution` and the film position.
+    """
+    h, scene, join, f = kernel.heuristic, kernel.scene, y.endpoint, y.f
+    to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
+    estimate = y.throughput * f.value * (join.importance / join.dist2)
+    value = estimate * dr.rcp(kernel.count_light)
+    active = y.joinable & ~bsdf.is_zero(value)
+
+    newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
+    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
+    camera_side = 0
+    if kernel.plan.arrival:
+        camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
+    weight, shares = h.weigh(kernel.kappa.splat, light_side, camera_side)
+    active &= _counts(kernel, value, weight)
+
+    u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
+    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light")
+    active, survival = _roulette(kernel, c.weighted(), u, active, counters)
+    count(counters, "shadow_t1", active)
+    ray = rays.segment(y.anchor, join.anchor, y.si)
+    if kernel.plan.hide_emitters:
+        pi, _ = rays.intersect_past_emitters(scene, kernel.shape_errors, ray, active, coherent=False)
+        active &= ~pi.is_valid()
+    else:
+        active &= ~rays.occluded(scene, ray, active)
+    c.value, c.active = value / survival, active
+    return c, join.position
+
+
+def arrive(kernel, emission, y: Vertex, walk):
+    """t = 0: the last edge of a light subpath hits the sensor.
+
+    ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
+    are those of the scene's surface behind. Returns the `Contribution` and the film position.
+    """
+    h = kernel.heuristic
+    directly = walk.edges == 1
+    z = kernel.camera.arrive(walk, y, emission.infinite & directly)
+    active = z.active & (walk.edges <= kernel.last_arrival)
+    if kernel.plan.hide_emitters:
+        active &= walk.seen
+    value = walk.throughput * (z.importance * dr.rcp(kernel.count_light))
+    active &= ~bsdf.is_zero(value)
+
+    # (1,1) makes y_0 by emission, not by next-event estimation from z_0, and cannot make that of a beam.
+    completing = dr.select(emission.beam, 0, emission.pdf_first)
+    before = mis.Partial(h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)), walk.partial.d_vc)
+    dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
+    partial = mis.arrive(h, before, dist2, z.cos)
+    newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
+    light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
+    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
+    active &= _counts(kernel, value, weight)
+    if z.surroundings is not None and kernel.emitters.at_infinity:
+        asked = active & emission.infinite & directly
+        active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
+    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light"), z.position
+
+
+def _sensor_points(kernel, stream, edges=0):
+    """The random points with which the light vertex ``edges`` is joined with the sensor."""
+    u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, edges)
+    if not kernel.camera.needs_film_sample:
+        return u_lens, None
+    return u_lens, kernel.points.draw_2d("light", stream, Purpose.FILM, edges)

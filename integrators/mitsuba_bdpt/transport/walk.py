@@ -1,0 +1,246 @@
+"""One random walk for both subpaths; which side it serves is data.
+
+A walk knows no strategy: at each vertex it calls ``visit``, which may build paths from it.
+Vertices are numbered as in the field: y_0 / z_0 is the endpoint, ``edges`` the index of the vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from ..sampling.points import Purpose
+from . import bsdf, mis
+from .mis import choose
+
+
+@dataclass
+class Walk:
+    """State of a subpath between two vertices.
+
+    ``pi`` the next hit, ``o`` and ``d`` of the ray that finds it; ``previous`` position of the last vertex
+    (for a camera subpath the pinhole or lens point, not the near plane where the ray starts);
+    ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
+    measure before that edge; ``eta`` product of relative indices of refraction (1 where nothing
+    refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
+    happened; ``broken``: it ended for want of a finite throughput or shading frame.
+
+    What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
+    """
+
+    pi: object
+    o: object
+    d: object
+    previous: object
+    throughput: object
+    partial: mis.Partial
+    eta: object
+    edges: object
+    seen: object
+    broken: object
+    active: object
+
+    @staticmethod
+    def begin(kernel, pi, ray, previous, throughput, partial, active) -> Walk:
+        """A subpath on its first edge."""
+        return Walk(
+            pi=pi,
+            o=mi.Point3f(ray.o),
+            d=mi.Vector3f(ray.d),
+            previous=mi.Point3f(previous),
+            throughput=throughput,
+            partial=partial,
+            eta=mi.Float(1) if kernel.refracts else 1,
+            edges=mi.UInt32(1),
+            seen=mi.Bool(False),
+            broken=mi.Bool(False),
+            active=active,
+        )
+
+    def traced(self):
+        """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
+        return dr.maximum(self.edges, 2) - 1
+
+
+@dataclass
+class Vertex:
+    """A vertex that a walk has reached; ``partial`` is in the area measure (camera subpaths that
+    left the scene: solid angle). ``cos`` absolute geometric cosine of the edge to it; ``anchor``
+    starts rays; ``hit`` is false in the surroundings; ``endpoint`` with which it is to be joined and ``f``
+    the BSDF towards it (a `bsdf.Evaluation`), where ``joinable``, see `Side`."""
+
+    si: object
+    bsdf: object
+    cos: object
+    anchor: rays.Anchor
+    throughput: object
+    partial: mis.Partial
+    edges: object
+    previous: object
+    seen: object
+    hit: object
+    active: object
+    endpoint: object = None
+    joinable: object = None
+    f: object = None
+
+
+@dataclass(frozen=True)
+class Side:
+    """What distinguishes the two kinds of subpath, and what stays the same along one: ``like`` has its time
+    and wavelengths, roulette compares the throughput with ``reference``.
+
+    ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
+    alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera
+    side). ``complete``: called with the first vertex of a light subpath, returns the density of
+    next-event estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event
+    other than null happened. ``parallel``: the first edge has one direction, its density is one across it.
+    ``join``: called with each vertex, returns the endpoint of the other side with which it is to be joined
+    (`emitters.Direct`, or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no
+    strategy does so.
+    """
+
+    name: str
+    like: object
+    reference: object
+    adjoint: bool
+    last_edge: object
+    coefficient: object
+    complete: object = None
+    alpha: bool = False
+    parallel: bool = False
+    join: object = None
+
+
+def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
+    """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
+
+    ``visit(vertex, state, walk)`` returns the new state; ``walk`` as it was before it arrived.
+    """
+
+    def body(walk, state):
+        vertex = _arrive(kernel, side, walk)
+        step = _interact(kernel, side, walk, vertex, stream)
+        state = visit(vertex, state, walk)
+        return _leave(kernel, side, walk, vertex, step, stream), state
+
+    walk, state = dr.while_loop(
+        (walk, state),
+        lambda walk, state: walk.active,
+        body,
+        # Dr.Jit's kernel cache does not tell sizes of local memory apart; the label does.
+        label=f"{side.name} subpath, {kernel.store_size} stored",
+    )
+    return state, walk
+
+
+def newest_coefficient(kernel, first, edges):
+    """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1 (s = 0 differs,
+    see `techniques.hit_emitter`); ``first`` is that at vertex 1, see `Side`."""
+    return choose(edges == 1, first, kernel.kappa.inner)
+
+
+def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
+    """The vertex at the end of the walk's edge; densities go over to the area measure."""
+    h = kernel.heuristic
+    ray = mi.Ray3f(walk.o, walk.d, side.like.time, side.like.wavelengths)
+    si = walk.pi.compute_surface_interaction(ray, mi.RayFlags.All, walk.active)
+    hit = walk.active & si.is_valid()
+    cos = dr.abs(dr.dot(si.n, walk.d))
+    dist2 = dr.squared_norm(si.p - walk.previous)
+    partial, throughput = walk.partial, walk.throughput
+    if side.complete is not None:
+        first = hit & (walk.edges == 1)
+        density = dr.select(first, side.complete(si, first), 1)
+        # No weight follows from such a density.
+        throughput = dr.select(dr.isfinite(density), throughput, dr.nan)
+        partial = mis.Partial(h.scale(partial.d_vcm, density), partial.d_vc)
+        dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
+    if side.parallel:
+        dist2 = dr.select(walk.edges == 1, 1, dist2)
+    # A hit at exactly zero cosine has probability zero; its densities would be infinite.
+    hit &= cos > 0
+    in_area = mis.arrive(h, partial, dist2, cos)
+    partial = mis.Partial(choose(hit, in_area.d_vcm, partial.d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
+    return Vertex(
+        si=si,
+        bsdf=si.bsdf(),
+        cos=cos,
+        anchor=rays.surface_anchor(si, ray, kernel.shape_errors),
+        throughput=throughput,
+        partial=partial,
+        edges=walk.edges,
+        previous=walk.previous,
+        seen=walk.seen,
+        hit=hit,
+        active=walk.active,
+    )
+
+
+def _interact(kernel, side: Side, walk: Walk, vertex: Vertex, stream):
+    """Sample the direction of the next edge, and put into ``vertex`` what joins it with an endpoint."""
+    if not kernel.surfaces:  # a virtual call needs somebody to call
+        return None
+    points, si = kernel.points, vertex.si
+    target = None
+    if side.join is not None:
+        vertex.endpoint, target = side.join(vertex)
+        vertex.joinable = target.active
+    u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
+    u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
+    take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
+    sampled = _is_sampled(side, walk, vertex)
+    step, vertex.f = take(vertex.bsdf, si, u1, u2, sampled, kernel.traits, target)
+    return step
+
+
+def _goes_on(side: Side, walk: Walk, vertex: Vertex):
+    return vertex.hit & (walk.edges < side.last_edge)
+
+
+def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
+    """`path` samples at the last vertex too: alpha is 1 unless that event is null."""
+    return vertex.hit if side.alpha else _goes_on(side, walk, vertex)
+
+
+def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
+    """Take the sampled ``step`` and trace the next edge."""
+    if step is None:
+        return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
+    points, h, si = kernel.points, kernel.heuristic, vertex.si
+    active = _goes_on(side, walk, vertex)
+    coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
+    partial = mis.scatter(h, vertex.partial, coefficient, step)
+
+    throughput = vertex.throughput * step.weight
+    eta = walk.eta * step.eta if kernel.refracts else 1
+    brightest = bsdf.brightest(throughput)
+    # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
+    finite = bsdf.is_finite(throughput) & dr.isfinite(dr.sum(si.wi))
+    broken = walk.broken | (active & ~finite)
+    active &= (brightest > 0) & ~broken
+    # Roulette as in `path`; the weights ignore it (it is not part of any density).
+    survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
+    u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.edges)
+    playing = walk.edges >= kernel.rr_depth
+    throughput = dr.select(playing, throughput / survive, throughput)
+    active &= ~playing | (u < survive)
+
+    seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
+    ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.like)
+    return Walk(
+        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
+        o=ray.o,
+        d=ray.d,
+        previous=mi.Point3f(si.p),
+        throughput=throughput,
+        partial=partial,
+        eta=eta,
+        edges=walk.edges + 1,
+        seen=seen,
+        broken=broken,
+        active=active,
+    )
