@@ -58,7 +58,7 @@ def predicted(scene, settings) -> moments.Moments:
     found = None
     for i in range(ROUNDS):
         seed = dr.opaque(mi.UInt32, i)
-        new = pilot.measure(render.world, render.plan, settings, seed, LANES)
+        new = pilot.measure(render.prepared, render.plan, settings, seed, LANES)
         found = new if found is None else found.joined(new)
     return found
 
@@ -87,11 +87,11 @@ def lines(name: str, depth: int) -> list:
         way = candidate(*entry)
         draw = moments.draw if connections == "one" else 0
         base, light = moments.variance(draw, stratified=True)[:, :, way.weighting].mean(axis=0)
-        light *= way.served
+        light *= way.camera_paths_per_light_path
         made = way.decided(0, choice.cost(way, moments.rays), base + light, moments.mean)
         error, seconds = rendered(scene, depth, made, expected)
         alone = alone or seconds
-        name_of_share = f"1/{way.served}" if share else "0"
+        name_of_share = f"1/{way.camera_paths_per_light_path}" if share else "0"
         rows.append(
             [
                 f"`{name}`",

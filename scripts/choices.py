@@ -103,15 +103,15 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
     the best are ``known``, only of the best, by which the machine's speed is told, and the chosen."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
-    mean = pilot.measure(render.world, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    ways = choice.candidates(render.world, render.plan, settings)
+    mean = pilot.measure(render.prepared, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
+    ways = choice.candidates(render.prepared, render.plan, settings)
     ways += [replace(way, connections="all") for way in ways if way.connections == "one"]
     ways = {named(way): way for way in ways}
     if known:
         old = {name: product(rows) for name, rows in known.items()}
         names = chosen | {min(old, key=lambda name: old[name][i]) for i in (0, 1)}
     else:
-        names = chosen | {name for name, way in ways.items() if way.served in SERVED}
+        names = chosen | {name for name, way in ways.items() if way.camera_paths_per_light_path in SERVED}
     made = {name: by_hand(scene, depth, ways[name], mean) for name in sorted(names)}
     if not known:
         first = {n: product([measured(scene, w, FIRST_SEED, expected)]) for n, w in made.items()}
@@ -133,7 +133,8 @@ def named(way: choice.Candidate) -> str:
     weighting = pilot.WEIGHTINGS[way.weighting]
     if not way.light_paths:
         return f"0, {way.direct:g}"
-    return f"1/{way.served} {way.connections} {weighting.light * way.served:g}"
+    served = way.camera_paths_per_light_path
+    return f"1/{served} {way.connections} {weighting.light * served:g}"
 
 
 def measure(name: str, known: dict) -> dict:

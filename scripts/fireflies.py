@@ -113,7 +113,7 @@ def _found_anew(scene, kernel, kappa, path):
     except reconstruct.Lost as why:
         return None, str(why)
     # The estimate is divided by the class's count and by the probability that roulette let the path live.
-    count = (1 / kernel.plan.served if path.t <= 1 else 1.0) * path.survival
+    count = (1 / kernel.plan.camera_paths_per_light_path if path.t <= 1 else 1.0) * path.survival
     ratio = path.estimate.max() * count / rebuilt.estimate(path.s).max()
     if abs(ratio - 1) > AGREE:
         return rebuilt, f"the estimate is {ratio:.3g} times that of the path"
@@ -125,13 +125,13 @@ def _found_anew(scene, kernel, kappa, path):
 
 def coefficients(plan, k: int) -> np.ndarray:
     """kappa of the k + 2 strategies of paths of ``k`` edges, 0 for those that are not in use."""
-    light = plan.splat_coefficient / plan.served
+    light = plan.kappa_light / plan.camera_paths_per_light_path
     of = oracle.Coefficients(
         light * plan.endpoints, light * plan.splat, float(plan.connections != "none"), light * plan.arrival
     )
     kappa = np.array([of.of(s, k) for s in range(k + 2)])
     if plan.direct and k > 1:
-        kappa[1] = plan.direct_coefficient
+        kappa[1] = plan.kappa_direct
     return kappa
 
 

@@ -23,7 +23,7 @@ import drjit as dr
 import reference
 from mistakes import answered
 from mitsuba_bdpt.cli.arguments import number
-from mitsuba_bdpt.host.jit import step_by_step
+from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.sampling import points
@@ -77,7 +77,7 @@ class Pass:
         integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
         self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
         self._render.decide()
-        self._batch = schedule.batches(self._render.world.camera, 0, SPP, integrator.settings)[0]
+        self._batch = schedule.batches(self._render.prepared.camera, 0, SPP, integrator.settings)[0]
 
     def trace(self):
         """Trace the pass as one kernel."""
@@ -90,7 +90,7 @@ class Pass:
     def rays(self) -> list:
         """All calls that trace rays, with their rays."""
         calls = []
-        with recorded(calls), step_by_step():
+        with recorded(calls), evaluated_mode():
             self.trace()
         return calls
 

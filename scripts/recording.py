@@ -118,7 +118,7 @@ def _slots(launch: Launch, rows) -> list[int]:
     pixel = y * launch.width + x - batch.first_pixel
     sharing = kernel.shared_by(launch.kernel, batch, launch.points)
     seat, slot = sharing.seat(mi.UInt32(lane)), mi.UInt32(lane)
-    for part in range(launch.kernel.plan.served):
+    for part in range(launch.kernel.plan.camera_paths_per_light_path):
         served = sharing.slot(seat, mi.UInt32(part))
         here = (served // batch.samples == mi.UInt32(pixel)) & mi.Mask(splat == 0)
         slot = dr.select(here, served, slot)
@@ -209,7 +209,7 @@ class _Subpath:
 
 
 class Recorder:
-    """Sink (see `sinks`) of a replay of ``count`` samples: writes down contributions, and, `watching`, the
+    """Sink (see `sink`) of a replay of ``count`` samples: writes down contributions, and, `watching`, the
     vertices of the walks."""
 
     alpha = False
@@ -409,7 +409,7 @@ def replay(outliers: list[Outlier]) -> list[list[Path]]:
         slots = [outliers[i].slot for i in numbers]
         slots += slots[:1]  # Dr.Jit takes arrays of width 1 for constants
         recorder = Recorder(len(slots))
-        with rendering.nothing_freed(), recorder.watching():
+        with rendering.gc_paused(), recorder.watching():
             drawn = launch.kernel, recorder, launch.batch, launch.points, launch.spp
             dr.eval(kernel.retrace(*drawn, mi.UInt32(slots)))
         for lane, i in enumerate(numbers):

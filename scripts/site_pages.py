@@ -45,7 +45,11 @@ def module(path: Path) -> str:
 def on_files(files, config):
     """Add the pages."""
     pages = {"index.md": readme(), "tutorial.md": tutorial()}
-    paths = [path for path in sorted(PACKAGE.rglob("*.py")) if path.stem not in ("_version", "__main__")]
+    paths = [
+        path
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if path.stem == "__init__" or not path.stem.startswith("_")
+    ]
     paths = [path for path in paths if path.stem != "__init__" or path.parent == PACKAGE]
     pages |= {
         f"api/{path.relative_to(PACKAGE).with_suffix('')}.md".replace("__init__", "init"): module(path)

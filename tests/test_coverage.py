@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 import welch as st
-from mitsuba_bdpt.host.jit import step_by_step
+from mitsuba_bdpt.host.jit import evaluated_mode
 
 LEVEL = 1e-4
 DEPTH = 3
@@ -134,7 +134,7 @@ def test_pair(emitter, sensor):
     method = bdpt(strategy_images=True)
     images = renders(scene, method, SAMPLES, 0)
     other = parts.pair(emitter, sensor, reference=True)
-    with step_by_step(emitter == "timed_sunsky"):
+    with evaluated_mode(emitter == "timed_sunsky"):
         reference = tiles(renders(other, path(), 2 * SAMPLES, 1000))
     label = f"{emitter} + {sensor}"
     precise(tiles(images), 0.01, label)
@@ -181,7 +181,7 @@ def test_pair_with_defaults(emitter, sensor):
     """
     ours = tiles(renders(parts.pair(emitter, sensor), bdpt(skip="auto"), 2 * SAMPLES, 0))
     other = parts.pair(emitter, sensor, reference=True)
-    with step_by_step(emitter == "timed_sunsky"):
+    with evaluated_mode(emitter == "timed_sunsky"):
         reference = tiles(renders(other, path(), 2 * SAMPLES, 1000))
     assert_agree([st.compare_images(reference, ours, f"{emitter} + {sensor}")])
 

@@ -12,7 +12,7 @@ import pytest
 import scene_parts as parts
 from mitsuba_bdpt.emitters import infinity
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.host.jit import step_by_step
+from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.sensors import kinds as sensors
 from scipy import stats
 
@@ -35,7 +35,7 @@ def emission(name, **others):
     u = [mi.Float(v) for v in numbers(4)]
     like = dr.zeros(mi.Interaction3f)  # time and wavelengths
     like.time = mi.Float(0.3)
-    with step_by_step(name == "timed_sunsky"):
+    with evaluated_mode(name == "timed_sunsky"):
         e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
         dr.eval(e)
     return scene, emitters, e
@@ -128,7 +128,7 @@ def test_directions_from_infinity(name):
         around = emitters.disks.scene
         si = scene.ray_intersect(mi.Ray3f(around.center + outward * (3 * around.radius), outward))
         si.time = mi.Float(0.3)
-        with step_by_step(name == "timed_sunsky"):
+        with evaluated_mode(name == "timed_sunsky"):
             return column(emitters.hit_densities(si, mi.Point3f(around.center), mi.Bool(True))[1])
 
     stated, own = column(e.pdf_first), density(-e.d)

@@ -14,9 +14,9 @@ from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.transport.kernel import Shared
 from scene_parts import (
     EGG,
+    EMITTERS,
     T,
     emitter_part,
-    EMITTERS,
     grey,
     orthographic,
     perspective,

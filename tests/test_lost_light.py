@@ -100,7 +100,7 @@ def estimate(scene, monkeypatch):
     total = 0
     for seed in range(4):
         monkeypatch.setattr(lost_light, "SEED", seed)
-        total += sum(lost_light.lost_radiance(render.world, render.plan, 16).values())
+        total += sum(lost_light.lost_radiance(render.prepared, render.plan, 16).values())
     return total / 4
 
 
@@ -198,7 +198,7 @@ def test_red_light_on_a_blue_floor_is_no_loss():
         lamp = {"type": "point", "position": [0.5, 3, 0], "intensity": {"type": "rgb", "value": red}}
         scene = scene_of(lamp, block=BLOCK, floor=floor() | {"bsdf": blue})
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        found = sum(lost_light.lost_radiance(render.world, render.plan, 16).values())
+        found = sum(lost_light.lost_radiance(render.prepared, render.plan, 16).values())
         assert found > lost_light.WORTH_A_WORD if lost else found == 0
 
 
@@ -338,7 +338,7 @@ def test_other_committed_scenes_are_not_looked_at():
     for path in sorted(SCENES.glob("*.xml")):
         scene = mi.load_file(str(path), resolution=8, integrator="bdpt")
         render = Render(scene, scene.sensors()[0], scene.integrator().settings, 0, 16)
-        if lost_light.is_possible(render.world, render.plan, render.settings):
+        if lost_light.is_possible(render.prepared, render.plan, render.settings):
             lacking.add(path.stem)
     assert lacking == {
         *("lamp_behind_glass", "projector_through_glass", "smallvcm_cornell_point", "smallvcm_cornell_sun")
@@ -356,7 +356,7 @@ def test_rough_metal_reflects_no_more_than_arrives(alpha):
     for bsdf_of in ({"type": "diffuse", "reflectance": 1.0}, {"type": "roughconductor", "alpha": alpha}):
         scene = scene_of(LAMPS["point"], block=BLOCK, floor=floor() | {"bsdf": bsdf_of})
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        found.append(sum(lost_light.lost_radiance(render.world, render.plan, 16).values()))
+        found.append(sum(lost_light.lost_radiance(render.prepared, render.plan, 16).values()))
     white, metal = found
     assert 0.5 * white < metal < 1.1 * white
 
@@ -373,7 +373,7 @@ def test_lamps_of_several_colours_are_lost_together():
     shares = []
     for scene in (one, three):
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        shares.append(lost_light.lost_radiance(render.world, render.plan, 16))
+        shares.append(lost_light.lost_radiance(render.prepared, render.plan, 16))
     white, coloured = shares
     assert len(coloured) == 3
     assert sum(coloured.values()) == pytest.approx(sum(white.values()), rel=0.2)

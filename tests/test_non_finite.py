@@ -95,7 +95,7 @@ def bitmap(value, kind=np.uint8, **keys):
 def test_bytes_of_a_bitmap_are_shares_of_255(texture, said):
     """Rationale: Mitsuba keeps the bytes of 8-bit images, divides them by 255 at each look-up and undoes
     sRGB: no such texture reflects more than all. Expected: named only where numbers above 1 are kept."""
-    found = diagnostics.brighteners([mi.load_dict({"type": "principled", "base_color": texture})])
+    found = diagnostics.non_conserving_bsdfs([mi.load_dict({"type": "principled", "base_color": texture})])
     assert len(found) == bool(said) and all(said in text for text in found), found
 
 
@@ -126,7 +126,7 @@ def test_the_nearest_object_with_an_id_is_named(shape, name, tmp_path, monkeypat
     twice), which names the nearest object around the number that has an id, or a bitmap's file."""
     monkeypatch.chdir(tmp_path)
     LOUD["bitmap"].write("wood.exr")
-    (text,) = diagnostics.brighteners([mi.load_dict({"type": "sphere", **shape})])
+    (text,) = diagnostics.non_conserving_bsdfs([mi.load_dict({"type": "sphere", **shape})])
     assert text == f"{name} has reflectance up to 1.5"
 
 
@@ -165,7 +165,7 @@ def test_a_large_bitmap_is_looked_at_in_part(monkeypatch):
     looked = []
     nanmax = np.nanmax
     monkeypatch.setattr(np, "nanmax", lambda a, **keys: looked.append(a.size) or nanmax(a, **keys))
-    assert len(diagnostics.brighteners(bsdfs)) == 2
+    assert len(diagnostics.non_conserving_bsdfs(bsdfs)) == 2
     assert looked == [3 * 64, 3 * 64]
 
 
@@ -234,7 +234,7 @@ def test_coefficients_of_spectra_are_no_reflectances():
         bright = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.95, np.float32))}
         loud = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 1.5, np.float32)), "raw": True}
         bsdfs = [mi.load_dict({"type": "diffuse", "reflectance": texture}) for texture in (bright, loud)]
-        assert diagnostics.brighteners(bsdfs[:1]) == []
-        assert "reflectance up to 1.5" in diagnostics.brighteners(bsdfs[1:])[0]
+        assert diagnostics.non_conserving_bsdfs(bsdfs[:1]) == []
+        assert "reflectance up to 1.5" in diagnostics.non_conserving_bsdfs(bsdfs[1:])[0]
     finally:
         mi.set_variant(before)

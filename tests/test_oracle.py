@@ -2,7 +2,7 @@
 
 Three layers, from arithmetic to scenes:
 
-* `test_recursion_*`: ``mis.py`` alone, called in the order in which ``subpath.py`` and
+* `test_recursion_*`: ``mis.py`` alone, called in the order in which ``walk.py`` and
   ``techniques.py`` call it, on random numbers of any size.
 * `test_kernel_*`: the real code, unchanged: ``kernel._light_subpath`` and ``_camera_subpath``, the
   random walks and all functions of ``techniques.py``, in a scripted world. There the scene, the BSDFs,
@@ -111,7 +111,7 @@ def test_partial_sums_survive_zero_and_infinity(name):
     """Rationale: 1e30 / 1e-30 is inf in float32, and inf times a reverse density of 0 is NaN (seen).
 
     Expected: every function of ``mis.py`` returns finite numbers, weights in [0, 1], for all
-    combinations of 0, the smallest and largest densities and 1; cosines > 0 as in `_arrive`. Two
+    combinations of 0, the smallest and largest densities and 1; cosines > 0 as in `walk._vertex`. Two
     terms of 1e-30 or 1e30 combine as well as two of 1 (to 1e-5: a few roundings).
     """
     h = mis.Heuristic(name)
@@ -124,7 +124,7 @@ def test_partial_sums_survive_zero_and_infinity(name):
     grid = [mi.Float(x.ravel()) for x in np.meshgrid(values, values, values, values[1:])]
     a, rev, density, fwd = grid
     start = mis.Partial(h.start(dr.rcp(fwd * fwd)), h.start(a))
-    for partial in (start, mis.arrive(h, start, dr.rcp(fwd), mi.Float(1e-6))):
+    for partial in (start, mis.to_area(h, start, dr.rcp(fwd), mi.Float(1e-6))):
         step = SimpleNamespace(pdf_fwd_w=fwd, pdf_rev_w=rev, cos_out=a, delta=mi.Bool(False))
         folded = mis.scatter(h, partial, 0.3, step)
         for x in (partial, folded):
@@ -424,8 +424,8 @@ class Sensor:
         join.dist2 = mi.Float(1)
         return join
 
-    def arrive(self, walk, vertex, distant):
-        return sensor_records.Arrival(
+    def hit(self, walk, vertex, distant):
+        return sensor_records.SensorHit(
             dist2=self.dist2,
             cos=self.cos,
             pdf_area=self.lens_pdf,
@@ -501,7 +501,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         arrival=kappa.arrival > 0 and world.lens,
         light=True,
         connections="all" if kappa.inner > 0 else "none",
-        served=1,
+        camera_paths_per_light_path=1,
         roulette=False,
         hide_emitters=False,
     )
@@ -566,7 +566,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         (techniques.next_event, lambda z, *_: (1, edges(z) + 1)),
         (techniques.join_endpoints, lambda *_: (1, 1)),
         (techniques.splat, lambda y, *_: (edges(y) + 1, edges(y) + 1)),
-        (techniques.arrive, lambda e, y, walk: (edges(walk) + 1, edges(walk))),
+        (techniques.hit_sensor, lambda e, y, walk: (edges(walk) + 1, edges(walk))),
         (connections.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),
     ):
         monkeypatch.setattr(sys.modules[function.__module__], function.__name__, record(function, edges_of))

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.parameters import check_variant
 from mitsuba_bdpt.run import rendering, schedule
-from mitsuba_bdpt.scene.prepared import World
+from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
 
 T = mi.ScalarTransform4f
@@ -896,7 +896,7 @@ def test_materials_in_groups_are_known():
         (mixture, True, True, False),
     ):
         scene = grouped({"ball": {"type": "sphere", "bsdf": bsdf}})
-        world = World(scene, scene.sensors()[0])
+        world = PreparedScene(scene, scene.sensors()[0])
         assert (world.smooth, world.delta, world.refracts) == (smooth, delta, refracts), bsdf["type"]
         assert world.traits.full_pdf == (bsdf is mixture)
 

@@ -97,7 +97,7 @@ def moments_of(target, lanes, rounds=1, **parameters):
     found = None
     for number in range(rounds):
         seed = dr.opaque(mi.UInt32, number)
-        new = pilot.measure(render.world, render.plan, render.settings, seed, lanes)
+        new = pilot.measure(render.prepared, render.plan, render.settings, seed, lanes)
         found = new if found is None else found.joined(new)
     return found
 
@@ -193,7 +193,7 @@ def test_few_pixels():
     target = caustic(2)
     render = of(target)
     seed = dr.opaque(mi.UInt32, 3)
-    found = pilot.measure(render.world, render.plan, render.settings, seed, 2048)
+    found = pilot.measure(render.prepared, render.plan, render.settings, seed, 2048)
     assert found.lanes == 2048 and (found.base[:, -1] > 0).all()
     integrator = bdpt()
     integrator.render(target, spp=1 << 15)
@@ -207,7 +207,7 @@ def test_rare_paths_count_by_how_often_they_are_made():
     has a share of 1/160 and connections the rest. Expected: without connections its second moment is 160, at
     any coefficient of light tracing; with a share of 1/10240 it counts as if it were made once in 1,024
     times."""
-    sink = pilot.Pilot(of(sky()).world.camera.region, Batch(0, 8, 0, 2, 1), pilot.RAREST)
+    sink = pilot.Pilot(of(sky()).prepared.camera.region, Batch(0, 8, 0, 2, 1), pilot.RAREST)
     for share, expected in ((1 / 160, 160), (1 / 10240, 1024)):
         shares = mi.Vector4f(*({"light": share, "inner": 1 - share}.get(kind, 0) for kind in mis.CLASSES))
         _, parts = sink._parts(mi.Float(1), SimpleNamespace(shares=shares, kind="inner"))
@@ -388,7 +388,7 @@ def test_light_subpaths_from_infinity_cost_more():
     sun = {"type": "directional", "sampling_weight": 1.0}
     for emitters, share in (({"a": sphere}, 0), ({"a": sphere, "b": sun}, 0.25), ({"b": sun}, 1)):
         target = mi.load_dict({"type": "scene", "sensor": camera(16), **emitters})
-        assert of(target).world.emitters.far_share == share
+        assert of(target).prepared.emitters.far_share == share
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     way = choice.Candidate(pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, 0)), 4, "none")
     more = choice.cost(way, rays) - choice.cost(way, rays | {"far": 0.0})
@@ -488,14 +488,14 @@ def test_an_even_sky_decides_without_a_pilot(monkeypatch):
     ):
         render = of(target)
         asked = [
-            choice.by_scene(render.world, render.plan, bdpt().settings, n) is None
+            choice.by_scene(render.prepared, render.plan, bdpt().settings, n) is None
             for n in (samples - 1, samples)
         ]
         assert asked == [False, True]
     for bright, kappa in ((1.5, choice.SKY_DIRECT), (10.0, 1.0)):  # a map worth sampling gets its full weight
         render = of(surroundings(bright=bright))
-        made = choice.by_scene(render.world, render.plan, bdpt().settings, 1 << 14)
-        assert made.direct_coefficient == kappa
+        made = choice.by_scene(render.prepared, render.plan, bdpt().settings, 1 << 14)
+        assert made.kappa_direct == kappa
     by_hand = bdpt(light_paths=1)
     by_hand.render(sky(), spp=4, develop=False)
     assert by_hand.statistics["decisions"] == [] and by_hand.statistics["rays"]["light"] > 0
@@ -572,7 +572,7 @@ def test_light_that_only_connections_find():
 
     def combinations(**scene):
         render = of(mi.load_dict({"type": "scene", "floor": floor, "lamp": lamp, **scene}))
-        found = choice.candidates(render.world, render.plan, render.settings)
+        found = choice.candidates(render.prepared, render.plan, render.settings)
         return {c.combination for c in found}
 
     assert combinations(sensor=camera(16)) == {"n0c0", "n1c0", "n1c1"}
@@ -584,7 +584,7 @@ def test_candidates_draw_their_connections():
     """Rationale: all connections gain nothing over a drawn one in any scene of the benchmark, and what a
     pilot finds of the outliers of drawing is noisy. Expected: they are no candidate."""
     render = of(cornell())
-    found = choice.candidates(render.world, render.plan, render.settings)
+    found = choice.candidates(render.prepared, render.plan, render.settings)
     assert {c.connections for c in found} == {"none", "one"}
     assert len(set(found)) == len(found) == 30  # as docs/skipping.md says
 
@@ -596,7 +596,7 @@ def test_decisions_are_unbiased(name):
     target = cornell(64)
     made = decision(*CANDIDATES[name], mean=0.1)
     if made.light_paths:
-        made = replace(made, splat_coefficient=0.37, direct_coefficient=3.3)
+        made = replace(made, kappa_light=0.37, kappa_direct=3.3)
     expected = np.array(bdpt(skip="none").render(target, seed=90, spp=512))[..., :3].mean()
     found = np.array(forced(made).render(target, seed=91, spp=1024))[..., :3].mean()
     assert found == pytest.approx(expected, rel=0.005)
@@ -667,7 +667,7 @@ def test_changed_decisions_change_the_points():
     late._adopt(replace(path, first_pass=2))  # after passes without a decision
     assert late._changes == 1
     step = schedule.Step(0, 0, 1, 64, False)
-    batch = schedule.batches(render.world.camera, 0, 1, render.settings)[0]
+    batch = schedule.batches(render.prepared.camera, 0, 1, render.settings)[0]
     seeds = {int(render._points(step, batch).seed[0])}
     render._changes = 0
     assert render._points(step, batch).seed[0] == 1 and seeds.isdisjoint({1})
@@ -701,7 +701,7 @@ def test_changed_decisions_change_the_points():
         (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "all"}]), "without light paths"),
         (
             json.dumps([decision(ALONE, 1, "none").record() | {"coefficients": {"t<=1": 1, "s=1": 0}}]),
-            "direct_coefficient=0.0",
+            "kappa_direct=0.0",
         ),
     ],
 )
@@ -841,7 +841,7 @@ def test_twice_the_light_subpaths_have_to_gain():
         # base + S light: (base + 4 light) cost_4 = gain (base + 2 light) cost_2, with base = 1.
         light = (gain * costs[0] - costs[1]) / (4 * costs[1] - 2 * gain * costs[0])
         table = choice.choose(made_of(np.ones((moments.GROUPS, 10)), rays, light), possible, False)
-        assert table[0].candidate.served == chosen and len(table) == 2
+        assert table[0].candidate.camera_paths_per_light_path == chosen and len(table) == 2
 
 
 def test_certainty():
@@ -951,7 +951,7 @@ def test_loops_are_recorded_once(parameters, capfd):
         counts = kernel.trace(render.kernel, sink.Image(render.accumulator), Batch(0, 4, 0, 1), drawn, 1)
         render.accumulator.evaluate(counts)
         if parameters.get("light_paths") != 0:  # else there is nothing to choose
-            pilot.measure(render.world, render.plan, render.settings, render.seed, 64)
+            pilot.measure(render.prepared, render.plan, render.settings, render.seed, 64)
     finally:
         dr.set_log_level(before)
     log = "".join(capfd.readouterr())

@@ -153,7 +153,7 @@ def test_an_arrival_is_a_start_in_reverse(name):
         pi.t = mi.Float(dr.inf)
     walk = SimpleNamespace(previous=p, d=ray.d, pi=pi, active=mi.Bool(True))
     vertex = SimpleNamespace(si=si, cos=dr.abs(dr.dot(si.n, ray.d)), hit=si.is_valid())
-    arrival = camera.arrive(walk, vertex, mi.Bool(False))
+    arrival = camera.hit(walk, vertex, mi.Bool(False))
     active = column(dr.select(arrival.active, 1.0, 0.0)) > 0
     cos = column(arrival.cos)
     keep = active & (cos > 0.05)
@@ -185,5 +185,5 @@ def test_sensors_by_their_rays_alone(name):
     np.testing.assert_allclose(column(start.ray.o), column(ray.o), atol=1e-5)
     np.testing.assert_allclose(column(start.ray.d), column(ray.d), atol=1e-6)
     np.testing.assert_allclose(column(start.weight), column(mi.Spectrum(weight)), rtol=1e-5)
-    assert not camera.joinable and not camera.area
+    assert not camera.connectible and not camera.area
     assert len(camera.reason) > 10 and len(camera.no_area) > 10

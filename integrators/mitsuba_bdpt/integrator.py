@@ -10,7 +10,7 @@ from functools import wraps
 import drjit as dr
 import mitsuba as mi
 
-from .emitters.kinds import foreign_elsewhere
+from .emitters.kinds import third_party_elsewhere
 from .host.introspection import all_shapes, is_instance, named
 from .host.notices import warn_once
 from .image.features import feature_names
@@ -21,7 +21,7 @@ from .planning.explain import explain
 from .run.rendering import Render
 from .run.schedule import REPLICATES
 from .run.snapshot import Snapshot
-from .scene.diagnostics import brighteners, narrow_spots, not_finite
+from .scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
 from .settings import UNLIMITED
 
 DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
@@ -149,7 +149,7 @@ def _without_gradients(method):
 def _hint_at_others(error: RuntimeError, arguments):
     """Say with an ``error`` that it may come from the emitter of a scene that is not among ``arguments``."""
     scene = next((value for value in arguments if isinstance(value, mi.Scene)), None)
-    count = foreign_elsewhere(scene) if scene is not None else 0
+    count = third_party_elsewhere(scene) if scene is not None else 0
     if count:
         error.add_note(
             f"bdpt: other scenes in this process have {count} foreign emitters, of plugins not "
@@ -244,7 +244,7 @@ def _make_class():
             self.statistics["lost_light"] = shares
             if text:
                 about = "lost light", render.plan.splat, render.plan.direct
-                warn_once(render.world.scene, render.sensor, text, about)
+                warn_once(render.prepared.scene, render.sensor, text, about)
 
         def sample(self, *args, **kwargs):
             raise NotImplementedError(
@@ -272,7 +272,9 @@ def _make_class():
             if self.settings.decisions:
                 render.replay(0)
             certainty = render.certainty() if table else 0.0
-            text = explain(render.world, render.plan, self.settings, table, certainty, render.lost_by_pilot())
+            text = explain(
+                render.prepared, render.plan, self.settings, table, certainty, render.lost_by_pilot()
+            )
             if spp is None and choice.is_open(render.plan, self.settings):
                 return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
             return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"
@@ -352,7 +354,7 @@ def _samples(sensor, spp, settings) -> int:
 
 
 def _whole_sets(sampler, spp: int, parts: int) -> int:
-    """``spp``, rounded up so that each of ``parts`` (see `passes.schedule`) is a number of samples that the
+    """``spp``, rounded up so that each of ``parts`` (see `schedule.schedule`) is a number of samples that the
     sampler makes: stratified ones do not make any."""
 
     def made(count):
@@ -388,7 +390,7 @@ def _log(statistics: dict):
 
 def _warn_of_suspects(scene, sensor):
     """Say once what in the ``scene`` spoils images."""
-    bright = brighteners([shape for shape in all_shapes(scene) if not is_instance(shape)])
+    bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
     narrow = narrow_spots(scene)
     if bright:
         warn_once(

@@ -291,7 +291,7 @@ def _check_size(film, colours: int, settings: Settings):
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise ValueError(f"bdpt: the {what} of {width} x {height} has no pixels; it needs one at least")
-    # Sums of a pass, of all passes and, while they are added, of both (see `film.Accumulator`).
+    # Sums of a pass, of all passes and, while they are added, of both (see `accumulator.Accumulator`).
     layers = 1 + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + len(features.feature_names(settings.aovs))
     camera, light = (n + n % 2 for n in (colours + layers, colours))
     numbers = width * height * max(camera, light)

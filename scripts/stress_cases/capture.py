@@ -87,7 +87,7 @@ class Capture:
     def __init__(self, scene, integrator, lanes: int, seed: int):
         self.scene, self.lanes = scene, lanes
         render = rendering.Render(scene, scene.sensors()[0], integrator.settings, seed, 1)
-        self.world, self.plan = render.world, render.plan
+        self.world, self.plan = render.prepared, render.plan
         self.kernel = render.kernel.bound(Points("independent", dr.opaque(mi.UInt32, seed)), 1.0)
         self.depth = integrator.settings.max_depth
         self.lamps, self.camera = lamps_of(scene), Camera.of(scene.sensors()[0])
@@ -143,7 +143,7 @@ class Capture:
 
         return joined
 
-    # Where the kernel puts contributions that no walk finds: it is a sink, see `sinks`.
+    # Where the kernel puts contributions that no walk finds: it is a sink, see `sink`.
 
     alpha = False
 
@@ -163,12 +163,12 @@ class Capture:
         return dict.fromkeys(kernel.COUNTERS, mi.UInt32(0))
 
     def _walk(self, k, side, walk, stream, visit, state):
-        """In the place of `subpath.random_walk`."""
+        """In the place of `walk.random_walk`."""
         walked = self.walked[side.name]
         dr.make_opaque(walk, self.emission)
         walked.origin = mi.Point3f(walk.previous)
         for edges in range(1, self.depth + 1):
-            vertex = walk._arrive(k, side, walk)
+            vertex = walk._vertex(k, side, walk)
             step = walk._interact(k, side, walk, vertex, stream)
             visited = self._visit_light if side.adjoint else self._visit_camera
             found = visited(edges, vertex, stream, walk)
@@ -190,7 +190,7 @@ class Capture:
     def _visit_light(self, edges, vertex, stream, walk):
         found, counters = {}, self._counters()
         if self.plan.arrival:
-            found[edges + 1, 0], _ = techniques.arrive(self.kernel, self.emission, vertex, walk)
+            found[edges + 1, 0], _ = techniques.hit_sensor(self.kernel, self.emission, vertex, walk)
             self.endpoint[edges + 1, 0] = self._on_lens(vertex, walk)
         if self.plan.splat:
             found[edges + 1, 1], _ = techniques.splat(self.kernel, vertex, stream, counters)
@@ -206,7 +206,7 @@ class Capture:
         return found
 
     def _on_lens(self, vertex, walk):
-        distance2 = self.kernel.camera.arrive(walk, vertex, mi.Bool(False)).dist2
+        distance2 = self.kernel.camera.hit(walk, vertex, mi.Bool(False)).dist2
         return walk.previous + walk.d * dr.sqrt(distance2)
 
     # -- paths ------------------------------------------------------------------------------

@@ -135,7 +135,7 @@ class Columns:
 
 class Recursion:
     """The partial sums along both subpaths of each path, and the weight of each strategy from them, in the
-    order of calls of ``subpath.py`` and ``techniques.py``."""
+    order of calls of ``walk.py`` and ``techniques.py``."""
 
     def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic):
         self.path, self.kappa, self.h = path, kappa, heuristic
@@ -156,7 +156,7 @@ class Recursion:
         return mis.scatter(self.h, partial, coefficient, step)
 
     def _along_light(self):
-        """Light subpath (kernel._light_subpath, subpath._arrive and _leave): the partial sums at y_e = x_e,
+        """Light subpath (kernel._light_subpath, walk._vertex and _leave): the partial sums at y_e = x_e,
         and those with which the last edge sets out."""
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * x.second)
@@ -168,7 +168,7 @@ class Recursion:
         for e in range(1, x.k):
             if e == 1:
                 partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
-            partial = mis.arrive(h, partial, 1 if e == 1 else x.dist2[e - 1], x.cos_camera[e - 1])
+            partial = mis.to_area(h, partial, 1 if e == 1 else x.dist2[e - 1], x.cos_camera[e - 1])
             found.append(partial)
             densities = x.to_camera[e], x.to_light[e]
             partial = self._fold(partial, self._of_light(e), *densities, x.cos_light[e], x.delta[e])
@@ -182,7 +182,7 @@ class Recursion:
         found = [None]
         for e in range(1, k + 1):
             i = k - e
-            arrived = mis.arrive(h, partial, x.dist2[i], x.cos_light[i])
+            arrived = mis.to_area(h, partial, x.dist2[i], x.cos_light[i])
             partial = dr.select(x.infinite, partial, arrived) if e == k else arrived
             found.append(partial)
             if e < k:
@@ -199,13 +199,13 @@ class Recursion:
     # -- strategies ---------------------------------------------------------------------------
 
     def arrive(self):
-        """t = 0 (techniques.arrive)."""
+        """t = 0 (techniques.hit_sensor)."""
         x, h, k, kappa, before = self.path, self.h, self.path.k, self.kappa, self._last
         if mis.is_absent(kappa.arrival):
             return mi.Float(0)
         if k == 1:
             before = mis.Partial(h.scale(before.d_vcm, x.first), before.d_vc)
-        arrived = mis.arrive(h, before, x.dist2[k - 1], x.cos_camera[k - 1])
+        arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
         return h.weight(kappa.arrival, light_side, mi.Float(0))

@@ -32,28 +32,28 @@ from ..geometry.quadrics import cone_density, is_turned_sphere, may_light_itself
 from ..geometry.smooth_meshes import SmoothMeshes
 from ..geometry.to_world import check_to_world
 from ..host.introspection import children, named, number
-from ..host.jit import living_emitters, share_functions
+from ..host.jit import make_parameters_opaque, registered_emitters
 from .infinity import Disks
 from .kinds import (
     AREA,
     DIRECTIONAL,
     DIRECTIONAL_AREA,
+    HIT_ONLY,
     INFINITE,
     POSITIONS,
     PROJECTOR,
-    UNKNOWN,
-    UNSAMPLED,
+    THIRD_PARTY,
     contrast,
-    is_foreign,
     is_hittable,
-    is_lit_directly,
     is_sampled_by_texture,
     is_textured,
-    is_traced,
+    is_third_party,
     kind_of,
     left_out,
     needs_evaluation,
     refuse_curves,
+    supports_emission,
+    supports_next_event,
 )
 from .projectors import Projectors
 from .tables import Placement, inverse_table, placement
@@ -113,12 +113,13 @@ class Emitters:
     ``NotImplementedError`` for emitters of which Mitsuba's own calls contradict each other.
 
     What the scene's ``count`` emitters of the ``kinds`` can do, decided from all of them: ``hittable``,
-    ``direct``, ``traced``, ``joinable``: camera subpaths can hit one, next-event estimation can choose one,
-    light subpaths can start from one, one of these points can be joined with a sensor; ``unhittable``: one
-    cannot be hit; ``finite_hittable``: one that can be hit and joined is not at infinity; ``on_shapes``: one
-    is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of them do; ``beams``:
-    one can be reached only by the light subpaths that it starts; ``evaluated``: one that lives, be it in
-    another scene, makes it necessary to record kernels without symbolic loops, calls and branches.
+    ``direct``, ``traced``, ``connectible_to_sensor``: camera subpaths can hit one, next-event estimation can
+    choose one, light subpaths can start from one, one of these points can be joined with a sensor;
+    ``unhittable``: one cannot be hit; ``finite_hittable``: one that can be hit and joined is not at
+    infinity; ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity,
+    ``far_share`` of them do; ``beams``: one can be reached only by the light subpaths that it starts;
+    ``evaluated``: one that lives, be it in another scene, makes it necessary to record kernels without
+    symbolic loops, calls and branches.
     ``left_out``: what single ones cannot take part in, and why. ``disks`` where light subpaths from infinity
     start, if any do; ``shape_errors`` of the scene, for rays.
     """
@@ -132,27 +133,27 @@ class Emitters:
         self.count = len(kinds)
         hittable = [is_hittable(e, k) for e, k in zip(emitters, kinds, strict=True)]
         self.hittable, self.unhittable = any(hittable), not all(hittable)
-        self.direct = any(is_lit_directly(k) for k in kinds)
-        self.traced = any(is_traced(k) for k in kinds)
-        self.joinable = any(is_traced(k) and is_lit_directly(k) for k in kinds)
+        self.direct = any(supports_next_event(k) for k in kinds)
+        self.traced = any(supports_emission(k) for k in kinds)
+        self.connectible_to_sensor = any(supports_emission(k) and supports_next_event(k) for k in kinds)
         self.finite_hittable = AREA in self.kinds
         self.on_shapes = any(e.get_shape() is not None for e in emitters)
         self.beams = DIRECTIONAL_AREA in self.kinds
         self.at_infinity, self.far_share = bool(self.kinds & {INFINITE, DIRECTIONAL}), 0.0
-        living = living_emitters()
+        living = registered_emitters()
         self.evaluated = any(needs_evaluation(name) for name in living)
         self.left_out = [text for e, k in zip(emitters, kinds, strict=True) for text in left_out(e, k)]
         if not kinds:
             return
-        share_functions([*emitters, *filter(None, (e.get_shape() for e in emitters))])
+        make_parameters_opaque([*emitters, *filter(None, (e.get_shape() for e in emitters))])
         self._pointers = scene.emitters_dr()
         weights = [number(e.sampling_weight()) for e in emitters]
         sampling_weight = mi.Float(weights)
         self._kind, self._pmf = mi.UInt32(kinds), sampling_weight / dr.sum(sampling_weight)
         of_kinds = list(zip(weights, kinds, strict=True))
         far = sum(w for w, k in of_kinds if k in (INFINITE, DIRECTIONAL))
-        self.far_share = far / sum(w for w, k in of_kinds if is_traced(k)) if far > 0 else 0.0
-        foreign = any(is_foreign(name) for name in living)
+        self.far_share = far / sum(w for w, k in of_kinds if supports_emission(k)) if far > 0 else 0.0
+        foreign = any(is_third_party(name) for name in living)
         self._ask_shapes = foreign and not _all_answer(self._pointers)
         self._read_shapes(scene, emitters, kinds)
         extent = 2 * scene.bbox().bounding_sphere().radius
@@ -171,7 +172,7 @@ class Emitters:
 
     @cached_property
     def contrast(self) -> float:
-        """The largest `emitter_kinds.contrast`: infinite unless all light comes from environments."""
+        """The largest `kinds.contrast`: infinite unless all light comes from environments."""
         return max((contrast(emitter) for emitter in self.scene.emitters()), default=math.inf)
 
     def _read_shapes(self, scene, emitters, kinds):
@@ -262,10 +263,10 @@ class Emitters:
 
     # -- emission ---------------------------------------------------------------------------
 
-    def sample_emission(self, u_point, u_direction, like, active) -> Emission:
+    def sample_emission(self, u_point, u_direction, shared, active) -> Emission:
         """Sample y_0 and the direction to y_1.
 
-        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction; ``like`` carries time
+        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction; ``shared`` carries time
         and wavelengths.
         """
         index, pmf, u_x = self._select(u_point.x, active)
@@ -281,27 +282,27 @@ class Emitters:
             if not self.kinds & set(kinds):
                 continue
             mask = self._is(index, active, *kinds)
-            of_kind = sampler(emitter, index, u_point, u_direction, like, mask)
+            of_kind = sampler(emitter, index, u_point, u_direction, shared, mask)
             e = of_kind if e is None else dr.select(mask, of_kind, e)
         e.pdf_first *= pmf
         e.weight = dr.select(pmf > 0, e.weight / pmf, 0)
         if self.kinds & {
-            UNKNOWN,
-            UNSAMPLED,
+            THIRD_PARTY,
+            HIT_ONLY,
         }:  # chosen with the probability of next-event estimation, and left
-            e.weight = dr.select(self._is(index, active, UNKNOWN, UNSAMPLED), 0, e.weight)
+            e.weight = dr.select(self._is(index, active, THIRD_PARTY, HIT_ONLY), 0, e.weight)
         return e
 
-    def _sample_surface(self, emitter, index, u_point, like, active):
+    def _sample_surface(self, emitter, index, u_point, shared, active):
         """A point on the shape of an emitter, density included."""
         shape = emitter.get_shape()
         if self._ask_shapes:
-            return self.upright(shape.sample_position(like.time, u_point, active), index, active)
+            return self.upright(shape.sample_position(shared.time, u_point, active), index, active)
         # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
-        ps, _ = emitter.sample_position(like.time, u_point, active)
+        ps, _ = emitter.sample_position(shared.time, u_point, active)
         if self._any_by_shape:
             mask = self._is_by_shape(index, active)
-            ps = dr.select(mask, shape.sample_position(like.time, u_point, mask), ps)
+            ps = dr.select(mask, shape.sample_position(shared.time, u_point, mask), ps)
         return self.upright(ps, index, active)
 
     def upright(self, ps, index, active):
@@ -312,11 +313,11 @@ class Emitters:
             ps.n = dr.select(sphere.outward != 0, n, ps.n)
         return ps
 
-    def _emit_area(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+    def _emit_area(self, emitter, index, u_point, u_direction, shared, active) -> Emission:
         shape = emitter.get_shape()
-        ps = self._sample_surface(emitter, index, u_point, like, active)
+        ps = self._sample_surface(emitter, index, u_point, shared, active)
         local = mi.warp.square_to_cosine_hemisphere(u_direction)
-        si = mi.SurfaceInteraction3f(ps, like.wavelengths)
+        si = mi.SurfaceInteraction3f(ps, shared.wavelengths)
         si.t = mi.Float(0)
         si.shape = shape
         si.wi = local
@@ -341,11 +342,11 @@ class Emitters:
             si=si,
         )
 
-    def _emit_beam(self, emitter, index, u_point, u_direction, like, active) -> Emission:
-        ps = self._sample_surface(emitter, index, u_point, like, active)
+    def _emit_beam(self, emitter, index, u_point, u_direction, shared, active) -> Emission:
+        ps = self._sample_surface(emitter, index, u_point, shared, active)
         n = self.geometric_normal(ps, index, u_point, active)
         d = mi.Vector3f(ps.n)
-        si = mi.SurfaceInteraction3f(ps, like.wavelengths)
+        si = mi.SurfaceInteraction3f(ps, shared.wavelengths)
         si.t, si.wi = mi.Float(0), mi.Vector3f(0, 0, 1)
         radiance = dr.zeros(mi.Spectrum)
         for place, texture in self._beam_radiances:
@@ -384,8 +385,8 @@ class Emitters:
         """
         # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
         turned = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
-        if UNKNOWN in self.kinds:
-            turned = dr.select(self._is(index, active, UNKNOWN), ds.n, turned)
+        if THIRD_PARTY in self.kinds:
+            turned = dr.select(self._is(index, active, THIRD_PARTY), ds.n, turned)
         ds.n = turned
         pdf = emitter.pdf_direction(it, ds, active)
         by_area = mi.Bool(False)
@@ -403,14 +404,14 @@ class Emitters:
         return pdf
 
     def _cone_density(self, index, p, active):
-        """`spheres.cone_density` of the emitter ``index``; 0 for one that is no small sphere."""
+        """`quadrics.cone_density` of the emitter ``index``; 0 for one that is no small sphere."""
         sphere = self._placements.at(index, active)
         return dr.select(active, cone_density(sphere.position, sphere.far, p), 0)
 
     def _is_by_shape(self, index, active):
         return active & dr.gather(mi.Bool, self._by_shape, index, active)
 
-    def _emit_position(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+    def _emit_position(self, emitter, index, u_point, u_direction, shared, active) -> Emission:
         placed = self._placements.at(index, active)
         p = placed.position
         local = mi.warp.square_to_uniform_cone(u_direction, placed.cos_cutoff)
@@ -419,9 +420,9 @@ class Emitters:
             mask = self._is(index, active, PROJECTOR)
             projected, density = self._projectors.sample(index, u_direction, mask)
             d, pdf_second = dr.select(mask, projected, d), dr.select(mask, density, pdf_second)
-        intensity = self._intensity(emitter, p, d, like, active)
+        intensity = self._intensity(emitter, p, d, shared, active)
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.t, si.p, si.time, si.wavelengths = mi.Float(0), p, like.time, like.wavelengths
+        si.t, si.p, si.time, si.wavelengths = mi.Float(0), p, shared.time, shared.wavelengths
         return Emission(
             weight=dr.select(pdf_second == 0, 0, intensity / pdf_second),
             d=d,
@@ -436,23 +437,23 @@ class Emitters:
             si=si,
         )
 
-    def _intensity(self, emitter, p, d, like, active):
+    def _intensity(self, emitter, p, d, shared, active):
         """Intensity of an emitter at the point ``p`` into direction ``d``, by its own calls."""
         far = 1 + dr.max(dr.abs(p))  # keeps the probe's relative rounding small away from 0
         it = dr.zeros(mi.Interaction3f)
-        it.p, it.time, it.wavelengths = p + d * far, like.time, like.wavelengths
+        it.p, it.time, it.wavelengths = p + d * far, shared.time, shared.wavelengths
         ds, weight = emitter.sample_direction(it, mi.Point2f(0.5), active)
         return weight * dr.square(ds.dist)
 
-    def _emit_infinite(self, emitter, index, u_point, u_direction, like, active) -> Emission:
+    def _emit_infinite(self, emitter, index, u_point, u_direction, shared, active) -> Emission:
         it = dr.zeros(mi.Interaction3f)
-        it.p, it.time, it.wavelengths = mi.Point3f(self.disks.scene.center), like.time, like.wavelengths
+        it.p, it.time, it.wavelengths = mi.Point3f(self.disks.scene.center), shared.time, shared.wavelengths
         ds, weight = emitter.sample_direction(it, u_direction, active)
         directional = self._is(index, active, DIRECTIONAL)
         d = -ds.d
         p, pdf_second = self.disks.start(d, u_point)
         si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi, si.p, si.time, si.wavelengths = d, p, like.time, like.wavelengths
+        si.wi, si.p, si.time, si.wavelengths = d, p, shared.time, shared.wavelengths
         return Emission(
             weight=dr.select(ds.pdf == 0, 0, weight / pdf_second),
             d=d,
@@ -552,8 +553,8 @@ class Emitters:
         infinite = self._is(index, active, INFINITE, DIRECTIONAL)
         delta = self._is(index, active, *POSITIONS, DIRECTIONAL)
         n = dr.select(area, self.geometric_normal(ds, index, u, area), 0)
-        if UNKNOWN in self.kinds:
-            unknown = self._is(index, active, UNKNOWN)
+        if THIRD_PARTY in self.kinds:
+            unknown = self._is(index, active, THIRD_PARTY)
             flags = emitter.flags()
             infinite |= unknown & mi.has_flag(flags, mi.EmitterFlags.Infinite)
             delta |= unknown & (mi.has_flag(flags, mi.EmitterFlags.Delta) | ds.delta)
@@ -565,8 +566,8 @@ class Emitters:
         pdf = dr.select(delta, 1, ds.pdf * to_geometric) * pmf
         weight = dr.select(ds.pdf == 0, 0, weight / (to_geometric * pmf))
         weight = dr.select(dr.isfinite(ds.pdf), weight, dr.nan)  # no weight of strategies follows from it
-        if UNSAMPLED in self.kinds:  # what Mitsuba samples of it has no radiance or the wrong one
-            weight = dr.select(self._is(index, active, UNSAMPLED), 0, weight)
+        if HIT_ONLY in self.kinds:  # what Mitsuba samples of it has no radiance or the wrong one
+            weight = dr.select(self._is(index, active, HIT_ONLY), 0, weight)
         ratio = mi.Float(0)
         if AREA in self.kinds:
             density = self.area_density(emitter, index, ds, n, area)
@@ -577,7 +578,7 @@ class Emitters:
             emitted = self._direction_density(index, -ds.d, here) / dr.square(ds.dist)
             ratio = dr.select(here, emitted, ratio)
         ratio = dr.select(infinite, self._density_across(si.p, ds.d), ratio)
-        if UNKNOWN in self.kinds:
+        if THIRD_PARTY in self.kinds:
             ratio = dr.select(unknown, 0, ratio)  # no light subpath starts there
         shape = emitter.get_shape() if self.on_shapes else dr.zeros(mi.ShapePtr)
         errors = self.shape_errors.at(shape, active) if self.on_shapes else None
@@ -607,14 +608,14 @@ class Emitters:
         it.p, it.time, it.wavelengths = previous, si.time, si.wavelengths
         ds = mi.DirectionSample3f(self.scene, si, it)
         ds.time = mi.Float(si.time)
-        if UNKNOWN in self.kinds:  # their own density has their own idea of a normal
-            ds.n = dr.select(self._is(index, active, UNKNOWN), ds.n, mi.Normal3f(si.n))
+        if THIRD_PARTY in self.kinds:  # their own density has their own idea of a normal
+            ds.n = dr.select(self._is(index, active, THIRD_PARTY), ds.n, mi.Normal3f(si.n))
         else:
             ds.n = mi.Normal3f(si.n)
         pdf = pmf * self.density_of_direction(emitter, index, it, ds, active)
         connect, first, second = mi.Float(pdf), mi.Float(pdf), self._density_across(previous, ds.d)
         on_surface = si.is_valid()
-        if self.kinds & {AREA, UNKNOWN}:
+        if self.kinds & {AREA, THIRD_PARTY}:
             to_area = dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)
             connect = dr.select(on_surface, pdf * to_area, connect)
         if AREA in self.kinds:
@@ -622,9 +623,9 @@ class Emitters:
             cos_second = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
             first = dr.select(on_surface, pmf * density, first)
             second = dr.select(on_surface, cos_second, second)
-        if self.kinds & {UNKNOWN, UNSAMPLED}:
-            first = dr.select(self._is(index, active, UNKNOWN, UNSAMPLED), 0, first)
-            connect = dr.select(self._is(index, active, UNSAMPLED), 0, connect)
+        if self.kinds & {THIRD_PARTY, HIT_ONLY}:
+            first = dr.select(self._is(index, active, THIRD_PARTY, HIT_ONLY), 0, first)
+            connect = dr.select(self._is(index, active, HIT_ONLY), 0, connect)
         return connect, first, second
 
     def area_density(self, emitter, index, at, n, active):

@@ -10,13 +10,13 @@ import numpy as np
 
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..host.introspection import all_shapes, children, matrix_of, named, number, own_parameters
-from ..host.jit import living_emitters
+from ..host.jit import registered_emitters
 
 # The first four emit from surfaces or points, the next two from infinity; a directional area has no
-# direction but its normal. An UNSAMPLED one is an area light whose points cannot be sampled, or tell no
-# radiance: it can be hit and no more. UNKNOWN are classes that are not Mitsuba's: only the calls that camera
-# subpaths need are used.
-AREA, POINT, SPOT, PROJECTOR, INFINITE, DIRECTIONAL, DIRECTIONAL_AREA, UNSAMPLED, UNKNOWN = range(9)
+# direction but its normal. A HIT_ONLY one is an area light whose points cannot be sampled, or tell no
+# radiance: it can be hit and no more. THIRD_PARTY are classes that are not Mitsuba's: only the calls that
+# camera subpaths need are used.
+AREA, POINT, SPOT, PROJECTOR, INFINITE, DIRECTIONAL, DIRECTIONAL_AREA, HIT_ONLY, THIRD_PARTY = range(9)
 
 _KINDS = {
     "AreaLight": AREA,
@@ -49,11 +49,11 @@ _SAMPLED = _TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.va
 def kind_of(emitter) -> int:
     """The kind of an emitter; raises ``ValueError`` for one that Mitsuba itself renders inconsistently, and
     ``NotImplementedError`` for one that it cannot sample."""
-    kind = _KINDS.get(emitter.class_name(), UNKNOWN)
+    kind = _KINDS.get(emitter.class_name(), THIRD_PARTY)
     if kind == INFINITE and "to_world" in own_parameters(emitter):
         _check_rotation(emitter)
     if kind == AREA and not _tells_its_points(emitter):
-        return UNSAMPLED
+        return HIT_ONLY
     return kind
 
 
@@ -107,44 +107,44 @@ def _reads_attributes(texture) -> bool:
 
 def is_hittable(emitter, kind: int) -> bool:
     """Whether a camera subpath can hit the emitter."""
-    if kind == UNKNOWN:
+    if kind == THIRD_PARTY:
         return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
-    return kind in (AREA, INFINITE, UNSAMPLED)
+    return kind in (AREA, INFINITE, HIT_ONLY)
 
 
-def is_lit_directly(kind: int) -> bool:
+def supports_next_event(kind: int) -> bool:
     """Whether next-event estimation can choose the emitter."""
-    return kind not in (DIRECTIONAL_AREA, UNSAMPLED)
+    return kind not in (DIRECTIONAL_AREA, HIT_ONLY)
 
 
-def is_traced(kind: int) -> bool:
+def supports_emission(kind: int) -> bool:
     """Whether light subpaths can start from the emitter."""
-    return kind not in (UNSAMPLED, UNKNOWN)
+    return kind not in (HIT_ONLY, THIRD_PARTY)
 
 
 _WHY_NOT = {
     DIRECTIONAL_AREA: "its light leaves in one direction only",
-    UNSAMPLED: "no points of it with a known radiance can be sampled; it can only be hit",
-    UNKNOWN: "its class is not Mitsuba's: only the calls that camera subpaths need are used",
+    HIT_ONLY: "no points of it with a known radiance can be sampled; it can only be hit",
+    THIRD_PARTY: "its class is not Mitsuba's: only the calls that camera subpaths need are used",
 }
 
 
 def left_out(emitter, kind: int) -> list[tuple[str, str]]:
     """What an emitter cannot take part in, and why."""
-    names = ["s=1"] * (not is_lit_directly(kind)) + ["light subpaths"] * (not is_traced(kind))
+    names = ["s=1"] * (not supports_next_event(kind)) + ["light subpaths"] * (not supports_emission(kind))
     return [(f"{name} of emitter {named(emitter)}", _WHY_NOT[kind]) for name in names]
 
 
-def is_foreign(class_name: str) -> bool:
+def is_third_party(class_name: str) -> bool:
     """Whether an emitter's class is not Mitsuba's."""
     return class_name not in _KINDS
 
 
-def foreign_elsewhere(scene) -> int:
+def third_party_elsewhere(scene) -> int:
     """How many emitters live outside of ``scene`` whose class is not Mitsuba's: virtual calls visit them
     too."""
-    own = sum(is_foreign(emitter.class_name()) for emitter in scene.emitters())
-    return sum(map(is_foreign, living_emitters())) - own
+    own = sum(is_third_party(emitter.class_name()) for emitter in scene.emitters())
+    return sum(map(is_third_party, registered_emitters())) - own
 
 
 def needs_evaluation(class_name: str) -> bool:

@@ -20,7 +20,7 @@ class Placement:
     projectors. Of spheres ``position``; the ``radius`` up to which one that emits inwards, and everywhere
     the same, samples as from inside, ``outward`` of a rotated one (see `Sphere`), the radius ``far`` of one
     that may be so small, as seen from the scene, that Mitsuba's density is wrong (see
-    `spheres.cone_density`); 0 for all others.
+    `quadrics.cone_density`); 0 for all others.
     Scalars for one emitter, Dr.Jit arrays for a table of them."""
 
     x: object = (1, 0, 0)

@@ -59,9 +59,9 @@ def free_anchor(p) -> Anchor:
     return Anchor(mi.Point3f(p), mi.Normal3f(0), mi.Float(0), mi.Float(0))
 
 
-def spawn(anchor: Anchor, d, like) -> mi.Ray3f:
-    """Unbounded ray from ``anchor`` along unit ``d``; time and wavelengths as in ``like``."""
-    return mi.Ray3f(anchor.towards(d), d, like.time, like.wavelengths)
+def spawn(anchor: Anchor, d, shared) -> mi.Ray3f:
+    """Unbounded ray from ``anchor`` along unit ``d``; time and wavelengths as in ``shared``."""
+    return mi.Ray3f(anchor.towards(d), d, shared.time, shared.wavelengths)
 
 
 def end_point(a: Anchor, b: Anchor):
@@ -88,17 +88,17 @@ def _early(back, b: Anchor):
     return dr.select(behind, dr.minimum(early, dr.abs(along) / (dist * dist * curvature)), early)
 
 
-def segment_to(a: Anchor, end, like) -> mi.Ray3f:
-    """Ray from ``a`` to the point ``end``; time and wavelengths as in ``like``."""
+def segment_to(a: Anchor, end, shared) -> mi.Ray3f:
+    """Ray from ``a`` to the point ``end``; time and wavelengths as in ``shared``."""
     o = a.towards(end - a.p)
     between = end - o
     dist = dr.norm(between)
-    return mi.Ray3f(o, between / dist, dist, like.time, like.wavelengths)
+    return mi.Ray3f(o, between / dist, dist, shared.time, shared.wavelengths)
 
 
-def segment(a: Anchor, b: Anchor, like) -> mi.Ray3f:
-    """Ray from ``a`` that ends just before ``b``; time and wavelengths as in ``like``."""
-    return segment_to(a, end_point(a, b), like)
+def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
+    """Ray from ``a`` that ends just before ``b``; time and wavelengths as in ``shared``."""
+    return segment_to(a, end_point(a, b), shared)
 
 
 @dataclass
@@ -110,13 +110,13 @@ class Own:
     t: object
 
 
-def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, like):
+def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, shared):
     """Ray from ``a`` to ``b`` on the shape of this ``number``, and an `Own` for `occluded`: None unless
     ``shape_errors`` are small."""
     if not shape_errors.small:
-        return segment(a, b, like), None
+        return segment(a, b, shared), None
     end = b.towards(a.p - b.p)
-    ray = segment_to(a, end, like)
+    ray = segment_to(a, end, shared)
     return ray, Own(number, ray.maxt * (1 - _early(a.p - end, b)))
 
 

@@ -14,7 +14,7 @@ from .introspection import own_parameters
 _GAP = 64
 
 
-def living_emitters() -> list[str]:
+def registered_emitters() -> list[str]:
     """Class names of all emitters in the process: a virtual call visits those of other scenes too."""
     found, index, missing = [], 0, 0
     while missing < _GAP:
@@ -34,7 +34,7 @@ def _emitter(index: int):
 
 
 @contextlib.contextmanager
-def step_by_step(on=True):
+def evaluated_mode(on=True):
     """Loops, calls and branches of kernels are not recorded as a whole but run one after the other, which
     calls of `timed_sunsky` need."""
     flags = (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals)
@@ -45,7 +45,7 @@ def step_by_step(on=True):
 
 
 @contextlib.contextmanager
-def nothing_freed():
+def gc_paused():
     """Python's cycle collector waits: a scene that only it would free, and that goes while a kernel is being
     recorded, leaves calls of its objects in the kernel beside those of the others, and Dr.Jit aborts the
     process ("invalid redefinition of function")."""
@@ -58,7 +58,7 @@ def nothing_freed():
             gc.enable()
 
 
-def share_functions(owners):
+def make_parameters_opaque(owners):
     """Move the numbers of ``owners`` that a kernel would hold as constants into memory: calls of objects of
     one class then differ in data alone and are compiled once, not once per object. What is differentiated
     stays."""

@@ -17,7 +17,7 @@ from ..settings import CONNECTIONS, LIGHT_PATHS, Settings
 from ..transport.plan import Plan
 from .moments import GROUPS, Moments
 from .pilot import WEIGHTINGS
-from .possible import lost_paths
+from .possible import unreachable_paths
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
 # `LEAST_SAMPLES` has none. A pilot's sample takes several times as long as one of path tracing alone,
@@ -127,8 +127,8 @@ class Decision:
     first_pass: int
     light_paths: float
     connections: str
-    splat_coefficient: float
-    direct_coefficient: float
+    kappa_light: float
+    kappa_direct: float
     cost: float
     variance: float
     mean: float
@@ -144,7 +144,7 @@ class Decision:
             "pass": self.first_pass,
             "light_paths": self.light_paths,
             "connections": self.connections,
-            "coefficients": {"t<=1": self.splat_coefficient, "s=1": self.direct_coefficient},
+            "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
             "cost": self.cost,
             "variance": self.variance,
             "mean": self.mean,
@@ -159,10 +159,12 @@ class Decision:
             endpoints=full.endpoints and light,
             arrival=full.arrival and light,
             connections=self.connections if full.connections != "none" and light else "none",
-            splat_coefficient=self.splat_coefficient,
-            direct_coefficient=self.direct_coefficient,
+            kappa_light=self.kappa_light,
+            kappa_direct=self.kappa_direct,
         )
-        return replace(adopted, served=round(1 / self.light_paths) if adopted.light else 1)
+        return replace(
+            adopted, camera_paths_per_light_path=round(1 / self.light_paths) if adopted.light else 1
+        )
 
 
 def read_decisions(text: str) -> tuple[Decision, ...]:
@@ -212,8 +214,8 @@ def _read_decision(entry: dict) -> Decision:
         raise TypeError(f"pass={entry['pass']!r}")
     numbers = {
         "first_pass": entry["pass"],
-        "splat_coefficient": _number(entry["coefficients"], "t<=1"),
-        "direct_coefficient": _number(entry["coefficients"], "s=1"),
+        "kappa_light": _number(entry["coefficients"], "t<=1"),
+        "kappa_direct": _number(entry["coefficients"], "s=1"),
         **{name: _number(entry, name) for name in ("cost", "variance", "mean")},
     }
     for name, value in numbers.items():
@@ -233,17 +235,17 @@ def _number(entry: dict, name: str) -> float:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A way to render: ``weighting`` of `pilot.WEIGHTINGS`, ``served`` camera subpaths per light subpath,
+    """A way to render: ``weighting`` of `pilot.WEIGHTINGS`, ``camera_paths_per_light_path`` (S),
     ``connections`` ``none`` or ``one``; also ``all``, which no pilot chooses (`candidates`)."""
 
     weighting: int
-    served: int
+    camera_paths_per_light_path: int
     connections: str
 
     @property
     def light_paths(self) -> float:
         """As the parameter."""
-        return 1 / self.served if WEIGHTINGS[self.weighting].light else 0
+        return 1 / self.camera_paths_per_light_path if WEIGHTINGS[self.weighting].light else 0
 
     @property
     def direct(self) -> float:
@@ -264,8 +266,8 @@ class Candidate:
             first_pass=first_pass,
             light_paths=float(self.light_paths),
             connections=self.connections,
-            splat_coefficient=weighting.light * self.served if weighting.light else 1.0,
-            direct_coefficient=float(self.direct),
+            kappa_light=weighting.light * self.camera_paths_per_light_path if weighting.light else 1.0,
+            kappa_direct=float(self.direct),
             **{name: float(f"{number:.6g}") for name, number in numbers.items()},
         )
 
@@ -306,7 +308,9 @@ def lanes(samples: int) -> int:
 def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
     """What a render begins with: ``full``, with a light subpath for each camera subpath on films of few
     pixels, unless parameters say how many."""
-    return replace(full, served=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
+    return (
+        replace(full, camera_paths_per_light_path=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
+    )
 
 
 def is_open(full: Plan, settings: Settings) -> bool:
@@ -323,15 +327,15 @@ def _is_auto(settings: Settings) -> bool:
     return settings.skip == settings.light_paths == settings.connections == "auto"
 
 
-def by_scene(world, full: Plan, settings: Settings, samples: int) -> Decision | None:
+def by_scene(prepared, full: Plan, settings: Settings, samples: int) -> Decision | None:
     """The decision for a render of so many ``samples`` for which the scene alone suffices, because a pilot
     would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky
     wherever its light enters, caustics included, and light subpaths hardly find the way in.)"""
-    contrast = world.emitters.contrast
+    contrast = prepared.emitters.contrast
     most = UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES
     if samples >= most or not contrast <= EVEN:  # also if it is no number
         return None
-    if all(candidate.light_paths for candidate in candidates(world, full, settings)):
+    if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
         return None
     return Decision(0, 0.0, "none", 1.0, SKY_DIRECT if contrast <= UNIFORM else 1.0, 1.0, 0.0, 0.0)
 
@@ -346,19 +350,19 @@ BY_SCENE = [
 ]
 
 
-def candidates(world, full: Plan, settings: Settings) -> list[Candidate]:
+def candidates(prepared, full: Plan, settings: Settings) -> list[Candidate]:
     """All ways to render that lose no light which ``full`` finds, with one inner connection or none. (All of
     them gain 1.02 at most in the scenes of docs/choices.json, 1.13 in one of a small caustic, and one pilot
     of 32 chose them where they take 2.1 times as long.)"""
 
     def lost_without_arrival(plan):
         """A small lens is a poor finder of what t = 0 alone finds: it does not stand for connections."""
-        return lost_paths(world, replace(plan, arrival=False), settings)
+        return unreachable_paths(prepared, replace(plan, arrival=False), settings)
 
     found = []
     lost = lost_without_arrival(full)
     # A sensor with area sees delta emitters by light subpaths alone.
-    tied = world.emitters.unhittable and not world.camera.delta and (full.endpoints or full.arrival)
+    tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
     for number, weighting in enumerate(WEIGHTINGS):
         if weighting.inner and full.connections == "none" or tied and not weighting.light:
             continue
@@ -399,7 +403,7 @@ def choose(
     parts = np.stack(
         [(drawn if c.connections == "one" else every)[:, :, c.weighting] for c in possible], axis=1
     )
-    variances = parts[:, :, 0] + parts[:, :, 1] * [c.served for c in possible]
+    variances = parts[:, :, 0] + parts[:, :, 1] * [c.camera_paths_per_light_path for c in possible]
     variances = _robust_mean(variances)
     table = [
         Choice(c, cost(c, moments.rays, samples), max(v, LEAST_VARIANCE))
@@ -408,7 +412,7 @@ def choose(
     ]
     if stratified:
         table = _without_doubtful(table, moments.rays["evenness"] * UNIFORM >= 1)
-    table.sort(key=lambda row: row.time * MORE_GAIN ** -math.log2(row.candidate.served))
+    table.sort(key=lambda row: row.time * MORE_GAIN ** -math.log2(row.candidate.camera_paths_per_light_path))
     least = min((row.time for row in table), default=0.0)
     tied = [row for row in table if row.candidate.light_paths and row.time <= KERNEL_TIE * least]
     if tied:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..settings import Settings
 from ..transport.plan import Plan
 from .choice import LIGHT_GAIN
-from .possible import lost_paths
+from .possible import unreachable_paths
 
 
 def subpaths(count: int) -> str:
@@ -13,7 +13,9 @@ def subpaths(count: int) -> str:
     return f"{count} camera subpaths" if count > 1 else "camera subpath"
 
 
-def explain(world, p: Plan, settings: Settings, table, certainty: float = 0.0, lost_by_pilot: int = 0) -> str:
+def explain(
+    prepared, p: Plan, settings: Settings, table, certainty: float = 0.0, lost_by_pilot: int = 0
+) -> str:
     """Text about the strategies in use and those that are skipped.
 
     ``table`` is a pilot's, see `choice.choose`, and `choice.certainty`; empty without one. ``lost_by_pilot``:
@@ -31,7 +33,7 @@ def explain(world, p: Plan, settings: Settings, table, certainty: float = 0.0, l
         if on
     ]
     lines = [
-        f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.served)}"
+        f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.camera_paths_per_light_path)}"
         if p.light
         else f"heuristic {settings.heuristic}, no light subpaths"
     ]
@@ -39,8 +41,8 @@ def explain(world, p: Plan, settings: Settings, table, certainty: float = 0.0, l
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     if (p.splat or p.arrival or p.connections != "none") and settings.stored_vertices < settings.max_depth:
         lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
-    lines += [f"lost: {text}" for text in lost_paths(world, p, settings)]
-    if world.emitters.evaluated:
+    lines += [f"lost: {text}" for text in unreachable_paths(prepared, p, settings)]
+    if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
             "one kernel"
@@ -61,11 +63,15 @@ def _pilot(settings: Settings, table, certainty: float) -> list[str]:
     shown = set()
     for row in table:
         candidate = row.candidate
-        key = candidate.combination, candidate.connections, candidate.served
+        key = candidate.combination, candidate.connections, candidate.camera_paths_per_light_path
         if key in shown:
             continue
         shown.add(key)
-        light = f"light_paths=1/{candidate.served}" if candidate.light_paths else "light_paths=0"
+        light = (
+            f"light_paths=1/{candidate.camera_paths_per_light_path}"
+            if candidate.light_paths
+            else "light_paths=0"
+        )
         lines.append(
             f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections} "
             f"({row.cost:.2f}, {row.variance:.3g})"

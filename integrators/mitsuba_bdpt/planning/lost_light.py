@@ -2,11 +2,11 @@
 delta surface) and is seen through glass.
 
 Such a path has no two neighbours that could be joined: lamp, delta surfaces, one other surface, delta
-surfaces, sensor. `plan.lost_paths` says where they are possible; here they are estimated as a photon map does
-it, by a few thousand subpaths from either end that take delta events alone. Paths with several other
-surfaces, no two of which are neighbours, are left out, and so is the lamp itself, seen in a mirror. The other
-surface is taken to reflect evenly what it reflects in all, glossy ones too: of these a single view shows more
-or less.
+surfaces, sensor. `possible.unreachable_paths` says where they are possible; here they are estimated as a
+photon map does it, by a few thousand subpaths from either end that take delta events alone. Paths with
+several other surfaces, no two of which are neighbours, are left out, and so is the lamp itself, seen in a
+mirror. The other surface is taken to reflect evenly what it reflects in all, glossy ones too: of these a
+single view shows more or less.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import rays
-from ..host.jit import nothing_freed, step_by_step
+from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..transport import bsdf
 from ..transport.kernel import Shared
-from .possible import lost_paths
+from .possible import unreachable_paths
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
 # deviation (24 seeds) is 0.06 for a block of glass that fills the view, and 0.07, 0.18, 0.28 and 0.31 in the
@@ -96,23 +96,23 @@ class _Ends:
         return ends, index, found / kept
 
 
-def is_possible(world, plan, settings) -> bool:
+def is_possible(prepared, plan, settings) -> bool:
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
-    return not plan.arrival and bool(lost_paths(world, plan, settings))
+    return not plan.arrival and bool(unreachable_paths(prepared, plan, settings))
 
 
-def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
+def lost_radiance(prepared, plan, max_depth: int) -> dict[int, float]:
     """Mean radiance over the film that is lost, by the index of the emitter; ``max_depth`` see
-    `plan.Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says so, as of one
-    that emits into directions that are: a render that does not make such paths may meet no such number
-    itself, and `suspects` is asked only if it did. Of several lamps together it is the brightest colour of
+    `Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says so, as of one that
+    emits into directions that are: a render that does not make such paths may meet no such number
+    itself, and `diagnostics` is asked only if it did. Of several lamps together it is the brightest colour of
     their sum, of which each has a part by its own brightest."""
-    total = np.zeros((len(world.scene.emitters()), len(mi.UnpolarizedSpectrum())))
-    with nothing_freed(), step_by_step(world.emitters.evaluated):
-        points, _, times = _seen(world, plan, max_depth).some()
+    total = np.zeros((len(prepared.scene.emitters()), len(mi.UnpolarizedSpectrum())))
+    with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
+        points, _, times = _seen(prepared, plan, max_depth).some()
         if points is None:
             return {}
-        light, lamp, astray = _lit(world, plan, max_depth)
+        light, lamp, astray = _lit(prepared, plan, max_depth)
         total[dr.gather(mi.UInt32, lamp, dr.compress(astray)).numpy()] = np.nan
         photons, index, more = light.some()
         if photons is not None:
@@ -123,40 +123,40 @@ def lost_radiance(world, plan, max_depth: int) -> dict[int, float]:
                 colour += np.bincount(lamps.numpy(), values.numpy(), len(colour))
     finite = np.isfinite(total).all(axis=1)
     if not finite.all():
-        _warn_of_not_finite(world, np.flatnonzero(~finite))
+        _warn_of_not_finite(prepared, np.flatnonzero(~finite))
     total = np.where(finite[:, None], total, 0)
     single = total.max(axis=1)
     single *= total.sum(axis=0).max() / max(single.sum(), np.finfo(float).tiny)
     return {int(i): float(single[i]) for i in np.flatnonzero(single)}
 
 
-def _warn_of_not_finite(world, indices):
+def _warn_of_not_finite(prepared, indices):
     """Say of which emitters, by their ``indices``, the light that is lost cannot be told."""
-    emitters = world.scene.emitters()
+    emitters = prepared.scene.emitters()
     lamps = " and ".join(_called(emitters[i]) for i in indices[:NAMED])
     text = (
         f"bdpt: how much light of {lamps} is missing cannot be told, since the estimate is NaN or infinite; "
         "look for such numbers, or very large ones, in the lamp and in the BSDFs that its light meets"
     )
-    warn_once(world.scene, world.camera.sensor, text)
+    warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
-def in_words(world, plan, shares: dict[int, float]) -> str:
+def in_words(prepared, plan, shares: dict[int, float]) -> str:
     """What is missing, and what to do, where at least `WORTH_A_WORD` of the image's light is; else empty.
     ``shares`` of the image's light by the index of the emitter."""
     lost = sum(shares.values())
     if not lost >= WORTH_A_WORD:
         return ""
-    emitters = world.scene.emitters()
+    emitters = prepared.scene.emitters()
     order = sorted(shares, key=shares.get, reverse=True)
     lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * lost][:NAMED]
     what = " and ".join(map(_called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
-    what += " through glass or mirrors" if world.delta else " on what is seen"
+    what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "a lamp without area cannot be found that way", _remedy(lamps)
     if plan.splat:
         what += " on what is seen through them"
-    elif not world.camera.joinable:
-        why = f"no light can be traced to the sensor: {world.camera.reason}"
+    elif not prepared.camera.connectible:
+        why = f"no light can be traced to the sensor: {prepared.camera.reason}"
     else:
         why = "the render does without light tracing (t=1)"
         remedy = f"leave light_paths and decisions to the integrator, or {remedy}"
@@ -180,9 +180,9 @@ def _remedy(emitters) -> str:
     return "give it a small area: an area light on a small sphere or disk"
 
 
-def _shared(world, generator) -> Shared:
+def _shared(prepared, generator) -> Shared:
     """Time and wavelengths of subpaths."""
-    sensor = world.camera.sensor
+    sensor = prepared.camera.sensor
     time = sensor.shutter_open() + generator.next_float32() * sensor.shutter_open_time()
     if not mi.is_spectral:
         return Shared(time, mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
@@ -202,29 +202,29 @@ def _carried(value):
     return dr.mean(value) + dr.zeros(mi.UnpolarizedSpectrum) if mi.is_spectral else value
 
 
-def _lit(world, plan, max_depth):
+def _lit(prepared, plan, max_depth):
     """Where light of delta emitters arrives by delta events in a way that next-event estimation does not
     find; the emitters' indices; and the mask of subpaths whose ray is not finite, which hit nothing."""
     generator = mi.PCG32(SUBPATHS, SEED, 1)
-    shared = _shared(world, generator)
-    e = world.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
+    shared = _shared(prepared, generator)
+    e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
     active = e.delta & ~bsdf.is_zero(e.weight)  # what is not finite is kept, to be said
     ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
     weight, index = mi.Spectrum(e.weight), e.index
     ray.maxt = dr.full(mi.Float, dr.inf, SUBPATHS)  # as wide as those of the sensor, for the same kernel
     dr.make_opaque(ray, weight, active, beam, index, generator)
     astray = active & ~(dr.all(dr.isfinite(ray.o)) & dr.all(dr.isfinite(ray.d)))
-    ends = _follow(world, ray, weight, active, generator, max_depth, True)
+    ends = _follow(prepared, ray, weight, active, generator, max_depth, True)
     if plan.direct:
         ends.active &= (ends.edges > 1) | beam
     return ends, index, astray
 
 
-def _seen(world, plan, max_depth):
+def _seen(prepared, plan, max_depth):
     """What is seen by delta events in a way that t = 1 does not find. Weights are those of the irradiance
     there, distances the radii of the disks that stand for these points."""
     generator = mi.PCG32(SUBPATHS, SEED, 2)
-    shared, camera = _shared(world, generator), world.camera
+    shared, camera = _shared(prepared, generator), prepared.camera
     pixels = int(camera.region.size.prod())
     place = (dr.arange(mi.Float, SUBPATHS) + generator.next_float32()) * dr.opaque(
         mi.Float, pixels / SUBPATHS
@@ -235,7 +235,7 @@ def _seen(world, plan, max_depth):
     weight = start.weight * dr.opaque(mi.Spectrum, 1, SUBPATHS)
     active = dr.full(mi.Bool, True, SUBPATHS)
     dr.make_opaque(ray, weight, active, pdf_w, generator)
-    ends = _follow(world, ray, weight, active, generator, max_depth, False)
+    ends = _follow(prepared, ray, weight, active, generator, max_depth, False)
     if plan.splat:
         ends.active &= ends.edges > 1
     ends.weight *= ends.reflectance * dr.inv_pi
@@ -244,14 +244,14 @@ def _seen(world, plan, max_depth):
     return ends
 
 
-def _follow(world, ray, weight, active, generator, max_depth, adjoint: bool) -> _Ends:
+def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) -> _Ends:
     """Follow rays by delta events to the first surface that has another lobe (where one has both, a coin
     decides). One kernel for both sides."""
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
     last, adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
 
     def body(ray, weight, edges, distance, active, generator, ends):
-        si = world.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
         active = active & si.is_valid()
         distance += dr.select(active, si.t, 0)
         surface = si.bsdf()
@@ -267,7 +267,7 @@ def _follow(world, ray, weight, active, generator, max_depth, adjoint: bool) -> 
         factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
         active &= ~bsdf.is_zero(weight)
-        anchor = rays.surface_anchor(si, ray, world.emitters.shape_errors)
+        anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)
         edges += dr.select(active, mi.UInt32(1), 0)
         return rays.spawn(anchor, si.to_world(bs.wo), ray), weight, edges, distance, active, generator, ends
 

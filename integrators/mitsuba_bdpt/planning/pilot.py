@@ -128,7 +128,7 @@ _SPLAT_COLUMNS = _even(sum(_SPLAT_PARTS.values()))
 
 
 class Pilot:
-    """Sink (see `sinks`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
+    """Sink (see `sink`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
     follow one another each `PER_PIXEL` are of the same pixel, in nets each `batch.NETS` times
     `batch.NET`."""
 
@@ -263,19 +263,19 @@ class Pilot:
         return xy.y * FINE + xy.x
 
 
-def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
+def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
     """Run a pilot of about ``lanes`` camera samples, spread over the image, each of which ``stands_for`` so
     many of the render."""
     everything = replace(
         plan,
         connections="none" if plan.connections == "none" else "all",
-        served=1,
-        splat_coefficient=1.0,
-        direct_coefficient=1.0,
+        camera_paths_per_light_path=1,
+        kappa_light=1.0,
+        kappa_direct=1.0,
         roulette=False,
     )
-    kernel = Kernel(world, everything, settings, mis.ByClass())
-    region = world.camera.region
+    kernel = Kernel(prepared, everything, settings, mis.ByClass())
+    region = prepared.camera.region
     pixels = int(region.size.prod())
     stratified = settings.points != "independent"
     nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
@@ -289,8 +289,8 @@ def measure(world, plan, settings, seed, lanes: int, stands_for: float = RAREST)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
-    known = {"bsdfs": world.traits.asked.count, "far": world.emitters.far_share}
-    contrast = world.emitters.contrast
+    known = {"bsdfs": prepared.traits.asked.count, "far": prepared.emitters.far_share}
+    contrast = prepared.emitters.contrast
     known["evenness"] = 1 / contrast if contrast < np.inf else 0.0  # also if it is no number
     return replace(found, rays=found.rays | known)
 
@@ -319,7 +319,7 @@ def _none(n: int) -> list:
 
 def _sums(total: list, more: list) -> list:
     """``total`` with ``more``, which has an entry for the last weightings only, added to these. What gets
-    nothing is left as it is: loops do not hold it, see `subpath.Walk`."""
+    nothing is left as it is: loops do not hold it, see `walk.Walk`."""
     first = len(total) - len(more)
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 

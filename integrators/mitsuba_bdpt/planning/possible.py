@@ -6,9 +6,9 @@ from ..settings import DEFAULT_STORED, Settings
 from ..transport.plan import Plan
 
 
-def plan(world, settings: Settings) -> Plan:
+def plan(prepared, settings: Settings) -> Plan:
     """Decide from the scene alone what is impossible, and apply the parameters given by hand."""
-    emitters, camera = world.emitters, world.camera
+    emitters, camera = prepared.emitters, prepared.camera
     skipped = []
 
     def skip(name, level, why):
@@ -19,12 +19,12 @@ def plan(world, settings: Settings) -> Plan:
 
     def possible(name, needed, where, why):
         """A class that joins surfaces, on paths of ``needed`` edges or more."""
-        why = _why_not(world, settings.max_depth, needed) or ("" if where else why)
+        why = _why_not(prepared, settings.max_depth, needed) or ("" if where else why)
         return skip(name, "impossible", why) if why else True
 
-    joinable = camera.joinable and emitters.traced
+    connectible = camera.connectible and emitters.traced
     direct = possible("s=1", 2, emitters.direct, "next-event estimation can choose no emitter")
-    splat = possible("t=1", 2, joinable, camera.reason or _UNTRACED)
+    splat = possible("t=1", 2, connectible, camera.reason or _UNTRACED)
     inner = possible("inner", 3, emitters.traced, _UNTRACED)
     why = _why_not_endpoints(emitters, camera, settings)
     endpoints = skip("(1,1)", "impossible", why) if why else True
@@ -52,9 +52,9 @@ def plan(world, settings: Settings) -> Plan:
         endpoints=endpoints,
         arrival=arrival,
         connections=connections if inner else "none",
-        served=round(1 / light_paths) if splat or arrival or endpoints or inner else 1,
-        splat_coefficient=1.0 if settings.skip == "none" else 0.25,
-        direct_coefficient=1.0,
+        camera_paths_per_light_path=round(1 / light_paths) if splat or arrival or endpoints or inner else 1,
+        kappa_light=1.0 if settings.skip == "none" else 0.25,
+        kappa_direct=1.0,
         roulette=settings.skip != "none" and not settings.strategy_images,
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
@@ -77,15 +77,15 @@ def _defaults(settings: Settings):
 _UNTRACED = "no light subpath can start from the emitters"
 
 
-def _why_not(world, depth, needed) -> str:
+def _why_not(prepared, depth, needed) -> str:
     """Why no path of ``needed`` edges can be made by joining surfaces; empty if nothing forbids it."""
     if depth < needed:
         return f"max_depth={depth} allows no such path"
-    if world.emitters.count == 0:
+    if prepared.emitters.count == 0:
         return "the scene has no emitter"
-    if not world.surfaces:
+    if not prepared.surfaces:
         return "the scene has no surface"
-    return "" if world.smooth else "no surface has a lobe that is not delta"
+    return "" if prepared.smooth else "no surface has a lobe that is not delta"
 
 
 def _why_no_light(emitters, settings: Settings) -> str:
@@ -97,11 +97,11 @@ def _why_no_light(emitters, settings: Settings) -> str:
 
 def _why_not_endpoints(emitters, camera, settings: Settings) -> str:
     """Why (1,1) is impossible; empty if it is not."""
-    if not camera.joinable:
+    if not camera.connectible:
         return camera.reason
     if settings.hide_emitters:
         return "hide_emitters: emitters are not seen directly"
-    if emitters.count and not emitters.joinable:
+    if emitters.count and not emitters.connectible_to_sensor:
         return "no point of the emitters can be joined with the sensor"
     if emitters.count and camera.delta and not emitters.hittable:
         return "delta emitters are not seen by a sensor without area (measure zero)"
@@ -121,11 +121,11 @@ def _why_not_arrival(emitters, camera, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
-def lost_paths(world, p: Plan, settings: Settings) -> list[str]:
+def unreachable_paths(prepared, p: Plan, settings: Settings) -> list[str]:
     """Paths that no strategy in use can make, one text each."""
-    emitters, camera = world.emitters, world.camera
+    emitters, camera = prepared.emitters, prepared.camera
     lost = []
-    deltas = world.delta and emitters.unhittable
+    deltas = prepared.delta and emitters.unhittable
     starts = ["delta emitter, delta surfaces"] * deltas + ["directionalarea"] * emitters.beams
     if not p.arrival:  # t = 0 finds all that follow
         for start in starts:

@@ -16,7 +16,7 @@ import numpy as np
 from .._version import __version__
 from ..host.edits import State
 from ..host.introspection import number
-from ..host.jit import nothing_freed, step_by_step
+from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import remembered
 from ..image.accumulator import Accumulator
 from ..image.features import FeatureLayers, feature_names
@@ -25,9 +25,9 @@ from ..image.sink import Image
 from ..parameters import check_film, check_not_frozen, check_scene, check_variant, integer
 from ..planning import choice, lost_light, pilot
 from ..planning.moments import ARRAYS, Moments
-from ..planning.possible import lost_paths, plan
+from ..planning.possible import plan, unreachable_paths
 from ..sampling import points
-from ..scene.prepared import World
+from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
 from ..transport.kernel import COUNTERS, Kernel, trace
@@ -90,9 +90,9 @@ class Render:
         colour = check_film(sensor, settings)
         self.started = time.perf_counter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
-        self.world = World(scene, sensor)
-        self._pixels = int(self.world.camera.region.size.prod())
-        self._full = self.plan = choice.first_plan(plan(self.world, settings), settings, self._pixels)
+        self.prepared = PreparedScene(scene, sensor)
+        self._pixels = int(self.prepared.camera.region.size.prod())
+        self._full = self.plan = choice.first_plan(plan(self.prepared, settings), settings, self._pixels)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
         self.seed = mi.UInt32(seed)
@@ -100,7 +100,7 @@ class Render:
         depth = settings.strategy_depth
         _check_strategy_memory(depth, sensor.film())
         features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
-        border = self.world.camera.region.border
+        border = self.prepared.camera.region.border
         self.accumulator = Accumulator(sensor.film(), colour, border, depth, settings.variance, features)
         self._samplers, self._running = {}, []
         self.decisions, self._moments, self._threshold = [], None, None
@@ -131,7 +131,7 @@ class Render:
         self._pilots += 1
         moments = self._pilot(count, samples / count)
         self._moments = moments if self._moments is None else self._moments.joined(moments)
-        possible = choice.candidates(self.world, self._full, self.settings)
+        possible = choice.candidates(self.prepared, self._full, self.settings)
         table = choice.choose(self._moments, possible, self._has_stratified_points(), samples)
         if not self._moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
             table = []
@@ -151,22 +151,22 @@ class Render:
         def trace() -> Moments:
             seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT_SEQUENCE + self._pilots)
             flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
-            with nothing_freed(), flag, step_by_step(self.world.emitters.evaluated):
-                found = pilot.measure(self.world, self._full, self.settings, seed, count, stands_for)
+            with gc_paused(), flag, evaluated_mode(self.prepared.emitters.evaluated):
+                found = pilot.measure(self.prepared, self._full, self.settings, seed, count, stands_for)
             self._wait()  # for the kernel's entry in the history
             return found
 
-        found, is_known = remembered(self.world.scene, self.sensor, "pilots", key, trace)
+        found, is_known = remembered(self.prepared.scene, self.sensor, "pilots", key, trace)
         self._remembered += is_known
         return found
 
     def _scene_state(self) -> tuple:
         """What tells scene and sensor from themselves after an edit."""
-        return State.of([self.world.scene, self.sensor]), self.world.camera.region.border
+        return State.of([self.prepared.scene, self.sensor]), self.prepared.camera.region.border
 
     def certainty(self) -> float:
         """`choice.certainty` of what the pilots decided."""
-        possible = choice.candidates(self.world, self._full, self.settings)
+        possible = choice.candidates(self.prepared, self._full, self.settings)
         return choice.certainty(self._moments, possible, self._has_stratified_points(), self._expected())
 
     def lost_by_pilot(self) -> int:
@@ -188,9 +188,9 @@ class Render:
             return f"it says nothing about films of fewer than {choice.FEW_PIXELS} pixels", None
         samples = self._expected()
         whole = sum(self.accumulator.passes) * self._pixels + samples
-        if decision := choice.by_scene(self.world, self._full, self.settings, whole):
+        if decision := choice.by_scene(self.prepared, self._full, self.settings, whole):
             return "the scene alone decides in a render as short as this", decision
-        if samples < (least := choice.least_samples(self.world.traits)):
+        if samples < (least := choice.least_samples(self.prepared.traits)):
             return f"{samples} samples are too few, it takes {least}", None
         return "", None
 
@@ -219,7 +219,7 @@ class Render:
 
     def _use(self, chosen):
         self.plan = chosen
-        self.kernel = Kernel(self.world, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
+        self.kernel = Kernel(self.prepared, chosen, self.settings, mis.Heuristic(self.settings.heuristic))
         if self._threshold and chosen.roulette:
             self.kernel.set_threshold(dr.opaque(mi.Float64, self._threshold))
 
@@ -232,7 +232,7 @@ class Render:
                     mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {text}")
 
     def _lost(self, p):
-        return lost_paths(self.world, p, self.settings)
+        return unreachable_paths(self.prepared, p, self.settings)
 
     def _decide_before(self, step: Step):
         """Replay the decision for this pass; or, early in a long render, ask another pilot."""
@@ -286,7 +286,7 @@ class Render:
             known = self._threshold is not None or first
             self._small_first = bool(self.plan.roulette and self.plan.light and not known)
         earlier = sum(self.accumulator.passes)
-        for step in schedule(self.world.camera, self.spp, self.settings, self._small_first):
+        for step in schedule(self.prepared.camera, self.spp, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
             skipped = min(earlier, step.size)
             done, earlier = done + skipped, earlier - skipped
@@ -315,12 +315,12 @@ class Render:
 
     def _pass(self, step: Step):
         first = not self.accumulator.passes and self._threshold is None
-        for launch, batch in enumerate(batches(self.world.camera, step.done, step.size, self.settings)):
+        for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self._wait()
             drawn = self._points(step, batch)
-            with nothing_freed(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-                with step_by_step(self.world.emitters.evaluated):
+            with gc_paused(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+                with evaluated_mode(self.prepared.emitters.evaluated):
                     counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
                 self.accumulator.evaluate(counts)
             self._running.append(counts)
@@ -456,14 +456,14 @@ class Render:
     def lost_light(self) -> tuple[dict, str]:
         """Shares of the image's light that no strategy in use finds, by the index of the emitter, and in
         words, which are empty where it is little. Looked for once for a scene and choice, until an edit."""
-        if not self.accumulator.passes or not lost_light.is_possible(self.world, self.plan, self.settings):
+        if not self.accumulator.passes or not lost_light.is_possible(self.prepared, self.plan, self.settings):
             return {}, ""
         key = self._scene_state(), self.plan.splat, self.plan.direct, self.settings.max_depth
-        look = partial(lost_light.lost_radiance, self.world, self.plan, self.settings.max_depth)
-        lost, _ = remembered(self.world.scene, self.sensor, "lost light", key, look)
+        look = partial(lost_light.lost_radiance, self.prepared, self.plan, self.settings.max_depth)
+        lost, _ = remembered(self.prepared.scene, self.sensor, "lost light", key, look)
         whole = number(self.accumulator.mean()) + sum(lost.values())
         shares = {i: radiance / whole for i, radiance in lost.items()}
-        return shares, lost_light.in_words(self.world, self.plan, shares)
+        return shares, lost_light.in_words(self.prepared, self.plan, shares)
 
     def _rays(self):
         rays = {name: self._counts[name] for name in RAYS}

@@ -26,7 +26,7 @@ class Snapshot:
     ``identity`` says of which render: variant, parameters, seed, samples per pixel, film; plain values, as
     ``progress`` (decisions, counts, seconds, …). ``passes``: samples per pixel of each. ``arrays``, all in
     double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums, see
-    `film.Accumulator`; flat), ``inverse_threshold`` of roulette, ``moments.*`` of the pilots,
+    `accumulator.Accumulator`; flat), ``inverse_threshold`` of roulette, ``moments.*`` of the pilots,
     ``replicates.*`` of the variance. The scene is not part of it: whoever goes on has to bring the same one.
     """
 

@@ -39,7 +39,7 @@ class _Scale:
     name: str
 
 
-def brighteners(owners) -> list[str]:
+def non_conserving_bsdfs(owners) -> list[str]:
     """What returns more light than it receives among ``owners``, BSDFs or shapes with a BSDF, and the BSDFs
     inside them, as far as their parameters tell, in words."""
     scales = _scales([(owner,) for owner in owners])

@@ -11,7 +11,7 @@ from ..sensors.kinds import prepare
 from ..transport import bsdf
 
 
-class World:
+class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
     ``emitters`` and ``camera`` are the two kinds of endpoints, ``smooth``, ``delta`` and ``refracts``:

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..geometry import rays
 from ..host.introspection import number, own_parameters
-from .records import Arrival, CameraJoin, CameraStart, Sensor, view_at
+from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
 
 KINDS = ("PerspectiveCamera", "ThinLensCamera")
 
@@ -95,7 +95,7 @@ class Camera(Sensor):
             return _View.of(self._columns)
         return _View.of([dr.gather(mi.Float, column, index) for column in self._columns])
 
-    def _start(self, uv, u_lens, like) -> CameraStart:
+    def _start(self, uv, u_lens, shared) -> CameraStart:
         index = mi.UInt32(0)
         if self._count > 1:
             index, x = view_at(uv.x, self._count)
@@ -112,7 +112,7 @@ class Camera(Sensor):
         near, far = view.near / cos, view.far / cos
         pdf_w = view.density(cos)
         return CameraStart(
-            ray=mi.Ray3f(z0 + d * near, mi.Vector3f(d), far - near, like.time, like.wavelengths),
+            ray=mi.Ray3f(z0 + d * near, mi.Vector3f(d), far - near, shared.time, shared.wavelengths),
             p=z0,
             pdf_w=pdf_w,
             weight=mi.Float(1),
@@ -178,7 +178,7 @@ class Camera(Sensor):
             inside = self.region.contains(uv)
         return self.region.to_position(uv), depth, inside
 
-    def arrive(self, walk, vertex, distant) -> Arrival:
+    def hit(self, walk, vertex, distant) -> SensorHit:
         """Where the walk's ray crosses the lens, which is no shape of the scene. What lies between the lens
         and the near plane does not hide it: camera rays start there too."""
         view = self._view(mi.UInt32(0))
@@ -194,7 +194,7 @@ class Camera(Sensor):
         z0 = _transform(view.to_world, local, 1)
         position, _, inside = self._project(mi.UInt32(0), view, -walk.d, local)
         pdf_area, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
-        return Arrival(
+        return SensorHit(
             dist2=dr.square(distance),
             cos=slope,
             pdf_area=pdf_area,
@@ -216,13 +216,13 @@ class Camera(Sensor):
 def _numbers(sensor, share: float):
     """What `_View.of` takes; ``share`` see `Region`."""
     lens = sensor.class_name() == KINDS[1]
-    world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-    to_film, origin = _film_map(sensor, world)
+    prepared = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    to_film, origin = _film_map(sensor, prepared)
     # Area at z = 1 that one crop window covers, times the share that a border adds.
     area = 1 / abs(np.linalg.det(to_film)) * share
     values = [
-        *np.linalg.inv(world)[:3].ravel(),
-        *world[:3].ravel(),
+        *np.linalg.inv(prepared)[:3].ravel(),
+        *prepared[:3].ravel(),
         *to_film.ravel(),
         *np.linalg.inv(to_film).ravel(),
         *origin,
@@ -239,12 +239,12 @@ def _transform(rows, v, w):
     return mi.Point3f(*(dr.dot(row.xyz, mi.Vector3f(v)) + row.w * w for row in rows))
 
 
-def _film_map(sensor, world):
+def _film_map(sensor, prepared):
     """Affine map from (x/z, y/z) in camera space to the crop window's unit square."""
     u = mi.Point2f([0, 1, 0], [0, 0, 1])
     ray, _ = sensor.sample_ray(0, 0.5, u, mi.Point2f(0.5))
     d = np.array(ray.d, dtype=np.float64)
-    local = np.linalg.inv(world[:3, :3]) @ d
+    local = np.linalg.inv(prepared[:3, :3]) @ d
     xy = (local[:2] / local[2]).T
     to_film = np.linalg.inv(np.stack([xy[1] - xy[0], xy[2] - xy[0]], axis=1))
     return to_film, -to_film @ xy[0]

@@ -7,7 +7,7 @@ import mitsuba as mi
 from ..geometry.to_world import check_to_world
 from ..host.introspection import children, named, number
 from . import cameras
-from .others import Distant, IrradianceMeter, Opaque, Orthographic
+from .others import Distant, IrradianceMeter, Orthographic, RayOnlySensor
 from .records import Sensor
 
 UNTARGETED = "target = none"
@@ -27,15 +27,15 @@ def prepare(sensor, shape_errors, bounded=True) -> Sensor:
     if kind == "IrradianceMeter":
         return _meter(sensor, shape_errors)
     if kind == "RadianceMeter":
-        return Opaque(
+        return RayOnlySensor(
             sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
         )
     if kind == "DistantSensorImpl":
         # Only its text tells the three kinds apart.
         if UNTARGETED in str(sensor):
-            return Distant(sensor) if bounded else Opaque(sensor, "the scene has no surface")
-        return Opaque(sensor, "the target of a distant sensor is out of a plugin's reach")
-    return Opaque(sensor, f"of the class {kind} nothing but its camera rays is known")
+            return Distant(sensor) if bounded else RayOnlySensor(sensor, "the scene has no surface")
+        return RayOnlySensor(sensor, "the target of a distant sensor is out of a plugin's reach")
+    return RayOnlySensor(sensor, f"of the class {kind} nothing but its camera rays is known")
 
 
 def _batch(sensor) -> Sensor:
@@ -53,7 +53,7 @@ def _batch(sensor) -> Sensor:
     kinds = {view.class_name() for view in views}
     if len(kinds) == 1 and kinds <= set(cameras.KINDS):
         return cameras.Camera(sensor, views)
-    return Opaque(sensor, "the views of the batch are not all perspective or all thinlens", views)
+    return RayOnlySensor(sensor, "the views of the batch are not all perspective or all thinlens", views)
 
 
 def _meter(sensor, shape_errors) -> Sensor:
@@ -71,5 +71,7 @@ def _meter(sensor, shape_errors) -> Sensor:
         )
     check_to_world(shape, f"irradiance meter {named(sensor)}")
     if tuple(film.size()) != (1, 1):
-        return Opaque(sensor, "the film has more than one pixel: which of them a point belongs to is unknown")
+        return RayOnlySensor(
+            sensor, "the film has more than one pixel: which of them a point belongs to is unknown"
+        )
     return IrradianceMeter(sensor, shape_errors)

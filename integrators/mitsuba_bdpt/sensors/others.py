@@ -10,7 +10,7 @@ from ..geometry import rays
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..geometry.smooth_meshes import SmoothMeshes
 from ..host.introspection import number
-from .records import Arrival, CameraJoin, CameraStart, Sensor, view_at
+from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
 
 
 class _Parallel(Sensor):
@@ -24,9 +24,9 @@ class _Parallel(Sensor):
     _axis = _density = None  # set by the subclasses
     no_area = "its rays have one direction, which a light subpath takes with probability zero"
 
-    def _starting(self, o, reach, like) -> CameraStart:
+    def _starting(self, o, reach, shared) -> CameraStart:
         return CameraStart(
-            ray=mi.Ray3f(o, mi.Vector3f(self._axis), reach, like.time, like.wavelengths),
+            ray=mi.Ray3f(o, mi.Vector3f(self._axis), reach, shared.time, shared.wavelengths),
             p=mi.Point3f(o),
             pdf_w=self._density,
             weight=mi.Float(1),
@@ -65,8 +65,8 @@ class Orthographic(_Parallel):
         self._reach = dr.opaque(mi.Float, number(dr.slice(ray.maxt, 0)))
         self._density = dr.opaque(mi.Float, 1 / (abs(np.linalg.det(basis)) * self.region.share))
 
-    def _start(self, uv, u_lens, like) -> CameraStart:
-        return self._starting(self._on_near_plane(uv), self._reach, like)
+    def _start(self, uv, u_lens, shared) -> CameraStart:
+        return self._starting(self._on_near_plane(uv), self._reach, shared)
 
     def _on_near_plane(self, uv):
         return self._origin + self._along[0] * uv.x + self._along[1] * uv.y
@@ -100,10 +100,10 @@ class Distant(_Parallel):
         self._radius2 = dr.opaque(mi.Float, radius2)
         self._density = dr.opaque(mi.Float, 1 / (np.pi * radius2))
 
-    def _start(self, uv, u_lens, like) -> CameraStart:
+    def _start(self, uv, u_lens, shared) -> CameraStart:
         disk = mi.warp.square_to_uniform_disk_concentric(u_lens)
         o = self._origin + self._across[0] * disk.x + self._across[1] * disk.y
-        return self._starting(o, mi.Float(dr.inf), like)
+        return self._starting(o, mi.Float(dr.inf), shared)
 
     def join(self, p, u_lens, u_film) -> CameraJoin:
         from_origin = p - self._origin
@@ -136,9 +136,9 @@ class IrradianceMeter(Sensor):
         self.area = self.region.box
         self.no_area = "with a filter other than box the film position of a point of its shape is unknown"
 
-    def _sample(self, u, like, reference=None):
+    def _sample(self, u, shared, reference=None):
         """A point of the shape, and its anchor for rays to and from ``reference`` (the point itself)."""
-        ps = self._shape.sample_position(like.time, u)
+        ps = self._shape.sample_position(shared.time, u)
         if self._sphere is not None:
             ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
         n = ps.n
@@ -147,13 +147,13 @@ class IrradianceMeter(Sensor):
         errors = self._shape_errors.at(mi.ShapePtr(self._shape))
         return ps, rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
 
-    def _start(self, uv, u_lens, like) -> CameraStart:
-        ps, anchor = self._sample(uv, like)
+    def _start(self, uv, u_lens, shared) -> CameraStart:
+        ps, anchor = self._sample(uv, shared)
         local = mi.warp.square_to_cosine_hemisphere(u_lens)
         d = mi.Frame3f(ps.n).to_world(local)
         pdf_w = local.z * dr.inv_pi
         return CameraStart(
-            ray=mi.Ray3f(rays.spawn(anchor, d, like)),
+            ray=mi.Ray3f(rays.spawn(anchor, d, shared)),
             p=mi.Point3f(ps.p),
             pdf_w=pdf_w,
             weight=mi.Float(dr.pi),
@@ -189,10 +189,10 @@ class IrradianceMeter(Sensor):
     def _like(self):
         return dr.zeros(mi.Interaction3f)  # shapes do not move: any time will do
 
-    def arrive(self, walk, vertex, distant) -> Arrival:
+    def hit(self, walk, vertex, distant) -> SensorHit:
         si = vertex.si
         cos = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0)
-        return Arrival(
+        return SensorHit(
             dist2=dr.squared_norm(si.p - walk.previous),
             cos=cos,  # as in `start` and `join`: weights of all strategies have the same idea of it
             pdf_area=self._density,
@@ -203,24 +203,24 @@ class IrradianceMeter(Sensor):
         )
 
 
-class Opaque(Sensor):
+class RayOnlySensor(Sensor):
     """A sensor, or several side by side, of which only Mitsuba's own camera rays are used."""
 
     needs_aperture_sample = True
-    joinable = False
+    connectible = False
 
     def __init__(self, sensor, reason: str, views=None):
         super().__init__(sensor)
         self.reason = self.no_area = reason
         self._views = views or [sensor]
 
-    def _start(self, uv, u_lens, like) -> CameraStart:
+    def _start(self, uv, u_lens, shared) -> CameraStart:
         index, x = view_at(uv.x, len(self._views))
         uv = mi.Point2f(x, uv.y)
         chosen = None
         for i, view in enumerate(self._views):
-            ray, weight = view.sample_ray_differential(like.time, like.u_wavelength, uv, u_lens)
-            sampled = mi.Ray3f(ray.o, ray.d, ray.maxt, like.time, like.wavelengths), mi.Spectrum(weight)
+            ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
+            sampled = mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.Spectrum(weight)
             chosen = (
                 sampled
                 if i == 0
@@ -228,7 +228,7 @@ class Opaque(Sensor):
             )
         ray, weight = chosen
         # The share of the wavelengths joins when the sample is added to the film.
-        weight = dr.select(like.weight != 0, weight / like.weight, 0)
+        weight = dr.select(shared.weight != 0, weight / shared.weight, 0)
         return CameraStart(
             ray=ray,
             p=mi.Point3f(ray.o),

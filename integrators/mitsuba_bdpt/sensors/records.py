@@ -54,7 +54,7 @@ class CameraJoin:
 
 
 @dataclass
-class Arrival:
+class SensorHit:
     """A light subpath that hits the sensor at z_0: ``dist2`` of its last edge, ``cos`` at z_0,
     ``pdf_area`` density of z_0 (area measure) and ``pdf_w`` (solid angle) of the way back in camera
     subpaths, ``importance`` W_e, ``position`` on the film in pixels, ``active``. ``surroundings`` see
@@ -126,7 +126,7 @@ class Sensor:
     """What the kernel may ask of a sensor; made anew for each render.
 
     ``region`` of the film; ``needs_aperture_sample``: whether z_0 needs a random point; ``delta``: a join
-    with a delta emitter has measure zero; ``parallel``: all camera rays have one direction; ``joinable``:
+    with a delta emitter has measure zero; ``parallel``: all camera rays have one direction; ``connectible``:
     whether vertices of light subpaths can be joined with it, if not ``reason`` says why; ``area``: whether a
     light subpath can hit it (t = 0), if not ``no_area`` says why; ``needs_film_sample``: whether a join needs
     a second random point.
@@ -135,7 +135,7 @@ class Sensor:
     needs_aperture_sample = False
     delta = True
     parallel = False
-    joinable = True
+    connectible = True
     area = False
     needs_film_sample = False
     reason = ""
@@ -145,14 +145,14 @@ class Sensor:
         self.sensor = sensor
         self.region = Region(sensor.film())
 
-    def start(self, pixel, u_film, u_lens, like) -> CameraStart:
-        """Start of a camera subpath through ``pixel``; ``like`` carries time and wavelengths."""
+    def start(self, pixel, u_film, u_lens, shared) -> CameraStart:
+        """Start of a camera subpath through ``pixel``; ``shared`` carries time and wavelengths."""
         position = mi.Point2f(pixel) + u_film
-        start = self._start(self.region.to_uv(position), u_lens, like)
+        start = self._start(self.region.to_uv(position), u_lens, shared)
         counted = mi.Point2f(pixel) if self.region.box else position
         return replace(start, position=position, counted=counted)
 
-    def _start(self, uv, u_lens, like) -> CameraStart:
+    def _start(self, uv, u_lens, shared) -> CameraStart:
         """`start` at a point of the crop window's unit square, without ``position`` and ``counted``."""
         raise NotImplementedError
 
@@ -164,6 +164,6 @@ class Sensor:
         """As `join`, with light that travels along ``d`` from infinity; ``dist2`` is 1."""
         raise NotImplementedError
 
-    def arrive(self, walk, vertex, distant) -> Arrival:
+    def hit(self, walk, vertex, distant) -> SensorHit:
         """Where the last edge of a light subpath hits the sensor; ``distant``: it comes from infinity."""
         raise NotImplementedError

@@ -70,12 +70,12 @@ class Shared:
 class Kernel:
     """Everything that a pass needs besides its batch. Holds the scene for one render only."""
 
-    def __init__(self, world, plan, settings, heuristic):
-        self.scene, self.camera, self.emitters = world.scene, world.camera, world.emitters
+    def __init__(self, prepared, plan, settings, heuristic):
+        self.scene, self.camera, self.emitters = prepared.scene, prepared.camera, prepared.emitters
         self.plan, self.heuristic = plan, heuristic
-        self.shape_errors = world.emitters.shape_errors
-        self.surfaces, self.refracts = world.surfaces, world.refracts
-        self.traits = world.traits
+        self.shape_errors = prepared.emitters.shape_errors
+        self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
+        self.traits = prepared.traits
         depth = min(settings.max_depth, UNLIMITED)
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
@@ -87,7 +87,7 @@ class Kernel:
         self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
-        self.served = u32(plan.served)
+        self.camera_paths_per_light_path = u32(plan.camera_paths_per_light_path)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
 
@@ -111,7 +111,7 @@ class Kernel:
 
 
 def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
-    """Trace one batch and put its contributions into ``sink`` (see `sinks`); ``spp`` is the render's total,
+    """Trace one batch and put its contributions into ``sink`` (see `sink`); ``spp`` is the render's total,
     which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
     after the other); nothing is evaluated yet."""
     sharing = shared_by(kernel, batch, points)
@@ -130,7 +130,7 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
         seat = sharing.seat(lane)
         _, counters = dr.while_loop(
             (mi.UInt32(0), counters),
-            lambda served, counters: served < kernel.served,
+            lambda served, counters: served < kernel.camera_paths_per_light_path,
             lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
             label="camera subpaths of one light subpath",
         )
@@ -152,7 +152,7 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     subpaths have none."""
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
-    return Sharing(batch.pixels, batch.samples, kernel.plan.served, points.seed)
+    return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths_per_light_path, points.seed)
 
 
 def _count_light(batch: Batch, sharing: Sharing) -> float:
@@ -256,7 +256,7 @@ def _light_subpath(kernel, sink, stream, shared, path):
     def visit(vertex, state, walk):
         path, counters = state
         if kernel.plan.arrival:
-            c, position = techniques.arrive(kernel, e, vertex, walk)
+            c, position = techniques.hit_sensor(kernel, e, vertex, walk)
             sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
         if kernel.plan.splat:
             c, position = techniques.splat(kernel, vertex, stream, counters)
@@ -377,11 +377,11 @@ def _coefficients(plan, by_class: bool) -> Coefficients:
             return mi.Vector4f(*(1.0 if name == kind else 0.0 for name in mis.CLASSES))
         return dr.opaque(mi.Float, value)
 
-    count = 1 / plan.served if plan.light else 0.0  # nominal, see `Kernel.bound`
-    light = count * plan.splat_coefficient
+    count = 1 / plan.camera_paths_per_light_path if plan.light else 0.0  # nominal, see `Kernel.bound`
+    light = count * plan.kappa_light
     return Coefficients(
         hit=entry("hit", 1, plan.hit),
-        direct=entry("direct", plan.direct_coefficient, plan.direct),
+        direct=entry("direct", plan.kappa_direct, plan.direct),
         splat=entry("light", light, plan.splat),
         endpoints=entry("light", light, plan.endpoints),
         arrival=entry("light", light, plan.arrival),

@@ -152,7 +152,7 @@ class ByClass(Heuristic):
         return dr.sum(coefficient) / dr.sum(total), shares
 
 
-def arrive(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
+def to_area(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
     """Convert to the area measure at a new vertex (the part of eqs. 31-35 that is known at the hit).
 
     ``dist2`` squared length of the edge (1 where the edge keeps another measure: the first edge

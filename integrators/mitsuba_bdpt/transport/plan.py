@@ -10,9 +10,9 @@ class Plan:
     """Strategy classes in use for one scene and sensor.
 
     Classes: ``hit`` s=0, ``direct`` s=1 with t>=2, ``splat`` t=1 with s>=2, ``endpoints`` (1,1),
-    ``arrival`` t=0, ``inner`` s,t>=2. ``served``: camera subpaths per light subpath (S).
-    ``connections``: ``all``, ``one`` or ``none``. ``splat_coefficient``: kappa of t=1 over its count;
-    ``direct_coefficient``: kappa of s=1.
+    ``arrival`` t=0, ``inner`` s,t>=2. ``camera_paths_per_light_path``: camera subpaths per light subpath (S).
+    ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t=1 over its count;
+    ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out.
     """
@@ -23,9 +23,9 @@ class Plan:
     endpoints: bool
     arrival: bool
     connections: str
-    served: int
-    splat_coefficient: float
-    direct_coefficient: float
+    camera_paths_per_light_path: int
+    kappa_light: float
+    kappa_direct: float
     roulette: bool
     hide_emitters: bool
     skipped: tuple = field(default=())

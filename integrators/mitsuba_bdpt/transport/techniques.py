@@ -73,7 +73,7 @@ def choose_emitter(kernel, z: Vertex, stream):
 
 def next_event(kernel, z: Vertex, counters) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
-    h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.joinable
+    h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
     value = _known(z.throughput * f.value * e.weight, e.emission_ratio)
     active = active & ~bsdf.is_zero(value)
@@ -163,7 +163,7 @@ def splat(kernel, y: Vertex, stream, counters):
     to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
-    active = y.joinable & ~bsdf.is_zero(value)
+    active = y.endpoint_active & ~bsdf.is_zero(value)
 
     newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
@@ -187,7 +187,7 @@ def splat(kernel, y: Vertex, stream, counters):
     return c, join.position
 
 
-def arrive(kernel, emission, y: Vertex, walk):
+def hit_sensor(kernel, emission, y: Vertex, walk):
     """t = 0: the last edge of a light subpath hits the sensor.
 
     ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
@@ -195,7 +195,7 @@ def arrive(kernel, emission, y: Vertex, walk):
     """
     h = kernel.heuristic
     directly = walk.edges == 1
-    z = kernel.camera.arrive(walk, y, emission.infinite & directly)
+    z = kernel.camera.hit(walk, y, emission.infinite & directly)
     active = z.active & (walk.edges <= kernel.last_arrival)
     if kernel.plan.hide_emitters:
         active &= walk.seen
@@ -206,7 +206,7 @@ def arrive(kernel, emission, y: Vertex, walk):
     completing = dr.select(emission.beam, 0, emission.pdf_first)
     before = mis.Partial(h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)), walk.partial.d_vc)
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
-    partial = mis.arrive(h, before, dist2, z.cos)
+    partial = mis.to_area(h, before, dist2, z.cos)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)

@@ -70,7 +70,7 @@ class Vertex:
     """A vertex that a walk has reached; ``partial`` is in the area measure (camera subpaths that
     left the scene: solid angle). ``cos`` absolute geometric cosine of the edge to it; ``anchor``
     starts rays; ``hit`` is false in the surroundings; ``endpoint`` with which it is to be joined and ``f``
-    the BSDF towards it (a `bsdf.Evaluation`), where ``joinable``, see `Side`."""
+    the BSDF towards it (a `bsdf.Evaluation`), where ``endpoint_active``, see `Side`."""
 
     si: object
     bsdf: object
@@ -84,13 +84,13 @@ class Vertex:
     hit: object
     active: object
     endpoint: object = None
-    joinable: object = None
+    endpoint_active: object = None
     f: object = None
 
 
 @dataclass(frozen=True)
 class Side:
-    """What distinguishes the two kinds of subpath, and what stays the same along one: ``like`` has its time
+    """What distinguishes the two kinds of subpath, and what stays the same along one: ``shared`` has its time
     and wavelengths, roulette compares the throughput with ``reference``.
 
     ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
@@ -104,7 +104,7 @@ class Side:
     """
 
     name: str
-    like: object
+    shared: object
     reference: object
     adjoint: bool
     last_edge: object
@@ -122,7 +122,7 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     """
 
     def body(walk, state):
-        vertex = _arrive(kernel, side, walk)
+        vertex = _vertex(kernel, side, walk)
         step = _interact(kernel, side, walk, vertex, stream)
         state = visit(vertex, state, walk)
         return _leave(kernel, side, walk, vertex, step, stream), state
@@ -143,10 +143,10 @@ def newest_coefficient(kernel, first, edges):
     return choose(edges == 1, first, kernel.kappa.inner)
 
 
-def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
+def _vertex(kernel, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the walk's edge; densities go over to the area measure."""
     h = kernel.heuristic
-    ray = mi.Ray3f(walk.o, walk.d, side.like.time, side.like.wavelengths)
+    ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
     si = walk.pi.compute_surface_interaction(ray, mi.RayFlags.All, walk.active)
     hit = walk.active & si.is_valid()
     cos = dr.abs(dr.dot(si.n, walk.d))
@@ -163,7 +163,7 @@ def _arrive(kernel, side: Side, walk: Walk) -> Vertex:
         dist2 = dr.select(walk.edges == 1, 1, dist2)
     # A hit at exactly zero cosine has probability zero; its densities would be infinite.
     hit &= cos > 0
-    in_area = mis.arrive(h, partial, dist2, cos)
+    in_area = mis.to_area(h, partial, dist2, cos)
     partial = mis.Partial(choose(hit, in_area.d_vcm, partial.d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
     return Vertex(
         si=si,
@@ -188,7 +188,7 @@ def _interact(kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     target = None
     if side.join is not None:
         vertex.endpoint, target = side.join(vertex)
-        vertex.joinable = target.active
+        vertex.endpoint_active = target.active
     u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
     take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
@@ -230,7 +230,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk
     active &= ~playing | (u < survive)
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
-    ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.like)
+    ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
     return Walk(
         pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
         o=ray.o,
