@@ -29,7 +29,7 @@ from mitsuba_bdpt.cli.render import message, prepare_output
 STATUS = 2
 SOURCES = Path(__file__).resolve().parent, Path(mitsuba_bdpt.__file__).resolve().parent
 
-IN_WORDS = re.compile(r"(ValueError|TypeError|NotImplementedError): bdpt: ")
+IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
 
 def answered(main: Callable[[], int | None]) -> int | None:

@@ -1142,7 +1142,7 @@ def test_frozen_functions_are_refused_in_words(method):
     done = subprocess.run([sys.executable, "-c", FROZEN, method], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-500:]
     refused, last = done.stdout.splitlines()
-    assert re.match("NotImplementedError bdpt: .*dr.freeze is not supported.*call render outside", refused)
+    assert re.match("UnsupportedError bdpt: .*dr.freeze is not supported.*call render outside", refused)
     assert last == "done"
 
 

@@ -1,9 +1,35 @@
-"""What a mistyped name may have meant, for messages."""
+"""Errors that the user can mend, and what a mistyped name may have meant."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+
+
+class UsageError(ValueError):
+    """A value that the user gave cannot be used. The message names it and says what to do instead."""
+
+    prefix = "bdpt: "
+
+    def __str__(self) -> str:
+        return self.prefix + super().__str__()
+
+
+class UsageTypeError(UsageError, TypeError):
+    """A value that the user gave is of a type that cannot be used."""
+
+
+class UnsupportedError(NotImplementedError):
+    """The method does not support what was asked for; the message says what to use instead."""
+
+    def __str__(self) -> str:
+        return UsageError.prefix + super().__str__()
+
+
+class CommandError(UsageError):
+    """A mistake in the arguments of a command, or in a file that they name."""
+
+    prefix = ""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
+from .errors import UnsupportedError, UsageError, UsageTypeError
 from .host.introspection import all_shapes, is_instance, named
 from .host.notices import warn_once
 from .image.features import feature_names
@@ -247,17 +248,17 @@ def _make_class():
                 warn_once(render.prepared.scene, render.sensor, text, about)
 
         def sample(self, *args, **kwargs):
-            raise NotImplementedError(
-                "bdpt: cannot be nested in another integrator (aov, moment, stokes): light subpaths "
+            raise UnsupportedError(
+                "cannot be nested in another integrator (aov, moment, stokes): light subpaths "
                 "reach pixels other than their own; render with bdpt itself, which has a parameter aovs "
                 "(the command's --integrator bdpt takes layers of aov over)"
             )
 
         def render_forward(self, *args, **kwargs):
-            raise NotImplementedError(NO_DERIVATIVES)
+            raise UnsupportedError(NO_DERIVATIVES)
 
         def render_backward(self, *args, **kwargs):
-            raise NotImplementedError(NO_DERIVATIVES)
+            raise UnsupportedError(NO_DERIVATIVES)
 
         @_without_gradients
         def explain(self, scene, sensor=0, spp=None):
@@ -289,12 +290,12 @@ def _make_class():
 
 def _check_resumable(start, settings):
     if not isinstance(start, Snapshot):
-        raise TypeError(f"bdpt: start={type(start).__name__} must be a snapshot from a PassReport")
+        raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
     if not start.progress["whole"]:
-        raise ValueError("bdpt: start=... was joined or reduced for joining; only assemble() can use it")
+        raise UsageError("start=... was joined or reduced for joining; only assemble() can use it")
     if settings.points == "sampler":
-        raise ValueError(
-            "bdpt: start with points=sampler is not possible: a scene's sampler cannot start in the middle "
+        raise UsageError(
+            "start with points=sampler is not possible: a scene's sampler cannot start in the middle "
             "of its samples; use points=sobol"
         )
 
@@ -303,7 +304,7 @@ def _check_resumable(start, settings):
 NAMED = 5
 
 NO_DERIVATIVES = (
-    "bdpt: derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
+    "derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
     "and render_backward"
 )
 
@@ -326,12 +327,12 @@ def _resolve(scene, sensor):
     if isinstance(sensor, mi.Sensor):
         return sensor
     if not is_index(sensor):
-        raise TypeError(f"bdpt: sensor={sensor!r} must be an index or one of scene.sensors()")
+        raise UsageTypeError(f"sensor={sensor!r} must be an index or one of scene.sensors()")
     sensors = scene.sensors()
     if not sensors:
-        raise ValueError("bdpt: the scene has no sensor; add one, for example of type perspective")
+        raise UsageError("the scene has no sensor; add one, for example of type perspective")
     if not 0 <= sensor < len(sensors):
-        raise ValueError(f"bdpt: sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
+        raise UsageError(f"sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
     return sensors[int(sensor)]
 
 
@@ -339,13 +340,13 @@ def _samples(sensor, spp, settings) -> int:
     """Samples per pixel of a render that was asked for ``spp``."""
     spp = integer(spp, "spp", 0) or int(sensor.sampler().sample_count())
     if not spp:
-        raise ValueError(
-            f"bdpt: spp=0 stands for the sample_count of the sampler of sensor {named(sensor)}, which is 0 "
+        raise UsageError(
+            f"spp=0 stands for the sample_count of the sampler of sensor {named(sensor)}, which is 0 "
             "too; set one of them to 1 or more"
         )
     if settings.variance and spp < REPLICATES:
-        raise ValueError(
-            f"bdpt: variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
+        raise UsageError(
+            f"variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
             "samples per pixel, one for each independent part of the render"
         )
     if settings.points == "sampler":

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .errors import did_you_mean
+from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import all_shapes, named
 from .image import features
 from .image.colour import Bands, film_colours
@@ -65,9 +65,9 @@ def integer(value, name: str, low: int, high: int = UNLIMITED) -> int:
     """``value`` as an int within [low, high]; raises ``TypeError`` and ``ValueError``."""
     number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
     if not number or not math.isfinite(value) or value != int(value):
-        raise TypeError(f"bdpt: {name}={value!r} must be an integer: {MEANING[name]}")
+        raise UsageTypeError(f"{name}={value!r} must be an integer: {MEANING[name]}")
     if not low <= value <= high:
-        raise ValueError(f"bdpt: {name}={value!r} is out of range; it is {MEANING[name]}")
+        raise UsageError(f"{name}={value!r} is out of range; it is {MEANING[name]}")
     return int(value)
 
 
@@ -79,7 +79,7 @@ def is_index(value) -> bool:
 def _boolean(props, name):
     value = props.get(name, False)
     if not isinstance(value, bool):
-        raise TypeError(f"bdpt: {name}={value!r} must be a boolean (true or false)")
+        raise UsageTypeError(f"{name}={value!r} must be a boolean (true or false)")
     return value
 
 
@@ -91,16 +91,16 @@ def _shown(value) -> str:
 def _choice(props, name, choices):
     value = props.get(name, choices[0])
     if not isinstance(value, str):
-        raise TypeError(f"bdpt: {name}={_shown(value)} must be a string, one of {', '.join(choices)}")
+        raise UsageTypeError(f"{name}={_shown(value)} must be a string, one of {', '.join(choices)}")
     if value not in choices:
-        raise ValueError(f"bdpt: {name}={value!r} is not known; use one of {', '.join(choices)}")
+        raise UsageError(f"{name}={value!r} is not known; use one of {', '.join(choices)}")
     return value
 
 
 def _light_paths(props):
     value = props.get("light_paths", "auto")
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise TypeError(f"bdpt: light_paths={_shown(value)} must be a number or 'auto'")
+        raise UsageTypeError(f"light_paths={_shown(value)} must be a number or 'auto'")
     if value == "auto":
         return value
     try:
@@ -109,21 +109,21 @@ def _light_paths(props):
         number = None
     if number not in LIGHT_PATHS:
         choices = ", ".join(str(Fraction(n)) for n in LIGHT_PATHS)
-        raise ValueError(f"bdpt: light_paths={value!r} is not possible; use auto, {choices}")
+        raise UsageError(f"light_paths={value!r} is not possible; use auto, {choices}")
     return number
 
 
 def _decisions(props):
     value = props.get("decisions", "")
     if not isinstance(value, str):
-        raise TypeError(f"bdpt: decisions={value!r} must be a string of JSON")
+        raise UsageTypeError(f"decisions={value!r} must be a string of JSON")
     return choice.read_decisions(value) if value else None
 
 
 def _aovs(props):
     value = props.get("aovs", "")
     if not isinstance(value, str):
-        raise TypeError(f"bdpt: aovs={value!r} must be a string, for example 'albedo:albedo,nn:sh_normal'")
+        raise UsageTypeError(f"aovs={value!r} must be a string, for example 'albedo:albedo,nn:sh_normal'")
     features.check_syntax(value)
     return value
 
@@ -131,9 +131,9 @@ def _aovs(props):
 def _until_error(props):
     value = props.get("until_error", 0.0)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"bdpt: until_error={value!r} must be a number, the relMSE to stop at")
+        raise UsageTypeError(f"until_error={value!r} must be a number, the relMSE to stop at")
     if not 0 <= value < math.inf:
-        raise ValueError(f"bdpt: until_error={value!r} must be a positive relMSE, or 0 for none")
+        raise UsageError(f"until_error={value!r} must be a positive relMSE, or 0 for none")
     return float(value)
 
 
@@ -143,8 +143,8 @@ def _check_layers(settings: Settings):
     names = features.feature_names(settings.aovs)
     for layer in layer_names(settings.strategy_depth, settings.variance, names):
         if layer in seen:
-            raise ValueError(
-                f"bdpt: aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
+            raise UsageError(
+                f"aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
             )
         seen.add(layer)
 
@@ -156,14 +156,14 @@ def _check_names(props):
         if name in known:
             continue
         if isinstance(props[name], mi.Object):
-            raise ValueError(
-                f"bdpt: {name} ({props[name].class_name()}) cannot be nested in it: bdpt holds no other "
+            raise UsageError(
+                f"{name} ({props[name].class_name()}) cannot be nested in it: bdpt holds no other "
                 "object; take it out"
             )
         remedy = REMEDIES.get(name)
         if remedy is None:
             remedy = f"{did_you_mean(name, known)}Parameters: {', '.join(known)}"
-        raise ValueError(f"bdpt: {name}={_shown(props[name])} is not a parameter; {remedy}")
+        raise UsageError(f"{name}={_shown(props[name])} is not a parameter; {remedy}")
 
 
 def read_settings(props) -> Settings:
@@ -173,7 +173,7 @@ def read_settings(props) -> Settings:
     max_depth = integer(props.get("max_depth", -1), "max_depth", -1)
     timeout = props.get("timeout", -1.0)
     if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or timeout != timeout:
-        raise TypeError(f"bdpt: timeout={timeout!r} must be a number of seconds, or -1 for none")
+        raise UsageTypeError(f"timeout={timeout!r} must be a number of seconds, or -1 for none")
     settings = Settings(
         max_depth=UNLIMITED if max_depth < 0 else max_depth,
         rr_depth=integer(props.get("rr_depth", 5), "rr_depth", 1),
@@ -195,24 +195,24 @@ def read_settings(props) -> Settings:
         timeout=float(timeout),
     )
     if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
-        raise ValueError(
-            f"bdpt: strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
+        raise UsageError(
+            f"strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
             "set max_depth, for example to 5"
         )
     by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
     if settings.decisions and (by_hand or settings.strategy_images):
-        raise ValueError(
-            "bdpt: decisions together with light_paths, connections, skip or strategy_images is "
+        raise UsageError(
+            "decisions together with light_paths, connections, skip or strategy_images is "
             "contradictory; leave out one or the other"
         )
     _check_layers(settings)
     if settings.until_error and not settings.variance:
-        raise ValueError(
-            f"bdpt: until_error={settings.until_error} follows from the variance; set variance to true"
+        raise UsageError(
+            f"until_error={settings.until_error} follows from the variance; set variance to true"
         )
     if settings.until_error and settings.points == "sampler":
-        raise ValueError(
-            f"bdpt: until_error={settings.until_error} with points=sampler is not possible: a sampler's "
+        raise UsageError(
+            f"until_error={settings.until_error} with points=sampler is not possible: a sampler's "
             "samples are numbered before it is known how many there will be; use points=sobol"
         )
     return settings
@@ -222,18 +222,18 @@ def check_variant():
     """Raise ``NotImplementedError`` for variants that the method cannot serve, or is not known to."""
     variant = mi.variant()
     if variant.startswith("scalar"):
-        raise NotImplementedError(
-            f"bdpt: the variant {variant} is scalar; use a vectorised one, for example "
+        raise UnsupportedError(
+            f"the variant {variant} is scalar; use a vectorised one, for example "
             "mi.set_variant('llvm_ad_rgb')"
         )
     if not variant.startswith(("llvm", "cuda")):
-        raise NotImplementedError(
-            f"bdpt: the variant {variant} runs on {variant.partition('_')[0]}, where this method was never "
+        raise UnsupportedError(
+            f"the variant {variant} runs on {variant.partition('_')[0]}, where this method was never "
             "tried; use a variant of LLVM or CUDA, for example mi.set_variant('llvm_ad_rgb')"
         )
     if mi.is_polarized:
-        raise NotImplementedError(
-            f"bdpt: the variant {variant} is polarized, which is not supported; use "
+        raise UnsupportedError(
+            f"the variant {variant} is polarized, which is not supported; use "
             f"{variant.replace('_polarized', '')}"
         )
 
@@ -241,8 +241,8 @@ def check_variant():
 def check_not_frozen():
     """Raise ``NotImplementedError`` while a function is recorded by ``dr.freeze``."""
     if dr.flag(dr.JitFlag.FreezingScope):
-        raise NotImplementedError(
-            "bdpt: a render inside of a function under dr.freeze is not supported: its passes are planned "
+        raise UnsupportedError(
+            "a render inside of a function under dr.freeze is not supported: its passes are planned "
             "from numbers that it reads; call render outside of the function, without dr.freeze (the kernels "
             "of a second render are reused in any case)"
         )
@@ -252,8 +252,8 @@ def check_made_for(integrator, scene):
     """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
     for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
         if not isinstance(thing, kind):
-            raise TypeError(
-                f"bdpt: {name}={type(thing).__name__} was not loaded under the present variant "
+            raise UsageTypeError(
+                f"{name}={type(thing).__name__} was not loaded under the present variant "
                 f"{mi.variant()}; load it again after mi.set_variant"
             )
 
@@ -261,14 +261,14 @@ def check_made_for(integrator, scene):
 def check_scene(scene, sensor):
     """Raise ``NotImplementedError`` for what the method cannot render."""
     if sensor.get_medium() is not None:
-        raise NotImplementedError(
-            f"bdpt: sensor {named(sensor)} lies in a participating medium, which is not supported; "
+        raise UnsupportedError(
+            f"sensor {named(sensor)} lies in a participating medium, which is not supported; "
             "use integrator type 'volpath'"
         )
     for shape in all_shapes(scene):
         if shape.is_medium_transition():
-            raise NotImplementedError(
-                f"bdpt: shape {named(shape)} bounds a participating medium, which is not supported; "
+            raise UnsupportedError(
+                f"shape {named(shape)} bounds a participating medium, which is not supported; "
                 "use integrator type 'volpath'"
             )
 
@@ -278,8 +278,8 @@ def check_film(sensor, settings: Settings):
     pixels or too large; returns its colours."""
     colour = film_colours(sensor)
     if settings.strategy_images and isinstance(colour, Bands):
-        raise NotImplementedError(
-            f"bdpt: strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
+        raise UnsupportedError(
+            f"strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
     _check_size(sensor.film(), len(colour.names), settings)
@@ -290,7 +290,7 @@ def _check_size(film, colours: int, settings: Settings):
     width, height = (int(x) for x in film.crop_size())
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
-        raise ValueError(f"bdpt: the {what} of {width} x {height} has no pixels; it needs one at least")
+        raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
     # Sums of a pass, of all passes and, while they are added, of both (see `accumulator.Accumulator`).
     layers = 1 + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + len(features.feature_names(settings.aovs))
     camera, light = (n + n % 2 for n in (colours + layers, colours))
@@ -300,8 +300,8 @@ def _check_size(film, colours: int, settings: Settings):
         per_pixel += 8 * (camera + light) + 2 * 2 * 8 * colours
     needed, there = width * height * per_pixel, _memory()
     if needed > there or numbers >= MOST_NUMBERS:
-        raise ValueError(
-            f"bdpt: the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
+        raise UsageError(
+            f"the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
             f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render crop windows"
         )
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+from ..errors import CommandError
 from ..run.snapshot import Snapshot, read
 from .files import check_writable, replacing
 from .loading import elements
@@ -77,7 +78,7 @@ def check(options: Namespace, output: Path) -> None:
     if options.checkpoint is not None:
         check_writable(path)
     if options.checkpoint is not None and path.exists() and not options.resume:
-        raise ValueError(
+        raise CommandError(
             f"checkpoint={str(path)!r} of an unfinished render exists; go on by --resume, or delete it."
         )
 
@@ -86,10 +87,10 @@ def start(options: Namespace, output: Path) -> Snapshot:
     """The snapshot to go on from; raises ``ValueError`` if there is none, or one of another scene."""
     path = path_of(output)
     if not path.exists():
-        raise ValueError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
+        raise CommandError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
     kept = read(path)
     if kept.progress.get("scene") != digest(options):
-        raise ValueError(
+        raise CommandError(
             f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
             "it names, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
             "or delete it."

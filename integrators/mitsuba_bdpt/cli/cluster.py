@@ -20,6 +20,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from ..errors import CommandError
 from ..run.rendering import RAYS, PassReport
 from ..run.snapshot import Snapshot
 from .loading import load
@@ -41,9 +42,11 @@ def check_settings(settings) -> None:
     for name in ("timeout", "until_error"):
         value = getattr(settings, name)
         if value > 0 or name == "timeout" and value == 0:
-            raise ValueError(f"scheduler with {name}={value} is not possible: each part would end by itself.")
+            raise CommandError(
+                f"scheduler with {name}={value} is not possible: each part would end by itself."
+            )
     if found := [name for name in ("duv_dx", "duv_dy") if name in settings.aovs]:
-        raise ValueError(
+        raise CommandError(
             f"scheduler with aovs={settings.aovs!r} is not possible: {found[0]} depends on the samples per "
             "pixel of a part; render it apart."
         )
@@ -184,12 +187,12 @@ def connected(address: str):
     try:
         from distributed import Client
     except ImportError as error:
-        raise ValueError(
+        raise CommandError(
             "scheduler needs dask.distributed; install it with: pip install 'mitsuba-bdpt[cluster]'"
         ) from error
     with Client(address, timeout="20s") as client:
         if not worker_count(client):
-            raise ValueError(f"scheduler={address!r} has no worker; start some with `dask worker`.")
+            raise CommandError(f"scheduler={address!r} has no worker; start some with `dask worker`.")
         yield client
 
 

@@ -6,6 +6,8 @@ import contextlib
 import os
 from pathlib import Path
 
+from ..errors import CommandError
+
 MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
 """The first four bytes of an image's file, by suffix."""
 
@@ -23,7 +25,7 @@ def check_format(path: Path, output: Path) -> None:
     with path.open("rb") as file:
         start = file.read(4)
     if start and start != MAGIC[kind]:
-        raise ValueError(
+        raise CommandError(
             f"output={str(output)!r} would overwrite {str(path)!r}, which exists and is not "
             f"{kind[1:].upper()}. Move it away, or name another output."
         )
@@ -33,7 +35,7 @@ def check_writable(path: Path) -> None:
     """Raise ``OSError`` now if `replacing` could not write `path` later, ``ValueError`` if it is something
     else than a file."""
     if path.exists() and not path.is_file():
-        raise ValueError(f"{str(path)!r} is no file; name another output.")
+        raise CommandError(f"{str(path)!r} is no file; name another output.")
     try:
         _temporary(path).touch()
     finally:

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import mitsuba as mi
 
-from ..errors import did_you_mean
+from ..errors import CommandError, did_you_mean
 from ..image import features
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
@@ -56,7 +56,7 @@ def elements(file: Path) -> list[ElementTree.Element]:
         # Mitsuba takes comments that hold two hyphens, XML does not.
         return list(ElementTree.fromstring(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)).iter())
     except (ElementTree.ParseError, ValueError) as error:
-        raise ValueError(f"{str(file)!r} is not well-formed XML: {error}") from error
+        raise CommandError(f"{str(file)!r} is not well-formed XML: {error}") from error
 
 
 def _decoded(data: bytes) -> str:
@@ -88,18 +88,18 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
 def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     """Load the scene and the integrator to render it with."""
     if options.integrator == "":
-        raise ValueError("integrator='' names no integrator; use for example bdpt, or leave it out.")
+        raise CommandError("integrator='' names no integrator; use for example bdpt, or leave it out.")
     if options.variant not in mi.variants():
         known = ", ".join(mi.variants())
         question = did_you_mean(options.variant, mi.variants())
-        raise ValueError(
+        raise CommandError(
             f"variant={options.variant!r} is not one of Mitsuba's: {known}; {question}".rstrip("; ")
         )
     check_file(options.scene)
     try:
         mi.set_variant(options.variant)
     except ImportError as error:
-        raise ValueError(
+        raise CommandError(
             f"variant={options.variant!r} cannot be used on this machine ({str(error).rstrip('.')}); "
             "use an LLVM variant, for example llvm_ad_rgb."
         ) from error
@@ -110,7 +110,7 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
         better = _in_words(str(error), options)
         if better is None:
             raise
-        raise ValueError(better) from error
+        raise CommandError(better) from error
 
 
 def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
@@ -131,13 +131,13 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if options.until_error is not None:
         used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
         if used != "bdpt":
-            raise ValueError(
+            raise CommandError(
                 f"until_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
             )
         overrides |= {"until_error": options.until_error, "variance": True}
     if options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator):
         if options.integrator != "aov" or not overrides.get("aovs"):
-            raise ValueError(
+            raise CommandError(
                 f"integrator={options.integrator} is for one around another, which the command line cannot "
                 "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
             )
@@ -150,7 +150,7 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     kind = options.integrator or "bdpt"
     made = mi.load_dict({"type": kind, **overrides})
     if not isinstance(made, mi.Integrator):
-        raise ValueError(_no_integrator(kind, f"of class {made.class_name()}"))
+        raise CommandError(_no_integrator(kind, f"of class {made.class_name()}"))
     return scene, made
 
 
@@ -159,7 +159,7 @@ def _check_kind(name: str) -> None:
     known when they are made, and what is no plugin is answered then.)"""
     kind = mi.PluginManager.instance().plugin_type(name)
     if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
-        raise ValueError(_no_integrator(name, f"of type {kind.name.lower()}"))
+        raise CommandError(_no_integrator(name, f"of type {kind.name.lower()}"))
 
 
 def _no_integrator(name: str, what: str) -> str:
@@ -171,7 +171,7 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
     root = state.nodes[0]
     if root.type != mi.ObjectType.Scene:
         held = f"{root.type.name.lower()} {root.props.plugin_name()}"
-        raise ValueError(
+        raise CommandError(
             f"scene={str(scene)!r} holds a single object, {held}, and no <scene>: write one around it, with "
             "a sensor and lights."
         )
@@ -182,13 +182,13 @@ def _check_film_sizes(state: mi.parser.ParserState) -> None:
     for node in state.nodes:
         for name in ("width", "height") if node.type == mi.ObjectType.Film else ():
             if isinstance(size := node.props.get(name, 1), int) and size < 1:
-                raise ValueError(f"{name}={size} of the film must be 1 or more pixels.")
+                raise CommandError(f"{name}={size} of the film must be 1 or more pixels.")
 
 
 def check_file(scene: Path) -> None:
     """Raise ``ValueError`` if the ``scene`` file does not exist."""
     if not scene.is_file():
-        raise ValueError(f"scene={str(scene)!r} is not a file; {_scenes_near(scene)}")
+        raise CommandError(f"scene={str(scene)!r} is not a file; {_scenes_near(scene)}")
 
 
 def _scenes_near(scene: Path) -> str:
@@ -329,7 +329,7 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
     aovs, carried, prefix = [], {}, ""
     while (kind := node.props.plugin_name()) in AROUND:
         if kind in NOT_CARRIED:
-            raise ValueError(
+            raise CommandError(
                 f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
                 f"adds {NOT_CARRIED[kind]}; in the scene file, write the inner integrator alone."
             )
@@ -352,7 +352,7 @@ def _nested(nodes: Sequence, node) -> tuple[str, object]:
     if len(found) != 1:
         names = ", ".join(f"{key!r} ({inner.props.plugin_name()})" for key, inner in found)
         remedy = "leave out the others" if found else "write one inside of it"
-        raise ValueError(
+        raise CommandError(
             f"integrator: the scene's integrator {node.props.plugin_name()} is around {names or 'none'}; to "
             f"replace the one inside, there has to be just one: in the scene file, {remedy}."
         )
@@ -385,7 +385,7 @@ def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
     """The sensor with this `index`."""
     sensors = scene.sensors()
     if not sensors:
-        raise ValueError("The scene has no sensor; add one to the scene file.")
+        raise CommandError("The scene has no sensor; add one to the scene file.")
     if index >= len(sensors):
-        raise ValueError(f"sensor={index} is not in the scene; the last one is {len(sensors) - 1}.")
+        raise CommandError(f"sensor={index} is not in the scene; the last one is {len(sensors) - 1}.")
     return sensors[index]

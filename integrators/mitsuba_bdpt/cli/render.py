@@ -21,6 +21,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 import mitsuba_bdpt
 
+from ..errors import CommandError
 from . import checkpoints, cluster
 from .files import check_format, check_writable, replacing
 from .loading import check_file, choose_sensor, load
@@ -65,7 +66,7 @@ def run(options: Namespace) -> int:
         open_ended = options.time is not None or options.until_error is not None
         spp = options.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
         if not spp:
-            raise ValueError(
+            raise CommandError(
                 "The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N."
             )
         outcome = render(scene, integrator, options, spp, output)
@@ -101,7 +102,7 @@ def check_png(film: mi.Film) -> None:
     """Raise ``ValueError`` for an image that no PNG can hold, which would come out after the render."""
     width, height = film.crop_size()
     if max(width, height) > PNG_SIDE:
-        raise ValueError(
+        raise CommandError(
             f"the image of {width} x {height} is too long for a PNG, whose sides have {PNG_SIDE} "
             "pixels at most; render crop windows."
         )
@@ -116,7 +117,9 @@ def message(error: Exception) -> str:
 def prepare_output(output: Path) -> None:
     """Refuse an `output` that cannot be written in the end, which may be in hours; create its directory."""
     if output.suffix.lower() != ".exr":
-        raise ValueError(f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case.")
+        raise CommandError(
+            f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."
+        )
     for path in (output, output.with_suffix(".png")):
         check_format(path, output)
     try:
@@ -124,7 +127,7 @@ def prepare_output(output: Path) -> None:
         for path in (output, output.with_suffix(".png")):
             check_writable(path)
     except OSError as error:
-        raise ValueError(
+        raise CommandError(
             f"output={str(output)!r} cannot be written ({error.strerror}); name another with -o."
         ) from error
 
@@ -132,12 +135,12 @@ def prepare_output(output: Path) -> None:
 def check_options(options: Namespace, output: Path) -> None:
     """Raise ``ValueError`` for options that contradict one another."""
     if options.resume and options.checkpoint is None:
-        raise ValueError("resume needs --checkpoint MINUTES: how often to write the next ones.")
+        raise CommandError("resume needs --checkpoint MINUTES: how often to write the next ones.")
     if options.parts is not None and options.scheduler is None:
-        raise ValueError("parts needs --scheduler: without one, a render is made in one piece.")
+        raise CommandError("parts needs --scheduler: without one, a render is made in one piece.")
     for name in ("checkpoint", "until_error", "time"):
         if options.scheduler is not None and getattr(options, name) is not None:
-            raise ValueError(
+            raise CommandError(
                 f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
                 "leave out one or the other."
             )
@@ -146,7 +149,7 @@ def check_options(options: Namespace, output: Path) -> None:
         for name in names & set(properties):
             value = getattr(options, option)
             if value is not None and not (name == "variance" and properties[name] is True):
-                raise ValueError(
+                raise CommandError(
                     f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is "
                     f"not possible: the option sets {name} itself; leave out one or the other."
                 )
@@ -157,12 +160,12 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
     """Raise ``ValueError`` for options that only ``bdpt`` can follow, and for what these cannot."""
     for name in ("checkpoint", "scheduler"):
         if getattr(options, name) is not None and not hasattr(integrator, "assemble"):
-            raise ValueError(
+            raise CommandError(
                 f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "
                 "--integrator bdpt."
             )
     if options.checkpoint is not None and integrator.settings.points == "sampler":
-        raise ValueError(
+        raise CommandError(
             "checkpoint with points=sampler is not possible: a scene's sampler cannot start in the middle of "
             "its samples; use points=sobol."
         )

@@ -26,6 +26,7 @@ from functools import cached_property
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UsageError
 from ..geometry import rays, rounding
 from ..geometry.agreement import check_densities
 from ..geometry.quadrics import cone_density, is_turned_sphere, may_light_itself, sphere_normal
@@ -209,8 +210,8 @@ class Emitters:
         )
         if 0 in areas:
             emitter = emitters[areas.index(0)]
-            raise ValueError(
-                f"bdpt: emitter {named(emitter)} is on a shape without area ({named(emitter.get_shape())}); "
+            raise UsageError(
+                f"emitter {named(emitter)} is on a shape without area ({named(emitter.get_shape())}); "
                 "remove it, or give it some"
             )
         # The radiance of a directional area is told by its texture alone.

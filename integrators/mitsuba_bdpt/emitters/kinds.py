@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UnsupportedError, UsageError
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..host.introspection import all_shapes, children, matrix_of, named, number, own_parameters
 from ..host.jit import registered_emitters
@@ -61,13 +62,13 @@ def _tells_its_points(emitter) -> bool:
     """Whether the points that the shape of an area light samples have a density and a radiance."""
     shape = emitter.get_shape()
     if shape is None:
-        raise NotImplementedError(
-            f"bdpt: emitter {named(emitter)} is on a shape that Mitsuba does not tell (an ellipsoidsmesh); "
+        raise UnsupportedError(
+            f"emitter {named(emitter)} is on a shape that Mitsuba does not tell (an ellipsoidsmesh); "
             "use shape type ellipsoids, or a mesh"
         )
     if shape.shape_type() in _CURVES:
-        raise NotImplementedError(
-            f"bdpt: emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "
+        raise UnsupportedError(
+            f"emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "
             "sample; use a cylinder or a mesh"
         )
     sampled = shape.shape_type() in _SAMPLED
@@ -190,8 +191,8 @@ def check_coordinates(emitter):
     """Raise ``ValueError`` for a texture on a mesh that has no texture coordinates."""
     shape = emitter.get_shape()
     if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
-        raise ValueError(
-            f"bdpt: emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
+        raise UsageError(
+            f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
             f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"
         )
 
@@ -201,8 +202,8 @@ def refuse_curves(scene, emitter, why: str):
     have no ``sample_position``."""
     for shape in all_shapes(scene):
         if shape.shape_type() in _CURVES:
-            raise NotImplementedError(
-                f"bdpt: emitter {named(emitter)} {why}, which is not supported beside curves "
+            raise UnsupportedError(
+                f"emitter {named(emitter)} {why}, which is not supported beside curves "
                 f"({named(shape)}); remove one of them, or use integrator type 'path'"
             )
 
@@ -212,8 +213,8 @@ def _check_rotation(emitter):
     Mitsuba's own calls disagree with each other (next-event estimation four times the radiance)."""
     columns = _columns(emitter)
     if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
-        raise ValueError(
-            f"bdpt: to_world of {_plugin(emitter)} {named(emitter)} is not a rotation (the lengths of its "
+        raise UsageError(
+            f"to_world of {_plugin(emitter)} {named(emitter)} is not a rotation (the lengths of its "
             f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
         )
 
@@ -230,8 +231,8 @@ def check_angles(emitter):
         plugin, angle = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}[
             emitter.class_name()
         ]
-        raise ValueError(
-            f"bdpt: to_world of {plugin} {named(emitter)} distorts angles (the lengths of its columns are "
+        raise UsageError(
+            f"to_world of {plugin} {named(emitter)} distorts angles (the lengths of its columns are "
             f"{_lengths(columns)}); leave out scaling and shear, and set {angle} instead"
         )
 

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UsageError
 from ..geometry.quadrics import Sphere, is_small
 from ..host.introspection import named, own_parameters
 from .kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_angles, is_textured
@@ -67,8 +68,8 @@ def placement(emitter, kind, extent) -> Placement:
         cutoff_angle = mi.Float(params["cutoff_angle"])
         cos_cutoff = dr.slice(dr.cos(dr.deg2rad(cutoff_angle)))
         if cos_cutoff >= 1:
-            raise ValueError(
-                f"bdpt: spot {named(emitter)} has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
+            raise UsageError(
+                f"spot {named(emitter)} has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
                 "width in single precision; make it 0.02 degrees or more"
             )
         return Placement(

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UnsupportedError
 from ..host.introspection import children, named
 
 CHECKED = 4096  # samples of an emitter
@@ -55,8 +56,8 @@ def check_densities(emitters, index: int):
         some = np.mean(np.array(compared))  # 0: nothing can be compared, and so nothing differs
         off = np.mean(np.array(differ)) / some if some else 0
         if off > OFF:
-            raise NotImplementedError(
-                f"bdpt: {off:.1%} of the {what} that Mitsuba {mi.__version__} samples of emitter "
+            raise UnsupportedError(
+                f"{off:.1%} of the {what} that Mitsuba {mi.__version__} samples of emitter "
                 f"{named(emitter)} have another density than is known here, so that the image would be "
                 "wrong; use integrator type 'path', and please report the scene"
             )

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UsageError
 from ..geometry.agreement import CHECKED, OFF, spread_points
 from ..host.introspection import named, own_parameters
 
@@ -57,8 +58,8 @@ class SmoothMeshes:
         # Rounding of the points is some 2e-7. A neighbour's plane is further away up to 10^7 faces.
         off = np.mean(height > 2e-6 * np.abs(faces.corners).max())
         if off > OFF:
-            raise ValueError(
-                f"bdpt: {off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
+            raise UsageError(
+                f"{off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
                 "or measures, are not on the faces that its areas tell: after an edit of faces Mitsuba keeps "
                 "its table of areas; update vertex_positions with them, or load the scene anew"
             )
@@ -124,8 +125,8 @@ def _curved_faces(shape):
     p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     n = np.array(params["vertex_normals"], dtype=np.float64).reshape(-1, 3)
     if faces.max(initial=0) >= len(p):
-        raise ValueError(
-            f"bdpt: the emitting mesh {named(shape)} has a face with vertex {faces.max()} of {len(p)}; "
+        raise UsageError(
+            f"the emitting mesh {named(shape)} has a face with vertex {faces.max()} of {len(p)}; "
             "mend the file that it comes from"
         )
     a, b, c = p[faces].transpose(1, 0, 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UsageError
 from ..host.introspection import inverse_of, matrix_of, named
 
 # Relative; single precision and its products are far below.
@@ -23,7 +24,7 @@ def check_to_world(shape, owner: str):
     reason = check(matrix, inverse) if np.isfinite([matrix, inverse]).all() else None
     if reason is not None:
         kind = shape.class_name().lower()
-        raise ValueError(f"bdpt: {owner} is on a {kind} ({named(shape)}) whose to_world {reason}")
+        raise UsageError(f"{owner} is on a {kind} ({named(shape)}) whose to_world {reason}")
 
 
 def _disk(matrix, inverse):

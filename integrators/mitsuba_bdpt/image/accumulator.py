@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UsageError
 from .block import Block
 from .layers import layer_names, strategies, strategy_count, strategy_index
 from .replicates import Replicates
@@ -114,7 +115,7 @@ class Accumulator:
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
             if len(s) != len(block.data):
-                raise ValueError(f"bdpt: the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
+                raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
         self._done = (sums, tuple(passes))
         if self.replicates is not None:
             self.replicates.restore(replicates, arrays)

@@ -11,6 +11,7 @@ from math import inf
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UnsupportedError
 from ..host.introspection import children, named
 
 # Wavelengths at which a film is asked for its response to a spectrum of 1.
@@ -24,8 +25,8 @@ def film_colours(sensor):
     if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
         return Rgb(film)
     if film.class_name() != "SpecFilm":
-        raise NotImplementedError(
-            f"bdpt: film {named(film)} of class {film.class_name()} is not supported; use hdrfilm or specfilm"
+        raise UnsupportedError(
+            f"film {named(film)} of class {film.class_name()} is not supported; use hdrfilm or specfilm"
         )
     return Bands(film, sensor)
 

@@ -17,7 +17,7 @@ import re
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import did_you_mean
+from ..errors import UsageError, did_you_mean
 from ..sampling.points import Purpose
 from ..sensors.records import Region
 
@@ -43,13 +43,13 @@ def check_syntax(aovs: str):
     for pair in pairs(aovs):
         name, colon, kind = pair.partition(":")
         if not (name and colon and kind):
-            raise ValueError(
-                f"bdpt: aovs={aovs!r}: {pair!r} is not a pair name:kind; write for example "
+            raise UsageError(
+                f"aovs={aovs!r}: {pair!r} is not a pair name:kind; write for example "
                 "'albedo:albedo,nn:sh_normal'"
             )
         if kind not in KINDS:
-            raise ValueError(
-                f"bdpt: aovs={aovs!r}: {kind!r} is not a kind of feature; "
+            raise UsageError(
+                f"aovs={aovs!r}: {kind!r} is not a kind of feature; "
                 f"{did_you_mean(kind, KINDS)}Kinds: {', '.join(KINDS)}"
             )
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS, Settings
 from ..transport.plan import Plan
 from .moments import GROUPS, Moments
@@ -186,9 +187,8 @@ def read_decisions(text: str) -> tuple[Decision, ...]:
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         says = f"{where}: {error}" if where else error
         what = f"{where} lacks {error}" if isinstance(error, KeyError) else says
-        raise ValueError(
-            f"bdpt: decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: "
-            f"{what}"
+        raise UsageError(
+            f"decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: {what}"
         ) from error
 
 

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from .._version import __version__
+from ..errors import UsageError
 from ..host.edits import State
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
@@ -425,8 +426,8 @@ class Render:
         (each would keep the sums of its time)."""
         passes, progress, arrays = self._state
         if len(passes) != reported:
-            raise ValueError(
-                f"bdpt: snapshot() of the report after {reported} passes came too late; only the newest "
+            raise UsageError(
+                f"snapshot() of the report after {reported} passes came too late; only the newest "
                 "report has one"
             )
         return Snapshot(
@@ -513,8 +514,8 @@ def _check_strategy_memory(depth: int, film):
     # Six channels in double precision: those of a pass, of all passes and, while they are added, of both.
     needed = strategy_count(depth) * w * h * 6 * (8 + 16)
     if needed > STRATEGY_MEMORY:
-        raise ValueError(
-            f"bdpt: strategy_images at {w}x{h} with max_depth={depth} needs about "
+        raise UsageError(
+            f"strategy_images at {w}x{h} with max_depth={depth} needs about "
             f"{needed / 2**30:.1f} GiB, more than {STRATEGY_MEMORY / 2**30:.0f} GiB; use a smaller "
             "film or max_depth"
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import CommandError, UsageError
 from ..image.spread import restored, stored
 
 # Of what a snapshot holds; another number with every change of that.
@@ -45,8 +46,8 @@ class Snapshot:
         for name in sorted(set(identity) | set(self.identity)):
             mine, given = self.identity.get(name), identity.get(name)
             if name not in apart_from and mine != given:
-                raise ValueError(
-                    f"bdpt: the snapshot is of another render: its {name} is {mine!r}, here it is {given!r}; "
+                raise UsageError(
+                    f"the snapshot is of another render: its {name} is {mine!r}, here it is {given!r}; "
                     "go on with what it was begun with, or begin anew"
                 )
 
@@ -56,8 +57,8 @@ class Snapshot:
         self.check(other.identity, ("seed", "spp"))
         seeds, others = _seeds(self), _seeds(other)
         if common := set(seeds) & set(others):
-            raise ValueError(
-                f"bdpt: seed={min(common)} is in both snapshots; joined renders need seeds of their own"
+            raise UsageError(
+                f"seed={min(common)} is in both snapshots; joined renders need seeds of their own"
             )
         spp = self.identity["spp"] + other.identity["spp"]
         progress = self.progress | {
@@ -96,7 +97,7 @@ class Snapshot:
             values = json.loads(str(arrays.pop("snapshot")))
             return Snapshot(values["identity"], tuple(values["passes"]), values["progress"], arrays)
         except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"not a snapshot: {type(error).__name__} {error}") from error
+            raise CommandError(f"not a snapshot: {type(error).__name__} {error}") from error
 
 
 def read(path: Path) -> Snapshot:
@@ -104,7 +105,7 @@ def read(path: Path) -> Snapshot:
     try:
         return Snapshot.from_bytes(path.read_bytes())
     except ValueError as error:
-        raise ValueError(f"{str(path)!r} is {error}") from error
+        raise CommandError(f"{str(path)!r} is {error}") from error
 
 
 def _seeds(snapshot: Snapshot) -> list:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from ..errors import UnsupportedError
 from ..geometry.to_world import check_to_world
 from ..host.introspection import children, named, number
 from . import cameras
@@ -41,13 +42,13 @@ def prepare(sensor, shape_errors, bounded=True) -> Sensor:
 def _batch(sensor) -> Sensor:
     views = [view for view in children(sensor).values() if isinstance(view, mi.Sensor)]
     if sensor.film().sample_border():
-        raise NotImplementedError(
-            f"bdpt: film of batch sensor {named(sensor)} has sample_border, which has no meaning beside "
+        raise UnsupportedError(
+            f"film of batch sensor {named(sensor)} has sample_border, which has no meaning beside "
             "the views of a batch; set it to false"
         )
     if mi.is_spectral and any("srf" in children(view) for view in views):
-        raise NotImplementedError(
-            f"bdpt: a view of batch sensor {named(sensor)} has an srf of its own, but wavelengths are "
+        raise UnsupportedError(
+            f"a view of batch sensor {named(sensor)} has an srf of its own, but wavelengths are "
             "sampled before the view is known; render the views one by one"
         )
     kinds = {view.class_name() for view in views}
@@ -59,14 +60,14 @@ def _batch(sensor) -> Sensor:
 def _meter(sensor, shape_errors) -> Sensor:
     film = sensor.film()
     if film.sample_border():
-        raise NotImplementedError(
-            f"bdpt: film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
+        raise UnsupportedError(
+            f"film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
             "its shape; set it to false"
         )
     shape = sensor.get_shape()
     if number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
-        raise NotImplementedError(
-            f"bdpt: irradiance meter {named(sensor)} is on a {shape.class_name()} ({named(shape)}), of which "
+        raise UnsupportedError(
+            f"irradiance meter {named(sensor)} is on a {shape.class_name()} ({named(shape)}), of which "
             "Mitsuba samples no points; put it on another shape"
         )
     check_to_world(shape, f"irradiance meter {named(sensor)}")

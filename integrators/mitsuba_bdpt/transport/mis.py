@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UsageError
 from ..settings import HEURISTICS
 
 # Classes whose coefficients a render may choose: s = 0, s = 1 (t >= 2), t <= 1, s and t >= 2.
@@ -69,7 +70,7 @@ class Heuristic:
 
     def __init__(self, name: str):
         if name not in HEURISTICS:
-            raise ValueError(f"heuristic={name!r} is not known; use one of {', '.join(HEURISTICS)}")
+            raise UsageError(f"heuristic={name!r} is not known; use one of {', '.join(HEURISTICS)}")
         self.name = name
 
     def scale(self, x, factor):
