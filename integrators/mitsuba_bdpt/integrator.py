@@ -23,82 +23,15 @@ from .run.rendering import Render
 from .run.schedule import REPLICATES
 from .run.snapshot import Snapshot
 from .scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
-from .settings import UNLIMITED
+from .settings import UNLIMITED, manual
 
-DOCUMENTATION = """Bidirectional path tracer (plugin ``bdpt``).
+DOCUMENTATION = f"""Bidirectional path tracer (plugin ``bdpt``).
 
 Every path of k edges can be made in k + 2 ways (s, t) with s light vertices and t camera vertices,
 s + t = k + 1 (E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation", 1997, chapter 10).
 All of them are combined by multiple importance sampling.
 
-.. pluginparameters::
-
- * - max_depth
-   - |int|
-   - Longest path in edges, as in ``path``: 1 is directly visible emitters, -1 (default) unlimited.
- * - rr_depth
-   - |int|
-   - Russian roulette starts at this depth, as in ``path``. (Default: 5)
- * - hide_emitters
-   - |bool|
-   - Hide directly visible emitters, as in ``path``. (Default: false)
- * - heuristic
-   - |string|
-   - ``balance`` (default), ``power``, ``maximum`` or ``uniform``.
- * - skip
-   - |string|
-   - ``impossible`` leaves out what the scene cannot use, draws one connection per camera vertex and drops
-     small contributions by unbiased roulette; ``auto`` (default) does so too and, in renders of 2^14
-     samples or more (2^22 in scenes of ten BSDFs or more), asks a pilot what pays, or the scene alone where
-     that tells (see `choice`); ``none`` does everything. What a pilot finds is remembered for later renders
-     of the scene, until its parameters are edited.
- * - light_paths
-   - |string| or |float|
-   - Light subpaths per camera subpath: ``auto`` (default: what the pilot chooses; without one 1/4, but 1 on
-     films of fewer than 64 pixels and 0 under an even sky; with ``skip=none`` 1), 0, 1, 1/2, 1/4, 1/8 or
-     1/16. One light subpath serves camera subpaths of different pixels. Given by hand, there is no pilot.
- * - connections
-   - |string|
-   - Inner connections per camera vertex: ``all``, ``one`` (drawn by its unshadowed contribution),
-     ``none``, or ``auto`` (default: what the pilot chooses; without one ``one``, but ``none`` under an even
-     sky; with ``skip=none`` ``all``). Given by hand, there is no pilot.
- * - points
-   - |string|
-   - ``sobol`` (default): Owen-scrambled Sobol' points for all draws that gain by them, at every vertex;
-     ``sampler``: the scene's sampler for a path's first draws; ``independent``.
- * - decisions
-   - |string|
-   - JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.
-     (Default: none)
- * - stored_vertices
-   - |int|
-   - Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. (Default: 64)
- * - strategy_images
-   - |bool|
-   - Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` for each strategy; needs a
-     finite ``max_depth``. (Default: false)
- * - variance
-   - |bool|
-   - Adds the layers ``variance.R``, ``.G``, ``.B``: the variance of each pixel, splats included,
-     estimated from 8 independent parts of the render; ``statistics["error"]`` is the relMSE that
-     follows. Needs at least 8 samples per pixel. On a ``specfilm`` these layers are called after its
-     bands. (Default: false)
- * - until_error
-   - |float|
-   - Stop when the estimate of the relMSE is this or less; needs ``variance``. It is looked at after 32
-     samples per pixel, 64, 128, …; ``spp`` is the most that is spent. An estimate that is too small by
-     chance ends a render too early: see docs/long_renders.md for by how much. (Default: 0, never)
- * - aovs
-   - |string|
-   - Adds feature layers, named by pairs ``name:kind`` as in Mitsuba's ``aov`` and equal to its layers:
-     ``albedo``, ``depth``, ``position``, ``uv``, ``geo_normal``, ``sh_normal``, ``dp_du``, ``dp_dv``,
-     ``duv_dx``, ``duv_dy``, ``prim_index``, ``shape_index``. (Default: none)
- * - spp_per_pass
-   - |int|
-   - Samples per pixel in one pass; 0 (default) chooses.
- * - timeout
-   - |float|
-   - Stop after the pass in which so many seconds were exceeded; -1 (default): never.
+{manual()}
 
 Values that are not finite, of textures or of plugins of yours, do not enter the image: a contribution that
 is NaN or infinite, or whose weight does not follow from densities that are, counts as zero in a sample that
