@@ -47,7 +47,8 @@ def test_the_option_replaces_the_old_name_in_a_scene_file(tmp_path):
     scene = tmp_path / "scene.xml"
     scene.write_text(
         """<scene version="3.0.0">
-        <integrator type="bdpt"><float name="until_error" value="1e-9"/><boolean name="variance" value="true"/>
+        <integrator type="bdpt"><float name="until_error" value="1e-9"/>
+        <boolean name="variance" value="true"/>
         <integer name="max_depth" value="2"/></integrator>
         <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
         <integer name="height" value="8"/></film></sensor>
