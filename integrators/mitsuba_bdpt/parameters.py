@@ -248,16 +248,6 @@ def check_not_frozen():
         )
 
 
-def check_made_for(integrator, scene):
-    """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
-    for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
-        if not isinstance(thing, kind):
-            raise UsageTypeError(
-                f"{name}={type(thing).__name__} was not loaded under the present variant "
-                f"{mi.variant()}; load it again after mi.set_variant"
-            )
-
-
 def check_scene(scene, sensor):
     """Raise ``NotImplementedError`` for what the method cannot render."""
     if sensor.get_medium() is not None:
