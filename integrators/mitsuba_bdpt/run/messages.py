@@ -16,6 +16,7 @@ NAMED = 5
 
 
 def log(statistics: dict):
+    """Log what a render did, and warn if its error is not known."""
     seconds = statistics["seconds"]
     mi.Log(
         mi.LogLevel.Info,

@@ -100,9 +100,9 @@ class Stream:
     the sequence's, ``key`` of the hashed numbers, ``first`` the scene sampler's numbers by (purpose,
     vertex). ``UInt32``, unchanged along the subpath."""
 
-    digits: object
-    seed: object
-    key: object
+    digits: mi.UInt32
+    seed: mi.UInt32
+    key: mi.UInt32
     first: dict
 
 

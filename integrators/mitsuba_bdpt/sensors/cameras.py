@@ -36,12 +36,12 @@ class _View:
     to_world: list
     to_film: list
     from_film: list
-    origin: object
-    area: object
-    near: object
-    far: object
-    radius: object
-    focus: object
+    origin: mi.Point2f
+    area: mi.Float
+    near: mi.Float
+    far: mi.Float
+    radius: mi.Float
+    focus: mi.Float
 
     @staticmethod
     def of(values) -> _View:
