@@ -220,7 +220,7 @@ def _check_together(settings: Settings):
 
 def check_variant():
     """Raise ``NotImplementedError`` for variants that the method cannot serve, or is not known to."""
-    variant = mi.variant()
+    variant = mi.variant() or "none"
     if variant.startswith("scalar"):
         raise UnsupportedError(
             f"the variant {variant} is scalar; use a vectorised one, for example "
@@ -298,7 +298,7 @@ def _check_size(film, colours: int, settings: Settings):
 
 def _memory() -> float:
     """What the machine has, in bytes."""
-    if mi.variant().startswith("cuda"):
+    if (mi.variant() or "").startswith("cuda"):
         return math.inf  # what a GPU has is not known here
     if not hasattr(os, "sysconf"):
         return math.inf  # Windows: Dr.Jit says it

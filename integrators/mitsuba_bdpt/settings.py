@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field, fields
 from math import inf
+from typing import Any
 
 # Path length, or number of samples, that stands for no limit: the largest of Dr.Jit's 32-bit integers.
 UNLIMITED = 2**32 - 1
@@ -47,12 +48,15 @@ class Parameter:
         return type(self.default)
 
 
-def _parameter(default, what: str, meaning: str, **bounds):
+Value = bool | int | float | str
+
+
+def _parameter(default: Value, what: str, meaning: str, **bounds: Any) -> Any:
     """A field of `Settings` that holds the value as it is given."""
     return _converted(default, default, what, meaning, **bounds)
 
 
-def _converted(default, value, what: str, meaning: str, **bounds):
+def _converted(default: Value, value: Value | None, what: str, meaning: str, **bounds: Any) -> Any:
     """A field of `Settings` that holds ``value`` for the parameter's ``default``."""
     text = " ".join(meaning.split())
     return field(default=value, metadata={"parameter": Parameter(default, what, text, **bounds)})
@@ -121,7 +125,7 @@ class Settings:
         ``sampler``: the scene's sampler for a path's first draws. ``independent``: random numbers.""",
         choices=POINTS,
     )
-    decisions: tuple | None = _converted(
+    decisions: tuple[Any, ...] | None = _converted(
         "",
         None,
         "a string of JSON",

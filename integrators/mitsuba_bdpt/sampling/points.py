@@ -117,7 +117,7 @@ class Points:
         self.kind = kind
         self.seed = seed
         self._table = None
-        if kind == "sampler":
+        if sampler is not None:
             self._table = [
                 sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in SAMPLER_TABLE
             ]
