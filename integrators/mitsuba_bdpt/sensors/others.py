@@ -218,8 +218,8 @@ class RayOnlySensor(Sensor):
         index, x = view_at(uv.x, len(self._views))
         uv = mi.Point2f(x, uv.y)
         ray, weight = _sampled(self._views[0], uv, u_lens, shared)
-        for number, view in enumerate(self._views[1:], 1):
-            chosen = index == number
+        for i, view in enumerate(self._views[1:], 1):
+            chosen = index == i
             other, other_weight = _sampled(view, uv, u_lens, shared)
             ray, weight = dr.select(chosen, other, ray), dr.select(chosen, other_weight, weight)
         # The share of the wavelengths joins when the sample is added to the film.
