@@ -103,8 +103,8 @@ def test_a_join_is_the_ray_back(name):
 
 @pytest.mark.parametrize("name", [name for name in SENSORS if not name.startswith(("distant", "irrad"))])
 def test_nothing_is_joined_beyond_the_far_plane(name):
-    """Rationale: camera rays end at the far clip plane, and so must what light subpaths add. Expected: a point
-    on a camera ray is joined before its end, at 0.999 of its length, and not at 1.001 of it."""
+    """Rationale: camera rays end at the far clip plane, and so must what light subpaths add. Expected: a
+    point on a camera ray is joined before its end, at 0.999 of its length, and not at 1.001 of it."""
     _, _, camera, u = prepared(name)
     start = start_of(camera, u)
     u_film = camera.region.to_uv(start.position)
