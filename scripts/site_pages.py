@@ -24,8 +24,8 @@ def readme() -> str:
 
 
 def tutorial() -> str:
-    """The cells of docs/tutorial.py: prose and code in turn."""
-    cells = re.split(r"^# %%", (ROOT / "docs" / "tutorial.py").read_text(), flags=re.MULTILINE)[1:]
+    """The cells of docs/user/tutorial.py: prose and code in turn."""
+    cells = re.split(r"^# %%", (ROOT / "docs" / "user" / "tutorial.py").read_text(), flags=re.MULTILINE)[1:]
     parts = []
     for cell in cells:
         kind, _, body = cell.partition("\n")

@@ -1,11 +1,11 @@
 """Try to break the renderer, and write what happened into a table.
 
-    python scripts/stress.py             # all cases, under twenty minutes; writes docs/stress.json, .md
+    python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress.json, .md
     python scripts/stress.py NAME ...    # some of them, printed
     python scripts/stress.py --list      # names of all
 
 Each case runs in a process of its own, so that a crash or a hang is an outcome too. The table is written
-between the lines `<!-- report: stress -->` and `<!-- end -->` of docs/stress.md. Exit status 1 if a case did
+between the lines `<!-- report: stress -->` and `<!-- end -->` of docs/reports/stress.md. Exit status 1 if a case did
 not go as expected; one that can't be tried here (as this user, on this system) says so.
 """
 
@@ -27,8 +27,8 @@ from stress_cases.case import Case, Outcome
 
 import mitsuba as mi  # isort: skip
 
-RECORD = reference.ROOT / "docs" / "stress.json"
-PAGE = reference.ROOT / "docs" / "stress.md"
+RECORD = reference.ROOT / "docs" / "reports" / "stress.json"
+PAGE = reference.ROOT / "docs" / "reports" / "stress.md"
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.

@@ -4,8 +4,8 @@
 # Run it as a script, or cell by cell in an editor that knows `# %%`:
 #
 #     pip install mitsuba-bdpt
-#     python docs/tutorial.py            # some minutes; images in renders/tutorial
-#     python docs/tutorial.py --size 32  # a quick look
+#     python docs/user/tutorial.py            # some minutes; images in renders/tutorial
+#     python docs/user/tutorial.py --size 32  # a quick look
 #
 # It needs the scenes of the repository.
 
@@ -22,7 +22,7 @@ import mitsuba as mi  # isort: skip
 parser = argparse.ArgumentParser()
 parser.add_argument("--size", type=int, default=128, help="width of the images")
 SIZE = parser.parse_known_args()[0].size  # a notebook has arguments of its own
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "renders" / "tutorial"
 OUT.mkdir(parents=True, exist_ok=True)
 mi.set_variant("llvm_ad_rgb")
