@@ -7,8 +7,9 @@
 The scene that had the least time comes next, with another seed, another size and another heuristic each
 time, and skip=auto and skip=none in turn. Every render is added to the record at once; Ctrl-C ends the one
 that runs after its pass, a second Ctrl-C at once, and then it is not in the record. A scene of which several
-renders have failed is left out until the plugin's source is another. A run that adds to docs/reports/endurance.json
-ends by writing the table between the lines `<!-- report: endurance -->` and `<!-- end -->` of docs/reports/stress.md.
+renders have failed is left out until the plugin's source is another. A run that adds to the record of the
+project ends by writing the table between the lines `<!-- report: endurance -->` and `<!-- end -->` of
+docs/reports/endurance.md.
 
 Exit status 130 if the run was interrupted; else 1 if the record has a value that is not finite or a render
 that failed, of whatever version; 2 for a mistake, 0 if all is well.
@@ -41,7 +42,7 @@ import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
 RECORD = reference.ROOT / "docs" / "reports" / "endurance.json"
-PAGE = reference.ROOT / "docs" / "reports" / "stress.md"
+PAGE = reference.ROOT / "docs" / "reports" / "endurance.md"
 
 # Camera samples of all scenes together.
 TARGET = 10**10

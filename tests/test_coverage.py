@@ -471,8 +471,8 @@ def test_the_page_names_tests_that_exist():
 
 
 def test_the_page_says_who_takes_part():
-    """Expected: docs/user/coverage.md has a row for every kind of emitter and sensor, with a dash exactly where
-    the table of `scene_parts`, which the tests above rely on, says that it has no part.
+    """Expected: docs/user/coverage.md has a row for every kind of emitter and sensor, with a dash exactly
+    where the table of `scene_parts`, which the tests above rely on, says that it has no part.
     """
     rows = re.findall(r"^\| `([\w ]+)` \| (.+) \|.*\|$", PAGE.read_text(), re.MULTILINE)
     found = {name: [cell.startswith("[–]") for cell in cells.split(" | ")] for name, cells in rows}
