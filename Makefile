@@ -19,7 +19,7 @@ test: $(INSTALLED)
 slow: $(INSTALLED)
 	$(VENV)/bin/python -m pytest -m slow
 
-# The images of the README.
+# The images of the README and of docs/reports/figures.md.
 gallery: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml -o renders/lamp_behind_glass.exr
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
@@ -81,11 +81,11 @@ references: $(INSTALLED)
 	$(VENV)/bin/python scripts/reference.py glass_caustics --spp 256 --seconds 7200
 	$(VENV)/bin/python scripts/reference.py cornell_box --spp 256 --seconds 3600
 
-# The tables and plots of the README, about an hour, best on a quiet machine; goes on where it was stopped.
+# The tables and plots of docs/reports, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
 	-$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
 	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/reports/benchmark
-	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme README.md
+	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .
