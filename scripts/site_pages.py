@@ -58,9 +58,12 @@ def found_class(name: str) -> ast.ClassDef:
 
 
 def signature(method: ast.FunctionDef) -> str:
-    """Return the call of a method, without ``self``."""
-    arguments = ast.unparse(method.args).removeprefix("self").removeprefix(", ")
-    return f"{method.name}({arguments})"
+    """Return the call of a method as code, or the name of a property, with the type of the result."""
+    result = f" -> {ast.unparse(method.returns)}" if method.returns else ""
+    if any(isinstance(d, ast.Name) and d.id == "property" for d in method.decorator_list):
+        return method.name + result
+    arguments = re.sub(r"^(self|cls)(, )?", "", ast.unparse(method.args))
+    return f"{method.name}({arguments}){result}"
 
 
 def described(match: re.Match) -> str:

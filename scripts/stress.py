@@ -31,7 +31,7 @@ import mitsuba as mi  # isort: skip
 
 RECORD = reference.ROOT / "docs" / "reports" / "stress.json"
 PAGE = reference.ROOT / "docs" / "reports" / "stress.md"
-TABLES = reference.ROOT / "docs" / "reports" / "stress_cases.md"
+TABLES = PAGE.with_name("stress_cases.md")
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.
