@@ -96,9 +96,11 @@ SAMPLER_TABLE = (
 
 @dataclass
 class Stream:
-    """One subpath's numbers: ``digits`` its place in the Sobol' sequence (reversed index), ``seed``
-    the sequence's, ``key`` of the hashed numbers, ``first`` the scene sampler's numbers by (purpose,
-    vertex). ``UInt32``, unchanged along the subpath."""
+    """The random numbers of one subpath; ``UInt32``, unchanged along the subpath.
+
+    ``digits`` is its place in the Sobol' sequence (reversed index), ``seed`` the sequence's, ``key`` that of
+    the hashed numbers, ``first`` the scene sampler's numbers by (purpose, vertex).
+    """
 
     digits: object
     seed: object
