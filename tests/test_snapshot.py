@@ -47,7 +47,7 @@ def stopped(integrator, target, after: int | None, **arguments) -> Snapshot:
         ("box", {}, 1),
         ("gaussian", {"skip": "none"}, 3),
         ("box", {"variance": True, "aovs": "dd:depth"}, 5),
-        ("box", {"variance": True, "until_error": 1e-9}, 9),
+        ("box", {"variance": True, "target_error": 1e-9}, 9),
         ("box", {"strategy_images": True}, 2),
         ("box", {"light_paths": 0, "points": "independent"}, 2),
     ],
@@ -232,7 +232,7 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
     """Expected: a render until an error stops at 32, 64, 128, … spp, the first at which its estimate is
     small enough; what it reports is that estimate, also in its last report."""
     target, reports = scene(), []
-    integrator = bdpt(variance=True, until_error=0.01)
+    integrator = bdpt(variance=True, target_error=0.01)
     integrator.on_pass = reports.append
     integrator.render(target, seed=2, spp=1 << 14, develop=False)
     done = sum(integrator.statistics["passes"])
@@ -245,10 +245,10 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
 @pytest.mark.parametrize(
     ("parameters", "error", "message"),
     [
-        ({"until_error": 0.1}, ValueError, "set variance to true"),
-        ({"until_error": -1.0, "variance": True}, ValueError, "positive relMSE"),
-        ({"until_error": "low", "variance": True}, TypeError, "must be a number"),
-        ({"until_error": 0.1, "variance": True, "points": "sampler"}, ValueError, "points=sobol"),
+        ({"target_error": 0.1}, ValueError, "set variance to true"),
+        ({"target_error": -1.0, "variance": True}, ValueError, "the relMSE to stop at, or 0 for none"),
+        ({"target_error": "low", "variance": True}, TypeError, "must be a number"),
+        ({"target_error": 0.1, "variance": True, "points": "sampler"}, ValueError, "points=sobol"),
     ],
 )
 def test_bad_parameters(parameters, error, message):

@@ -58,8 +58,8 @@ STRATEGY_MEMORY = 2 << 30
 @dataclass(frozen=True)
 class PassReport:
     """Progress after a pass: samples per pixel, seconds and rays so far; ``error`` the relMSE estimated
-    when ``until_error`` was last looked at, else ``None``; ``snapshot()``, of the newest report, gives what a
-    later render can start from."""
+    when ``target_error`` was last looked at, else ``None``; ``snapshot()``, of the newest report, gives what
+    a later render can start from."""
 
     spp_done: int
     spp_total: int
@@ -298,13 +298,13 @@ class Render:
                 done += size
 
     def _is_exact_enough(self) -> bool:
-        """Whether a group of replicates is whole and its error is what ``until_error`` asks for."""
-        if not self.settings.until_error or not self.accumulator.ends_replicates():
+        """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""
+        if not self.settings.target_error or not self.accumulator.ends_replicates():
             return False
         if self.accumulator.replicates.count % REPLICATES:
             return False
         self._error = self.accumulator.error()
-        return self._error <= self.settings.until_error
+        return self._error <= self.settings.target_error
 
     def _affordable(self, size: int) -> int:
         if not 0 <= self.settings.timeout < math.inf or self.settings.points == "sampler":
@@ -382,7 +382,9 @@ class Render:
         JSON holds it."""
         film, settings = self.sensor.film(), asdict(self.settings)
         del settings["timeout"]
-        settings["until_error"] = bool(self.settings.until_error)  # the passes depend on whether there is one
+        settings["target_error"] = bool(
+            self.settings.target_error
+        )  # the passes depend on whether there is one
         values = settings | {
             "version": __version__,
             "format": FORMAT,

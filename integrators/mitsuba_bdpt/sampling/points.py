@@ -102,9 +102,9 @@ class Stream:
     the hashed numbers, ``first`` the scene sampler's numbers by (purpose, vertex).
     """
 
-    digits: object
-    seed: object
-    key: object
+    digits: mi.UInt32
+    seed: mi.UInt32
+    key: mi.UInt32
     first: dict
 
 
@@ -119,7 +119,7 @@ class Points:
         self.kind = kind
         self.seed = seed
         self._table = None
-        if kind == "sampler":
+        if sampler is not None:
             self._table = [
                 sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in SAMPLER_TABLE
             ]
