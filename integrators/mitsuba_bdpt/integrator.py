@@ -17,11 +17,12 @@ from .host.notices import warn_once
 from .image.features import feature_names
 from .image.layers import layer_names
 from .parameters import check_made_for, check_variant, integer, is_index, read_settings
-from .planning import choice
+from .planning.budget import is_open
 from .planning.explain import explain
 from .run.rendering import Render
 from .run.schedule import REPLICATES
 from .run.snapshot import Snapshot
+from .run.statistics import statistics
 from .scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
 from .settings import UNLIMITED
 
@@ -205,7 +206,7 @@ def _make_class():
                 self._cancelled = False
                 render.run(self.on_pass, lambda: self._cancelled)
             finally:
-                self.statistics = render.statistics()
+                self.statistics = statistics(render)
                 _warn_of_what_was_lost(self.statistics, scene)
             _log(self.statistics)
             self._look_for_lost_light(render)
@@ -221,9 +222,9 @@ def _make_class():
             sensor = _resolve(scene, sensor)
             render = Render(scene, sensor, self.settings, seed, _samples(sensor, spp, self.settings))
             render.decide()
-            self.statistics = render.statistics()
+            self.statistics = statistics(render)
             _warn_of_what_was_lost(self.statistics, scene)
-            return [decision.record() for decision in render.decisions]
+            return [decision.record() for decision in render.planner.decided.decisions]
 
         @_without_gradients
         def assemble(self, snapshot, scene, sensor=0, develop=True, evaluate=True):
@@ -234,7 +235,7 @@ def _make_class():
             render = Render(scene, sensor, self.settings, 0, 1)
             render.resume(snapshot, apart_from=("seed", "spp", "decisions"))
             render.accumulator.finish()
-            self.statistics = render.statistics()
+            self.statistics = statistics(render)
             _warn_of_what_was_lost(self.statistics, scene)
             self._look_for_lost_light(render)
             return _result(sensor.film(), develop, evaluate)
@@ -271,14 +272,15 @@ def _make_class():
             render = Render(scene, sensor, self.settings, 0, spp or 1)
             table = render.decide() if spp else []
             if self.settings.decisions:
-                render.replay(0)
-            certainty = render.certainty() if table else 0.0
+                render.replay()
+            planner = render.planner
+            certainty = planner.certainty(render.passes) if table else 0.0
             text = explain(
-                render.prepared, render.plan, self.settings, table, certainty, render.lost_by_pilot()
+                render.prepared, render.plan, self.settings, table, certainty, planner.lost_by_pilots()
             )
-            if spp is None and choice.is_open(render.plan, self.settings):
+            if spp is None and is_open(render.plan, self.settings):
                 return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
-            return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"
+            return text if table or spp is None else f"{text}\n{planner.why_no_pilot()}"
 
         def to_string(self):
             values = asdict(self.settings) | {"max_depth": self.max_depth}
@@ -291,7 +293,7 @@ def _make_class():
 def _check_resumable(start, settings):
     if not isinstance(start, Snapshot):
         raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
-    if not start.progress["whole"]:
+    if not start.progress.whole:
         raise UsageError("start=... was joined or reduced for joining; only assemble() can use it")
     if settings.points == "sampler":
         raise UsageError(

@@ -1,7 +1,7 @@
 """A pilot: a few thousand bidirectional samples that tell the variance of every way to render.
 
-Whether light subpaths and inner connections pay is decided per image (`choose`), by cost times
-variance of each `Candidate`: path tracing alone, with light tracing, with inner connections, each with
+Whether light subpaths and inner connections pay is decided per image (`choice.choose`), by cost times
+variance of each candidate: path tracing alone, with light tracing, with inner connections, each with
 several numbers S of camera subpaths per light subpath and several coefficients.
 
 All variances come from the *same* samples, which use every strategy (S = 1, all inner connections, balance
@@ -27,7 +27,7 @@ All is relative to the brightness of the place: a splat in a shadow weighs as mu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -38,6 +38,7 @@ from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
 from ..transport.kernel import COUNTERS, Kernel, trace
 from . import moments
+from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
 
 # A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
@@ -64,31 +65,6 @@ LIGHT_TIMES = 4
 SELDOM = 16
 
 
-@dataclass(frozen=True)
-class Weighting:
-    """Coefficients kappa of the classes `mis.CLASSES`, relative to the densities of one sample each."""
-
-    hit: float
-    direct: float
-    light: float
-    inner: float
-
-    def of(self, kind: str) -> float:
-        """kappa of a class."""
-        return getattr(self, kind)
-
-    @property
-    def combination(self) -> str:
-        """``n0c0`` path tracing alone, ``n1c0`` with light tracing, ``n1c1`` with inner connections."""
-        return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
-
-
-# In this order: each class is in use from some weighting on.
-WEIGHTINGS = (
-    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
-    *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
-    *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
-)
 _USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
 
 
