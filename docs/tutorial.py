@@ -90,10 +90,10 @@ assert again.statistics["decisions"] == decisions
 # * `light_paths=0`: path tracing with better points; for scenes without caustics, when every render is very short.
 # * `skip=none`, `light_paths=1`, `connections=all`: everything, for comparisons with other renderers.
 # * `heuristic`: `balance` is the best or nearly so; `power` helps where one strategy is nearly without noise.
-# * `variance=true`: error bars, and `until_error` to stop at one.
+# * `variance=true`: error bars, and `target_error` to stop at one.
 
 # %%
-bars = mi.load_dict({"type": "bdpt", "max_depth": 6, "variance": True, "until_error": 0.02})
+bars = mi.load_dict({"type": "bdpt", "max_depth": 6, "variance": True, "target_error": 0.02})
 image = bars.render(box, spp=4096, seed=3)
 done, error = sum(bars.statistics["passes"]), bars.statistics["error"]
 reference = mi.render(box, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=8192, seed=9)

@@ -62,7 +62,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
     scene = mi.load_file(str(SCENE), resolution=32)
     options = Namespace(
         **{"scene": SCENE, "defines": [("resolution", "32")], "properties": [], "variant": mi.variant()},
-        **{"integrator": None, "sensor": 0, "time": None, "until_error": None, "seed": 0},
+        **{"integrator": None, "sensor": 0, "time": None, "target_error": None, "seed": 0},
     )
     job = cluster._job(scene, scene.integrator(), options, 256)
     assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]

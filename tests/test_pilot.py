@@ -230,7 +230,7 @@ def test_rare_paths_count_by_how_often_they_are_made():
 def test_open_ends_are_not_counted_on():
     """Expected: a render whose samples are only a bound gets the pilot of 2^20, and rare paths count by
     that."""
-    for parameters in ({"timeout": 5.0}, {"until_error": 0.1, "variance": True}):
+    for parameters in ({"timeout": 5.0}, {"target_error": 0.1, "variance": True}):
         assert budget.expected_samples(bdpt(**parameters).settings, 1 << 30) == 1 << 20
         assert budget.expected_samples(bdpt(**parameters).settings, 1 << 18) == 1 << 18
     assert budget.expected_samples(bdpt().settings, 1 << 30) == 1 << 30

@@ -1,5 +1,6 @@
 """Renders that go on from a snapshot, and renders that are joined from several."""
 
+import io
 import json
 
 import mitsuba as mi
@@ -46,7 +47,7 @@ def stopped(integrator, target, after: int | None, **arguments) -> Snapshot:
         ("box", {}, 1),
         ("gaussian", {"skip": "none"}, 3),
         ("box", {"variance": True, "aovs": "dd:depth"}, 5),
-        ("box", {"variance": True, "until_error": 1e-9}, 9),
+        ("box", {"variance": True, "target_error": 1e-9}, 9),
         ("box", {"strategy_images": True}, 2),
         ("box", {"light_paths": 0, "points": "independent"}, 2),
     ],
@@ -195,6 +196,16 @@ def test_what_does_not_belong_together_is_refused():
     np.testing.assert_allclose(timed, np.array(bdpt().render(target, seed=0, spp=16)), **ROUNDING)
 
 
+def test_another_format_is_refused():
+    """Rationale: a later version may hold other things. Expected: of a snapshot in another format, whatever
+    is in it, the format is named."""
+    other = json.dumps({"identity": {"format": 0}, "passes": [1], "progress": {"unknown": 1}})
+    file = io.BytesIO()
+    np.savez(file, snapshot=np.array(other))
+    with pytest.raises(ValueError, match="another version of mitsuba-bdpt: its format is 0, here it is 5"):
+        Snapshot.from_bytes(file.getvalue())
+
+
 def test_only_the_newest_report_has_a_snapshot():
     """Rationale: reports that are kept must not keep the sums of their time. Expected: older ones refuse."""
     reports, integrator = [], bdpt()
@@ -231,7 +242,7 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
     """Expected: a render until an error stops at 32, 64, 128, … spp, the first at which its estimate is
     small enough; what it reports is that estimate, also in its last report."""
     target, reports = scene(), []
-    integrator = bdpt(variance=True, until_error=0.01)
+    integrator = bdpt(variance=True, target_error=0.01)
     integrator.on_pass = reports.append
     integrator.render(target, seed=2, spp=1 << 14, develop=False)
     done = sum(integrator.statistics["passes"])
@@ -244,10 +255,10 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
 @pytest.mark.parametrize(
     ("parameters", "error", "message"),
     [
-        ({"until_error": 0.1}, ValueError, "set variance to true"),
-        ({"until_error": -1.0, "variance": True}, ValueError, "positive relMSE"),
-        ({"until_error": "low", "variance": True}, TypeError, "must be a number"),
-        ({"until_error": 0.1, "variance": True, "points": "sampler"}, ValueError, "points=sobol"),
+        ({"target_error": 0.1}, ValueError, "set variance to true"),
+        ({"target_error": -1.0, "variance": True}, ValueError, "the relMSE to stop at, or 0 for none"),
+        ({"target_error": "low", "variance": True}, TypeError, "must be a number"),
+        ({"target_error": 0.1, "variance": True, "points": "sampler"}, ValueError, "points=sobol"),
     ],
 )
 def test_bad_parameters(parameters, error, message):

@@ -16,12 +16,12 @@ import numpy as np
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import bsdf, kernel, techniques
+from mitsuba_bdpt.transport import bsdf, connections, kernel, techniques
+from mitsuba_bdpt.transport.walk import _interact, _leave, _vertex
 
 import mitsuba as mi  # isort: skip
 
 from endpoints import Camera, disks_of, dot, lamps_of, length2
-from mitsuba_bdpt.transport import connections
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
@@ -168,11 +168,11 @@ class Capture:
         dr.make_opaque(walk, self.emission)
         walked.origin = mi.Point3f(walk.previous)
         for edges in range(1, self.depth + 1):
-            vertex = walk._vertex(k, side, walk)
-            step = walk._interact(k, side, walk, vertex, stream)
+            vertex = _vertex(k, side, walk)
+            step = _interact(k, side, walk, vertex, stream)
             visited = self._visit_light if side.adjoint else self._visit_camera
             found = visited(edges, vertex, stream, walk)
-            after = walk._leave(k, side, walk, vertex, step, stream)
+            after = _leave(k, side, walk, vertex, step, stream)
             pair = (vertex.si.wi, step.wo) if side.adjoint else (step.wo, vertex.si.wi)
             asked = densities(vertex.si, *pair)
             dr.eval(vertex, step, list(found.values()), after, asked, list(self.endpoint.values()))

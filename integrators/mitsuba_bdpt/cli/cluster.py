@@ -40,7 +40,7 @@ one_at_a_time = threading.Lock()
 
 def check_settings(settings) -> None:
     """Raise ``ValueError`` for parameters that would mean something else in each part."""
-    for name in ("timeout", "until_error"):
+    for name in ("timeout", "target_error"):
         value = getattr(settings, name)
         if value > 0 or name == "timeout" and value == 0:
             raise CommandError(
@@ -126,7 +126,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     if settings.decisions is None:  # an empty list where there is nothing to choose
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
-    names = ("variant", "defines", "integrator", "sensor", "time", "until_error")
+    names = ("variant", "defines", "integrator", "sensor", "time", "target_error")
     kept = {name: getattr(options, name) for name in names}
     kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})

@@ -53,7 +53,7 @@ def check_strategies(film, depth: int):
 
 def available() -> float:
     """What the machine has, in bytes."""
-    if mi.variant().startswith("cuda"):
+    if (mi.variant() or "").startswith("cuda"):
         return math.inf  # what a GPU has is not known here
     if not hasattr(os, "sysconf"):
         return math.inf  # Windows: Dr.Jit says it

@@ -32,10 +32,10 @@ FEW_PIXELS = 64
 
 
 def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
-    """Samples still to come of a render with ``left`` more at most. Under ``timeout`` and ``until_error``
+    """Samples still to come of a render with ``left`` more at most. Under ``timeout`` and ``target_error``
     nobody knows: as many as are ``done``, or `PROVISIONAL_SAMPLES`. (A pilot that takes half of the render
     would be as bad as one that sees rare paths which the render does not meet.)"""
-    open_end = settings.until_error > 0 or 0 <= settings.timeout < math.inf
+    open_end = settings.target_error > 0 or 0 <= settings.timeout < math.inf
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 

@@ -39,9 +39,10 @@ from .work import Meter
 
 @dataclass(frozen=True)
 class PassReport:
-    """Progress after a pass: samples per pixel, seconds and rays so far; ``error`` the relMSE estimated
-    when ``until_error`` was last looked at, else ``None``; ``snapshot()``, of the newest report, gives what a
-    later render can start from."""
+    """Progress after a pass: samples per pixel, seconds and rays so far.
+
+    ``error``: the relMSE estimated when ``target_error`` was last looked at, else ``None``; ``snapshot()``,
+    of the newest report: what a later render can start from."""
 
     spp_done: int
     spp_total: int
@@ -206,13 +207,13 @@ class Render:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
 
     def _is_exact_enough(self) -> bool:
-        """Whether a group of replicates is whole and its error is what ``until_error`` asks for."""
-        if not self.settings.until_error or not self.accumulator.ends_replicates():
+        """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""
+        if not self.settings.target_error or not self.accumulator.ends_replicates():
             return False
         if self.accumulator.replicates.count % REPLICATES:
             return False
         self._error = self.accumulator.error()
-        return self._error <= self.settings.until_error
+        return self._error <= self.settings.target_error
 
     def report(self) -> PassReport:
         """Progress so far, for ``on_pass``."""

@@ -23,7 +23,7 @@ PASS_SAMPLES_SAMPLER = 1 << 20
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
 
-# Samples per pixel of each of the first `REPLICATES` under ``until_error``.
+# Samples per pixel of each of the first `REPLICATES` under ``target_error``.
 FIRST_REPLICATE = 4
 
 
@@ -64,7 +64,7 @@ def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) ->
     """All passes of a render of ``spp`` samples per pixel; ``small_first`` see `pass_sizes`."""
     parts = [spp]
     if settings.variance:
-        parts = _replicates(spp, bool(settings.until_error))
+        parts = _replicates(spp, bool(settings.target_error))
     steps = []
     for replicate, part in enumerate(parts):
         done = 0

@@ -18,7 +18,7 @@ from ..settings import Settings
 from .progress import Progress
 
 # Of what a snapshot holds; another number with every change of that.
-FORMAT = 4
+FORMAT = 5
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:
@@ -26,7 +26,7 @@ def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) 
     holds it."""
     film, values = accumulator.film, asdict(settings)
     del values["timeout"]
-    values["until_error"] = bool(settings.until_error)  # the passes depend on whether there is one
+    values["target_error"] = bool(settings.target_error)  # the passes depend on whether there is one
     values |= {
         "version": __version__,
         "format": FORMAT,

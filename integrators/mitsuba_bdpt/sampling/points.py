@@ -100,9 +100,9 @@ class Stream:
     the sequence's, ``key`` of the hashed numbers, ``first`` the scene sampler's numbers by (purpose,
     vertex). ``UInt32``, unchanged along the subpath."""
 
-    digits: object
-    seed: object
-    key: object
+    digits: mi.UInt32
+    seed: mi.UInt32
+    key: mi.UInt32
     first: dict
 
 
@@ -117,7 +117,7 @@ class Points:
         self.kind = kind
         self.seed = seed
         self._table = None
-        if kind == "sampler":
+        if sampler is not None:
             self._table = [
                 sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in SAMPLER_TABLE
             ]

@@ -36,12 +36,12 @@ class _View:
     to_world: list
     to_film: list
     from_film: list
-    origin: object
-    area: object
-    near: object
-    far: object
-    radius: object
-    focus: object
+    origin: mi.Point2f
+    area: mi.Float
+    near: mi.Float
+    far: mi.Float
+    radius: mi.Float
+    focus: mi.Float
 
     @staticmethod
     def of(values) -> _View:
@@ -216,13 +216,13 @@ class Camera(Sensor):
 def _numbers(sensor, share: float):
     """What `_View.of` takes; ``share`` see `Region`."""
     lens = sensor.class_name() == KINDS[1]
-    prepared = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-    to_film, origin = _film_map(sensor, prepared)
+    to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    to_film, origin = _film_map(sensor, to_world)
     # Area at z = 1 that one crop window covers, times the share that a border adds.
     area = 1 / abs(np.linalg.det(to_film)) * share
     values = [
-        *np.linalg.inv(prepared)[:3].ravel(),
-        *prepared[:3].ravel(),
+        *np.linalg.inv(to_world)[:3].ravel(),
+        *to_world[:3].ravel(),
         *to_film.ravel(),
         *np.linalg.inv(to_film).ravel(),
         *origin,
@@ -239,12 +239,12 @@ def _transform(rows, v, w):
     return mi.Point3f(*(dr.dot(row.xyz, mi.Vector3f(v)) + row.w * w for row in rows))
 
 
-def _film_map(sensor, prepared):
+def _film_map(sensor, to_world):
     """Affine map from (x/z, y/z) in camera space to the crop window's unit square."""
     u = mi.Point2f([0, 1, 0], [0, 0, 1])
     ray, _ = sensor.sample_ray(0, 0.5, u, mi.Point2f(0.5))
     d = np.array(ray.d, dtype=np.float64)
-    local = np.linalg.inv(prepared[:3, :3]) @ d
+    local = np.linalg.inv(to_world[:3, :3]) @ d
     xy = (local[:2] / local[2]).T
     to_film = np.linalg.inv(np.stack([xy[1] - xy[0], xy[2] - xy[0]], axis=1))
     return to_film, -to_film @ xy[0]

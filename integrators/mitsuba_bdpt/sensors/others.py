@@ -217,16 +217,11 @@ class RayOnlySensor(Sensor):
     def _start(self, uv, u_lens, shared) -> CameraStart:
         index, x = view_at(uv.x, len(self._views))
         uv = mi.Point2f(x, uv.y)
-        chosen = None
-        for i, view in enumerate(self._views):
-            ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
-            sampled = mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.Spectrum(weight)
-            chosen = (
-                sampled
-                if i == 0
-                else tuple(dr.select(index == i, new, old) for new, old in zip(sampled, chosen, strict=True))
-            )
-        ray, weight = chosen
+        ray, weight = _sampled(self._views[0], uv, u_lens, shared)
+        for i, view in enumerate(self._views[1:], 1):
+            chosen = index == i
+            other, other_weight = _sampled(view, uv, u_lens, shared)
+            ray, weight = dr.select(chosen, other, ray), dr.select(chosen, other_weight, weight)
         # The share of the wavelengths joins when the sample is added to the film.
         weight = dr.select(shared.weight != 0, weight / shared.weight, 0)
         return CameraStart(
@@ -236,3 +231,9 @@ class RayOnlySensor(Sensor):
             weight=weight,
             arrival=mi.Float(0),
         )
+
+
+def _sampled(view, uv, u_lens, shared):
+    """Ray and weight of a sensor of which only these are known."""
+    ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
+    return mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.Spectrum(weight)

@@ -19,13 +19,13 @@ class CameraStart:
     ``pdf_w``), what t = 0 begins with (0 without area), ``position`` on the film in pixels, ``counted``
     where the filter counts it (a box filter: at the pixel's corner, as Mitsuba does)."""
 
-    ray: object
-    p: object
-    pdf_w: object
-    weight: object
-    arrival: object
-    position: object = None
-    counted: object = None
+    ray: mi.Ray3f
+    p: mi.Point3f
+    pdf_w: mi.Float
+    weight: mi.Float | mi.Spectrum
+    arrival: mi.Float
+    position: mi.Point2f | None = None
+    counted: mi.Point2f | None = None
 
 
 @dataclass
@@ -41,16 +41,16 @@ class CameraJoin:
     clip planes.
     """
 
-    p: object
+    p: mi.Point3f
     anchor: rays.Anchor
-    d: object
-    dist2: object
-    importance: object
-    pdf_w: object
-    arrival: object
-    position: object
-    reach: object
-    valid: object
+    d: mi.Vector3f
+    dist2: mi.Float
+    importance: mi.Float
+    pdf_w: mi.Float
+    arrival: mi.Float
+    position: mi.Point2f
+    reach: mi.Float
+    valid: mi.Bool
 
 
 @dataclass
@@ -61,14 +61,14 @@ class SensorHit:
     `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light comes from infinity, None where
     the subpath's own ray has said so."""
 
-    dist2: object
-    cos: object
-    pdf_area: object
-    pdf_w: object
-    importance: object
-    position: object
-    active: object
-    surroundings: object = None
+    dist2: mi.Float
+    cos: mi.Float
+    pdf_area: mi.Float
+    pdf_w: mi.Float
+    importance: mi.Float
+    position: mi.Point2f
+    active: mi.Bool
+    surroundings: mi.Ray3f | None = None
 
 
 class Region:
