@@ -33,7 +33,10 @@ import numpy as np
 import reference
 from metrics import TRIM, rel_mse
 from mistakes import answered
-from mitsuba_bdpt.planning import choice, pilot
+from mitsuba_bdpt.planning import pilot
+from mitsuba_bdpt.planning.candidates import candidates
+from mitsuba_bdpt.planning.configuration import Configuration
+from mitsuba_bdpt.planning.decision import Decision
 from mitsuba_bdpt.run import rendering
 from tables import table
 
@@ -80,9 +83,9 @@ def product(rows, seeds=slice(None)) -> np.ndarray:
     return rows[:, 0].min() * rows[seeds, 1:].mean(axis=0)
 
 
-def by_hand(scene, depth: int, way: choice.Candidate, mean: float):
+def by_hand(scene, depth: int, way: Configuration, mean: float):
     """An integrator that does what the candidate ``way`` says; ``mean`` of the image."""
-    made = json.dumps([way.decided(0, 1.0, 1.0, mean).record()])
+    made = json.dumps([Decision.of(way, first_pass=0, cost=1.0, variance=1.0, mean=mean).record()])
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})
     integrator.render(scene, spp=1)  # compiles
     return integrator
@@ -93,7 +96,7 @@ def piloted(scene, settings) -> Counter:
     tables = []
     for seed in range(PILOT_SEEDS):
         render = rendering.Render(scene, scene.sensors()[0], settings, 0, SPP)
-        render.pilot_seed = seed
+        render.planner.pilot_seed = seed
         tables.append(render.decide())
     return Counter(table[0].candidate for table in tables if table)
 
@@ -104,7 +107,7 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.prepared, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    ways = choice.candidates(render.prepared, render.plan, settings)
+    ways = candidates(render.prepared, render.plan, settings)
     ways += [replace(way, connections="all") for way in ways if way.connections == "one"]
     ways = {named(way): way for way in ways}
     if known:
@@ -128,13 +131,11 @@ def as_fast(known: dict, found: dict) -> dict:
     return {name: np.array(rows) * [np.median(speeds), 1, 1] for name, rows in known.items()}
 
 
-def named(way: choice.Candidate) -> str:
+def named(way: Configuration) -> str:
     """In words: light subpaths per camera subpath, connections, coefficients of t <= 1 and s = 1."""
-    weighting = pilot.WEIGHTINGS[way.weighting]
     if not way.light_paths:
-        return f"0, {way.direct:g}"
-    served = way.camera_paths_per_light_path
-    return f"1/{served} {way.connections} {weighting.light * served:g}"
+        return f"0, {way.kappa_direct:g}"
+    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}"
 
 
 def measure(name: str, known: dict) -> dict:

@@ -70,9 +70,9 @@ MUTANTS = (
     ),
     Mutant(
         "pilots of an edited scene",
-        "run/rendering.py",
-        "key = self._scene_state(), self.settings",
-        "key = self.settings",
+        "planning/findings.py",
+        "key = self._scene_state(), key",
+        "pass",
         ("tests/test_edits.py::test_edits_are_seen",),
     ),
     Mutant(

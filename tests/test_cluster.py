@@ -16,7 +16,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.planning.planner import Planner
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
@@ -77,8 +77,10 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
     values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the
     pilot that the client asked; with decisions by hand there are none."""
-    lost = rendering.Render.lost_by_pilot
-    monkeypatch.setattr(rendering.Render, "lost_by_pilot", lambda self: lost(self) + 7 * (self._pilots > 0))
+    lost = Planner.lost_by_pilots
+    monkeypatch.setattr(
+        Planner, "lost_by_pilots", lambda self: lost(self) + 7 * (self.decided.pilots.asked > 0)
+    )
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
     statistics = image(tmp_path / "a.exr")[1]
     seconds = statistics["seconds"]

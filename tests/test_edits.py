@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.edits import State, _checksum
-from mitsuba_bdpt.planning import choice, pilot
+from mitsuba_bdpt.planning import budget, pilot
 
-SPP = choice.LEAST_SAMPLES // 32**2
+SPP = budget.LEAST_SAMPLES // 32**2
 
 
 def cornell(**changes):

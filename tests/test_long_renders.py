@@ -12,7 +12,8 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.image.accumulator import Accumulator
+from mitsuba_bdpt.run import work
 from mitsuba_bdpt.run.snapshot import read
 
 SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
@@ -189,16 +190,21 @@ def test_an_interruption_inside_a_pass(monkeypatch):
     is the uninterrupted one, its estimate of the error included."""
     arguments = [*ARGUMENTS, "--spp", "63", "-P", "variance=true"]  # too few for a pilot
     assert main([*arguments, "-o", "whole.exr"]) == 0
-    original, waits = rendering.Render._wait, []
+    original, close_pass, waits, closed = work.Meter.wait, Accumulator.close_pass, [], []
+
+    def close(self, spp):
+        close_pass(self, spp)
+        closed.append(spp)
 
     def wait(self):
-        waits.append(len(self.accumulator.passes))
+        waits.append(len(closed))
         if waits[-1] == 5 and waits.count(5) == 1:
             raise KeyboardInterrupt
         original(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(rendering.Render, "_wait", wait)
+        patch.setattr(Accumulator, "close_pass", close)
+        patch.setattr(work.Meter, "wait", wait)
         assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60"]) == 130
     assert read(Path("cut.checkpoint.npz")).passes == (1, 4, 3, 4)  # the next one ends a replicate
     assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60", "--resume"]) == 0

@@ -15,12 +15,13 @@ from .host.notices import warn_once
 from .image.features import feature_names
 from .image.layers import layer_names
 from .parameters import check_variant, integer, read_settings
-from .planning import choice
+from .planning.budget import is_open
 from .planning.explain import explain
 from .run import messages
 from .run.arguments import check_made_for, check_resumable, resolve_sensor, samples_per_pixel
 from .run.rendering import PassReport, Render
 from .run.snapshot import Snapshot
+from .run.statistics import statistics
 from .settings import UNLIMITED, Settings, manual
 
 DOCUMENTATION = f"""Bidirectional path tracer (plugin ``bdpt``).
@@ -151,7 +152,7 @@ class BDPTIntegrator:
             self._cancelled = False
             render.run(self.on_pass, lambda: self._cancelled)
         finally:
-            self.statistics = render.statistics()
+            self.statistics = statistics(render)
             messages.warn_of_non_finite(self.statistics, scene)
         messages.log(self.statistics)
         self._look_for_lost_light(render)
@@ -175,12 +176,14 @@ class BDPTIntegrator:
         render = Render(scene, sensor, self.settings, 0, spp or 1)
         table = render.decide() if spp else []
         if self.settings.decisions:
-            render.replay(0)
-        certainty = render.certainty() if table else 0.0
-        text = explain(render.prepared, render.plan, self.settings, table, certainty, render.lost_by_pilot())
-        if spp is None and choice.is_open(render.plan, self.settings):
+            render.replay()
+        planner = render.planner
+        certainty = planner.certainty(render.passes) if table else 0.0
+        lost = planner.lost_by_pilots()
+        text = explain(render.prepared, render.plan, self.settings, table, certainty, lost)
+        if spp is None and is_open(render.plan, self.settings):
             return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
-        return text if table or spp is None else f"{text}\n{render.why_no_pilot()}"
+        return text if table or spp is None else f"{text}\n{planner.why_no_pilot()}"
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:
@@ -194,9 +197,9 @@ class BDPTIntegrator:
         spp = samples_per_pixel(sensor, spp, self.settings)
         render = Render(scene, sensor, self.settings, seed, spp)
         render.decide()
-        self.statistics = render.statistics()
+        self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
-        return [decision.record() for decision in render.decisions]
+        return [decision.record() for decision in render.planner.decided.decisions]
 
     @_without_gradients
     def assemble(
@@ -217,7 +220,7 @@ class BDPTIntegrator:
         render = Render(scene, sensor, self.settings, 0, 1)
         render.resume(snapshot, apart_from=("seed", "spp", "decisions"))
         render.accumulator.finish()
-        self.statistics = render.statistics()
+        self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
         self._look_for_lost_light(render)
         return _result(sensor.film(), develop, evaluate)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from fractions import Fraction
 from numbers import Integral, Real
 
@@ -13,10 +12,11 @@ import numpy as np
 
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import all_shapes, named
-from .image import features
+from .image import features, memory
+from .image.channels import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
-from .planning import choice
+from .planning.decision import read_decisions
 from .settings import ALIASES, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
 # What numbers that are arguments of a render mean, for messages; of parameters see `settings.PARAMETERS`.
@@ -42,9 +42,6 @@ REMEDIES = {
     "sampleDirect": _SAMPLE_DIRECT,
     "sample_direct": _SAMPLE_DIRECT,
 }
-
-# Of one array.
-MOST_NUMBERS = 1 << 32
 
 
 def integer(value, name: str, low: float, high: float = UNLIMITED) -> int:
@@ -125,7 +122,7 @@ def _light_paths(value, name: str) -> float | str:
 
 def _decisions(value, name: str) -> tuple | None:
     text = _string(value, name)
-    return choice.read_decisions(text) if text else None
+    return read_decisions(text) if text else None
 
 
 def _aovs(value, name: str) -> str:
@@ -272,34 +269,16 @@ def check_film(sensor, settings: Settings):
             f"strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
-    _check_size(sensor.film(), len(colour.names), settings)
+    _check_has_pixels(sensor.film())
+    channels = Channels.of(sensor.film(), len(colour.names), len(features.feature_names(settings.aovs)))
+    memory.check_film(sensor.film(), channels, settings.variance)
+    memory.check_strategies(sensor.film(), settings.strategy_depth)
     return colour
 
 
-def _check_size(film, colours: int, settings: Settings):
+def _check_has_pixels(film):
+    """Raise ``ValueError`` for a film without pixels."""
     width, height = (int(x) for x in film.crop_size())
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
-    # Sums of a pass, of all passes and, while they are added, of both (see `accumulator.Accumulator`).
-    layers = 1 + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + len(features.feature_names(settings.aovs))
-    camera, light = (n + n % 2 for n in (colours + layers, colours))
-    numbers = width * height * max(camera, light)
-    per_pixel = camera * (4 + 16) + light * (8 + 16)
-    if settings.variance:  # sums at the last replicate; means and squares of two halves
-        per_pixel += 8 * (camera + light) + 2 * 2 * 8 * colours
-    needed, there = width * height * per_pixel, _memory()
-    if needed > there or numbers >= MOST_NUMBERS:
-        raise UsageError(
-            f"the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
-            f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render crop windows"
-        )
-
-
-def _memory() -> float:
-    """What the machine has, in bytes."""
-    if (mi.variant() or "").startswith("cuda"):
-        return math.inf  # what a GPU has is not known here
-    if not hasattr(os, "sysconf"):
-        return math.inf  # Windows: Dr.Jit says it
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

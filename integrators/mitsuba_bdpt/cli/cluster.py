@@ -21,8 +21,9 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import CommandError
-from ..run.rendering import RAYS, PassReport
+from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
+from ..run.statistics import RAYS
 from .loading import load
 
 # Parts for each worker: the last one that is waited for then takes a quarter of what a worker does in all.
@@ -95,7 +96,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
                 merged.add(index, Snapshot.from_bytes(data))
                 done = merged.snapshot
                 if done is not None:
-                    rays = sum(done.progress["counts"][name] for name in RAYS)
+                    rays = sum(done.progress.work.counts[name] for name in RAYS)
                     seconds = time.perf_counter() - started
                     on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
         except KeyboardInterrupt:

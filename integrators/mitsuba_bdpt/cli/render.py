@@ -194,7 +194,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -
         watchers.append(kept.after_pass)
     if options.resume:
         arguments["start"] = checkpoints.start(options, output)
-        limit = limit and limit + arguments["start"].progress["seconds"]
+        limit = limit and limit + arguments["start"].progress.work.seconds
     with progress_bar() as bar:
         if hasattr(integrator, "on_pass"):
             watchers.append(show_pass(bar, limit))

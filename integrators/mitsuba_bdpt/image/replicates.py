@@ -6,7 +6,10 @@ from math import inf
 
 import numpy as np
 
-from .spread import Spread, restored, stored
+from .spread import Spread
+
+# Names of the sums after the last image, in a snapshot.
+_LAST = "replicates.last."
 
 
 class Replicates:
@@ -35,18 +38,15 @@ class Replicates:
         halves[which] = halves[which].joined(Spread.of(develop(*new, n), n))
         self.halves, self._sums = tuple(halves), sums
 
-    def store(self) -> tuple[dict, dict]:
-        """Arrays of a `Snapshot`, and the numbers that `restore` needs beside them."""
-        arrays, progress = stored(self.halves)
-        if self.count:
-            arrays |= {f"replicates.last.{i}": sums for i, sums in enumerate(self._sums)}
-        return arrays, progress
+    def store(self) -> dict:
+        """Sums after the last image, which `restore` needs beside the halves."""
+        return {f"{_LAST}{i}": sums for i, sums in enumerate(self._sums or ())}
 
-    def restore(self, progress: dict, arrays: dict):
-        """Go on from what `store` gave."""
-        self.halves = restored(progress, arrays)
+    def restore(self, halves: tuple, arrays: dict):
+        """Go on from these ``halves`` and what `store` gave."""
+        self.halves = halves
         if self.count:
-            self._sums = [arrays[n] for n in sorted(arrays) if n.startswith("replicates.last.")]
+            self._sums = [arrays[name] for name in sorted(arrays) if name.startswith(_LAST)]
 
     def variance(self, spp: int, shape=()):
         """Variance of the mean of ``spp`` samples per pixel (those of a replicate that was not

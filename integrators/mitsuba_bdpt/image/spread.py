@@ -44,20 +44,3 @@ class Spread:
     def variance(self) -> np.ndarray:
         """Of the mean; there must be two images."""
         return self.squares / (self.spp * (self.count - 1))
-
-
-def stored(halves) -> tuple[dict, dict]:
-    """Several `Spread` as arrays and plain numbers of a snapshot."""
-    arrays = {}
-    for i, half in enumerate(halves):
-        if half.count:
-            arrays |= {f"replicates.{i}.mean": half.mean, f"replicates.{i}.squares": half.squares}
-    return arrays, {"halves": [[half.count, half.spp] for half in halves]}
-
-
-def restored(progress: dict, arrays: dict) -> tuple[Spread, ...]:
-    """What was `stored`."""
-    return tuple(
-        Spread(count, spp, arrays.get(f"replicates.{i}.mean"), arrays.get(f"replicates.{i}.squares"))
-        for i, (count, spp) in enumerate(progress["halves"])
-    )

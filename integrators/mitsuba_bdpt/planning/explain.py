@@ -63,7 +63,7 @@ def _pilot(settings: Settings, table, certainty: float) -> list[str]:
     shown = set()
     for row in table:
         candidate = row.candidate
-        key = candidate.combination, candidate.connections, candidate.camera_paths_per_light_path
+        key = candidate.weighting.combination, candidate.connections, candidate.camera_paths_per_light_path
         if key in shown:
             continue
         shown.add(key)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..transport.batch import NET, NETS
+from .rows import SAMPLE, SPLAT
 
 # Tiles of the image in each direction: of those whose brightness is known by itself, and of the larger ones
 # that stand in for them as far as it is noise. (A caustic and its shadow are smaller than the larger ones: in
@@ -37,7 +38,7 @@ OWN_GAIN = 0.3
 
 # Fields of `Moments` that have a row for each group, and all of its arrays.
 _OF_GROUPS = ("base", "rare", "light", "draw")
-ARRAYS = (*_OF_GROUPS, "gain")
+_ARRAYS = (*_OF_GROUPS, "gain")
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Moments:
             return share * a + (1 - share) * b
 
         rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
-        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*ARRAYS, "mean")}
+        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean")}
         return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
 
 
@@ -114,23 +115,20 @@ class Samples:
     draw: np.ndarray
     tile: np.ndarray
 
-    def of(self, chosen) -> Samples:
-        """Those rows that the mask ``chosen`` says."""
-        return Samples(*(getattr(self, f.name)[chosen] for f in fields(self)))
+    @staticmethod
+    def of_rows(rows: np.ndarray) -> Samples:
+        """Those of a pilot's rows of `rows.SAMPLE`."""
+        found = {f.name: SAMPLE.of(rows, f.name) for f in fields(Samples)}
+        return Samples(**found | {"tile": found["tile"][:, 0].astype(int)})
 
 
 @dataclass(frozen=True)
 class Splats:
     """Sums of the splats of so many ``lanes`` light subpaths, by the group of the subpath and fine tile,
-    shape (`GROUPS`, fine tiles, columns). Which columns are what: their ``size``, and second moments by
-    weighting, as in `Samples`; ``rare`` that of ``moment`` which points do not help."""
+    shape (`GROUPS`, fine tiles, `rows.SPLAT`)."""
 
     sums: np.ndarray
     lanes: int
-    size: slice
-    moment: slice
-    rare: slice
-    light: slice
 
 
 def group(lane):
@@ -144,28 +142,28 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
     subpath per camera sample; ``rays`` per camera sample."""
     count = len(samples.tile)
     width = samples.estimate.shape[1]
-    sizes = splats.sums[:, :, splats.size].sum(axis=2) / splats.lanes
+    sizes = SPLAT.of(splats.sums, "size").sum(axis=2) / splats.lanes
     groups = group(np.arange(count))
     inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
     weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
     of_sample = inverse[groups % 2, samples.tile][:, None]
 
-    def summed(values, columns=slice(0)):
+    def summed(values, of_splats=None):
         """By group, one column per weighting: those that have no use for ``values`` come first."""
-        total = weighted[:, columns]
+        total = SPLAT.of(weighted, of_splats) if of_splats else weighted[:, :0]
         if values is not None:
             of_samples = _by_group(values * of_sample) * (GROUPS / count)
             total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
     estimate = samples.estimate
-    base = summed(estimate**2 + samples.moment - estimate * _other(estimate), splats.moment)
+    base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
     return Moments(
         base=np.where(base < RULED_OUT, base, np.inf),
-        rare=summed(None, splats.rare),
-        light=summed(samples.light, splats.light),
+        rare=summed(None, "rare"),
+        light=summed(samples.light, "light"),
         draw=summed(samples.draw),
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),

@@ -1,7 +1,7 @@
 """A pilot: a few thousand bidirectional samples that tell the variance of every way to render.
 
-Whether light subpaths and inner connections pay is decided per image (`choose`), by cost times
-variance of each `Candidate`: path tracing alone, with light tracing, with inner connections, each with
+Whether light subpaths and inner connections pay is decided per image (`choice.choose`), by cost times
+variance of each candidate: path tracing alone, with light tracing, with inner connections, each with
 several numbers S of camera subpaths per light subpath and several coefficients.
 
 All variances come from the *same* samples, which use every strategy (S = 1, all inner connections, balance
@@ -27,7 +27,7 @@ All is relative to the brightness of the place: a splat in a shadow weighs as mu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -38,7 +38,9 @@ from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
 from ..transport.kernel import COUNTERS, Kernel, trace
 from . import moments
+from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
+from .rows import SAMPLE, SPLAT, SUMS, Layout
 
 # A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
 # many as a sample of the pilot stands for: what a render is not likely to meet is missing from its image, not
@@ -64,67 +66,8 @@ LIGHT_TIMES = 4
 SELDOM = 16
 
 
-@dataclass(frozen=True)
-class Weighting:
-    """Coefficients kappa of the classes `mis.CLASSES`, relative to the densities of one sample each."""
-
-    hit: float
-    direct: float
-    light: float
-    inner: float
-
-    def of(self, kind: str) -> float:
-        """kappa of a class."""
-        return getattr(self, kind)
-
-    @property
-    def combination(self) -> str:
-        """``n0c0`` path tracing alone, ``n1c0`` with light tracing, ``n1c1`` with inner connections."""
-        return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
-
-
-# In this order: each class is in use from some weighting on.
-WEIGHTINGS = (
-    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
-    *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
-    *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
-)
-_USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
-
-
-def _slices(parts: dict) -> dict:
-    """Where the columns of each part are."""
-    ends = np.cumsum(list(parts.values())).tolist()
-    return {name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)}
-
-
 # Of `kernel.COUNTERS`, what light subpaths count alone.
 _OF_LIGHT = ("light", "shadow_t1")
-
-
-def _even(n: int) -> int:
-    return n + n % 2
-
-
-# What a lane keeps: for each weighting its estimate, and the second moments of its contributions without
-# t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
-# with inner connections what drawing one adds; then the number of its vertices that were joined; its tile.
-_PARTS = {
-    "estimate": len(WEIGHTINGS),
-    "moment": len(WEIGHTINGS),
-    "light": _USERS["light"],
-    "draw": _USERS["inner"],
-}
-_COLUMNS = _even(sum(_PARTS.values()) + 2)
-# The size of splats, their second moments without t <= 1, those of them that are rare (see `SELDOM`), and
-# their second moments by t <= 1.
-_SPLAT_PARTS = {
-    "size": 1,
-    "moment": len(WEIGHTINGS),
-    "rare": len(WEIGHTINGS),
-    "light": _USERS["light"],
-}
-_SPLAT_COLUMNS = _even(sum(_SPLAT_PARTS.values()))
 
 
 class Pilot:
@@ -138,13 +81,13 @@ class Pilot:
         self._region, self._lanes = region, batch.lanes
         self._first_net = batch.pixels * batch.samples
         self._least = dr.opaque(mi.Float64, 1 / rarest)
-        self._samples = dr.zeros(mi.Float64, batch.size * _COLUMNS)
-        self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * _SPLAT_COLUMNS)
+        self._samples = dr.zeros(mi.Float64, batch.size * SAMPLE.width)
+        self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * SPLAT.width)
         dr.make_opaque(self._samples, self._splats)
 
     def begin(self):
         """Nothing found yet."""
-        return {name: _none(n) for name, n in _PARTS.items()} | {"joined": mi.UInt32(0)}
+        return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {"joined": mi.UInt32(0)}
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2."""
@@ -162,7 +105,7 @@ class Pilot:
             return {name: _sums(total[name], more) for name, more in new.items()}
 
         tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
-        found = {"unshadowed": _none(_PARTS["draw"]), "visible": _none(_PARTS["draw"])}
+        found = {name: _none(SAMPLE.parts["draw"]) for name in ("unshadowed", "visible")}
         found |= {name: total[name] for name in ("moment", "light")}
         found = connections.connect_all(kernel, z, lane.path, counters, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
@@ -179,15 +122,14 @@ class Pilot:
         row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(position)
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
-        columns = [x for name in _SPLAT_PARTS for x in found[name]]
-        _add(self._splats, _SPLAT_COLUMNS, columns, row, size > 0)
+        _add(self._splats, SPLAT, found, row, size > 0)
 
     def end(self, kernel, lane, sample, total, seen, counters):
         """Add a camera sample."""
-        columns = [x for name in _PARTS for x in total[name]]
         slot = dr.arange(mi.UInt32, self._lanes)
-        columns += [mi.Float64(total["joined"]), mi.Float64(self._tile(sample.start.position))]
-        _add(self._samples, _COLUMNS, columns, slot, sample.covered)
+        others = {"joined": total["joined"], "tile": self._tile(sample.start.position)}
+        found = total | {name: [mi.Float64(value)] for name, value in others.items()}
+        _add(self._samples, SAMPLE, found, slot, sample.covered)
 
     def evaluate(self, counts):
         """Run what was recorded, and ``counts`` with it."""
@@ -195,25 +137,20 @@ class Pilot:
 
     def moments(self, counts: dict) -> Moments:
         """What was found; ``counts`` what the lanes counted."""
-        rows = np.array(self._samples).reshape(-1, _COLUMNS)
-        columns = [rows[:, part] for part in _slices(_PARTS).values()]
-        joined, tiles = rows[:, sum(_PARTS.values()) :][:, :2].T
-        columns.append(tiles.astype(int))
-        independent, nets = (
-            moments.Samples(*(column[part] for column in columns))
-            for part in (slice(self._first_net), slice(self._first_net, None))
-        )
-        sums = np.array(self._splats).reshape(GROUPS, FINE**2, _SPLAT_COLUMNS)
-        splats = moments.Splats(sums, self._lanes, **_slices(_SPLAT_PARTS))
+        rows = np.array(self._samples).reshape(-1, SAMPLE.width)
+        parts = slice(self._first_net), slice(self._first_net, None)
+        independent, nets = (moments.Samples.of_rows(rows[part]) for part in parts)
+        sums = np.array(self._splats).reshape(GROUPS, FINE**2, SPLAT.width)
+        splats = moments.Splats(sums, self._lanes)
         rays = {
             name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
         }
-        rays["joined"] = joined.mean()
+        rays["joined"] = SAMPLE.of(rows, "joined").mean()
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
     def _parts(self, size, c):
         """A contribution ``c`` of this weighted ``size``: its estimates, of the weightings that have its
-        class, and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
+        class, and a dictionary of what it adds to ``moment`` and ``light``, see `rows.SAMPLE`."""
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
         own, squares, lights = [], [], []
@@ -295,10 +232,11 @@ def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RARE
     return replace(found, rays=found.rays | known)
 
 
-def _add(target, columns: int, values, row, active):
-    """Add ``values`` to a row of ``target``; as a packet, which takes an even number of them. (`dr.scatter`
-    would evaluate what was recorded so far.)"""
-    packet = mi.ArrayXd(values + [mi.Float64(0)] * (columns - len(values)))
+def _add(target, layout: Layout, found: dict, row, active):
+    """Add what was ``found`` to a row of ``target``, as a packet. (`dr.scatter` would evaluate what was
+    recorded so far.)"""
+    values = layout.row(found)
+    packet = mi.ArrayXd(values + [mi.Float64(0)] * (layout.width - len(values)))
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
 
 

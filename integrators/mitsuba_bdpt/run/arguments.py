@@ -24,7 +24,7 @@ def check_made_for(integrator, scene):
 def check_resumable(start, settings):
     if not isinstance(start, Snapshot):
         raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
-    if not start.progress["whole"]:
+    if not start.progress.whole:
         raise UsageError("start=... was joined or reduced for joining; only assemble() can use it")
     if settings.points == "sampler":
         raise UsageError(
