@@ -13,9 +13,11 @@ SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
 
 def candidates(prepared, full: Plan, settings: Settings) -> list[Configuration]:
-    """All ways to render that lose no light which ``full`` finds, with one inner connection or none. (All of
-    them gain 1.02 at most in the scenes of docs/choices.json, 1.13 in one of a small caustic, and one pilot
-    of 32 chose them where they take 2.1 times as long.)"""
+    """All configurations that lose no light which ``full`` finds, with one inner connection or none.
+
+    (All of them gain 1.02 at most in the scenes of docs/choices.json, 1.13 in one of a small caustic, and one
+    pilot of 32 chose them where they take 2.1 times as long.)
+    """
 
     def lost_without_arrival(plan):
         """A small lens is a poor finder of what t = 0 alone finds: it does not stand for connections."""
