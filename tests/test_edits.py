@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.edits import State, _checksum
-from mitsuba_bdpt.planning import budget, pilot
+from mitsuba_bdpt.planning import budget, lost_light, pilot
 
 SPP = budget.LEAST_SAMPLES // 32**2
 
@@ -200,3 +200,55 @@ def test_scenes_that_are_gone_are_forgotten():
     integrator.render(scene, spp=SPP)
     assert len(notices._scenes) <= before
     assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}
+
+
+def behind_glass():
+    """A lamp over a pane of glass, seen through it: light that no strategy finds."""
+    pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
+    pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.2, 0]).scale([0.9, 0.05, 0.9])
+    return cornell(lamp={"type": "point", "position": [0, 0.8, 0], "intensity": 1.0}, pane=pane)
+
+
+def test_parameters_are_read_once(monkeypatch):
+    """Rationale: it takes up to 8 ms; pilot and look for lost light both need them. Expected: once
+    in a render, twice where ``on_pass`` was called, which may edit them."""
+    read, original = [], State.of
+
+    def of(owners):
+        read.append(owners)
+        return original(owners)
+
+    monkeypatch.setattr(State, "of", of)
+    integrator = bdpt()
+    integrator.render(behind_glass(), spp=SPP)
+    assert integrator.statistics["pilots"]["asked"] == 1 == len(read)
+    integrator.on_pass = lambda report: None
+    integrator.render(behind_glass(), spp=SPP)
+    assert len(read) == 3
+
+
+def test_edits_during_a_render_are_seen(monkeypatch):
+    """Rationale: what is found of a scene that ``on_pass`` has edited is not of the one that the pilot saw.
+    Expected: it is looked for anew when that one is rendered again."""
+    looks = []
+
+    def look(prepared, plan, max_depth):
+        looks.append(max_depth)
+        return {}
+
+    monkeypatch.setattr(lost_light, "lost_radiance", look)
+    scene, integrator = behind_glass(), bdpt()
+    parameters = mi.traverse(scene)
+
+    def shine(factor):
+        parameters["lamp.intensity.value"] = factor * mi.Color3f(1)
+        parameters.update()
+
+    shine(1)
+    integrator.on_pass = lambda report: shine(2)
+    integrator.render(scene, spp=SPP)
+    integrator.on_pass = None
+    shine(1)
+    integrator.render(scene, spp=SPP)
+    integrator.render(scene, spp=SPP)
+    assert len(looks) == 2
