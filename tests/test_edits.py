@@ -202,11 +202,11 @@ def test_scenes_that_are_gone_are_forgotten():
     assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}
 
 
-def behind_glass():
+def behind_glass(**shapes):
     """A lamp over a pane of glass, seen through it: light that no strategy finds."""
     pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
     pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.2, 0]).scale([0.9, 0.05, 0.9])
-    return cornell(lamp={"type": "point", "position": [0, 0.8, 0], "intensity": 1.0}, pane=pane)
+    return cornell(lamp={"type": "point", "position": [0, 0.8, 0], "intensity": 1.0}, pane=pane, **shapes)
 
 
 def test_parameters_are_read_once(monkeypatch):
@@ -237,18 +237,21 @@ def test_edits_during_a_render_are_seen(monkeypatch):
         return {}
 
     monkeypatch.setattr(lost_light, "lost_radiance", look)
-    scene, integrator = behind_glass(), bdpt()
+    texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
+    painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    scene, integrator = behind_glass(painted=painted), bdpt()
     parameters = mi.traverse(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("painted.bsdf.reflectance.data"))
 
-    def shine(factor):
-        parameters["lamp.intensity.value"] = factor * mi.Color3f(1)
+    def paint(value):
+        parameters[key] = dr.full(mi.TensorXf, value, (16, 16, 3))
         parameters.update()
 
-    shine(1)
-    integrator.on_pass = lambda report: shine(2)
+    paint(0.5)
+    integrator.on_pass = lambda report: paint(0.1)
     integrator.render(scene, spp=SPP)
     integrator.on_pass = None
-    shine(1)
+    paint(0.5)
     integrator.render(scene, spp=SPP)
     integrator.render(scene, spp=SPP)
     assert len(looks) == 2
