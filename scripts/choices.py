@@ -1,15 +1,15 @@
 """What the default's choice of strategies is worth: its time to an error over that of the best fixed choice.
 
     python scripts/choices.py small_casters/point_cube cornell_box
-    python scripts/choices.py --all -o docs/choices.json            # every scene; can be interrupted
-    python scripts/choices.py --all -o docs/choices.json --again    # after a change of the choice
+    python scripts/choices.py --all -o docs/reports/choices.json            # every scene; can be interrupted
+    python scripts/choices.py --all -o docs/reports/choices.json --again    # after a change of the choice
 
 For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
 inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
 ``decisions``); those which one render of a seed of its own shows to be among the best, or which are chosen,
 with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, which neighbours on
 the machine disturb less than seconds; the default's without the pilot, which later renders of a scene
-remember (docs/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
+remember (docs/method/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
 The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
 fixed choices, with the interval that nine in ten resamplings of the seeds (the same for both sides) lie in,
 and the same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its

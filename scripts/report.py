@@ -1,7 +1,7 @@
 """Tables and plots of a sweep.
 
-    python scripts/report.py results/small                             # a page and plots of any sweep
-    python scripts/report.py docs/benchmark --readme README.md         # the project's own
+    python scripts/report.py results/small     # a page and plots of any sweep
+    python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
 
 reads rows.parquet and probes.json in the folder, and writes the plots and README.md with all tables beside
 them. Goals and explanations of what is not as one expects are read from goals.toml and notes.toml, if there
@@ -109,7 +109,7 @@ def gaps_table(results: Results) -> str:
     return table(["scene", *methods], rows)
 
 
-GALLERY = "docs/images/gallery"  # from the README
+GALLERY = "../images/gallery"  # from docs/reports/figures.md
 GALLERY_COLUMNS = 3
 
 

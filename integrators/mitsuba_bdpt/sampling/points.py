@@ -10,7 +10,7 @@ Every draw names its purpose and the vertex it serves, so that the point set can
 * ``sampler``: the scene's own sampler for the first dimensions, see `SAMPLER_TABLE`; more would take
   memory and gain little. A path takes each number from another pixel's sequence of the sampler:
   those of one sequence are correlated (0.92 for ``stratified`` at 4 samples, 0.25 for ``ldsampler``
-  at any number), which would bias the image. Figures: docs/samplers.md.
+  at any number), which would bias the image. Figures: docs/user/samplers.md.
 * ``independent``: hashed numbers throughout.
 
 All else is hashed: a number is a function of seed, sample, vertex and purpose, so that no
@@ -96,9 +96,11 @@ SAMPLER_TABLE = (
 
 @dataclass
 class Stream:
-    """One subpath's numbers: ``digits`` its place in the Sobol' sequence (reversed index), ``seed``
-    the sequence's, ``key`` of the hashed numbers, ``first`` the scene sampler's numbers by (purpose,
-    vertex). ``UInt32``, unchanged along the subpath."""
+    """The random numbers of one subpath; ``UInt32``, unchanged along the subpath.
+
+    ``digits`` is its place in the Sobol' sequence (reversed index), ``seed`` the sequence's, ``key`` that of
+    the hashed numbers, ``first`` the scene sampler's numbers by (purpose, vertex).
+    """
 
     digits: mi.UInt32
     seed: mi.UInt32

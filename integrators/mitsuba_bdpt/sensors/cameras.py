@@ -28,9 +28,12 @@ KINDS = ("PerspectiveCamera", "ThinLensCamera")
 
 @dataclass
 class _View:
-    """One camera, or a table of them: rows of the transforms (``Vector4f``), the affine map from (x/z, y/z)
-    to the unit square and back (four numbers each) and where it maps (0, 0), ``area`` at z = 1 of the
-    region, clip planes, ``radius`` of the lens, distance of the plane in ``focus``."""
+    """One camera, or a table of them.
+
+    Rows of the transforms (``Vector4f``), the affine map from (x/z, y/z) to the unit square and back (four
+    numbers each) and where it maps (0, 0), ``area`` at z = 1 of the region, clip planes, ``radius`` of the
+    lens, distance of the plane in ``focus``.
+    """
 
     to_camera: list
     to_world: list
@@ -161,9 +164,11 @@ class Camera(Sensor):
         )
 
     def _project(self, index, view, outward, lens):
-        """Film position of the direction ``outward`` (world) from the point ``lens`` of the lens (camera
-        coordinates: in the world's, far from the origin, rounding would move it), its depth along the axis,
-        and whether it lies in the region."""
+        """Return the film position of a direction, its depth along the axis, and whether it is in the region.
+
+        ``outward`` is the direction (world) from the point ``lens`` of the lens (camera coordinates: in the
+        world's, far from the origin, rounding would move it).
+        """
         local = _transform(view.to_camera, outward, 0)
         depth = local.z
         x, y = local.x / depth, local.y / depth
@@ -179,8 +184,10 @@ class Camera(Sensor):
         return self.region.to_position(uv), depth, inside
 
     def hit(self, walk, vertex, distant) -> SensorHit:
-        """Where the walk's ray crosses the lens, which is no shape of the scene. What lies between the lens
-        and the near plane does not hide it: camera rays start there too."""
+        """Intersect the walk's ray with the lens, which is no shape of the scene.
+
+        What lies between the lens and the near plane does not hide it: camera rays start there too.
+        """
         view = self._view(mi.UInt32(0))
         centre = _transform(view.to_world, mi.Point3f(0), 1)
         o, d = (_transform(view.to_camera, v, 0) for v in (walk.previous - centre, walk.d))

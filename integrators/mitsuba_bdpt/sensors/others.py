@@ -80,8 +80,10 @@ class Orthographic(_Parallel):
 
 
 class Distant(_Parallel):
-    """A distant sensor without target: its rays cover a disk about the scene. Its film has one pixel, and a
-    position on the film means nothing."""
+    """A distant sensor without target: its rays cover a disk about the scene.
+
+    Its film has one pixel, and a position on the film means nothing.
+    """
 
     needs_aperture_sample = True
     needs_film_sample = True
@@ -115,10 +117,11 @@ class Distant(_Parallel):
 
 
 class IrradianceMeter(Sensor):
-    """An irradiance meter with one pixel: z_0 uniform on its shape (area measure), directions by the cosine
-    with the shading normal, W_e = 1 / area * (cosine with the shading over that with the geometric normal).
+    """An irradiance meter with one pixel.
 
-    The film position chooses z_0, as in Mitsuba.
+    z_0 is uniform on its shape (area measure), directions are distributed by the cosine with the shading
+    normal, W_e = 1 / area * (cosine with the shading normal over that with the geometric normal). The film
+    position chooses z_0, as in Mitsuba.
     """
 
     needs_aperture_sample = True

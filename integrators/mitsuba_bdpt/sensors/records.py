@@ -13,11 +13,14 @@ from ..geometry import rays
 
 @dataclass
 class CameraStart:
-    """Start of a camera subpath: ``ray`` (for cameras on the near plane), ``p`` of z_0, ``pdf_w`` density of
-    the direction given z_0 (solid angle; of a parallel sensor, whose direction is fixed, the density of z_0
-    over the area across it), ``weight`` W_e cos / all densities, ``arrival`` cos / (density of z_0 *
-    ``pdf_w``), what t = 0 begins with (0 without area), ``position`` on the film in pixels, ``counted``
-    where the filter counts it (a box filter: at the pixel's corner, as Mitsuba does)."""
+    """Start of a camera subpath.
+
+    ``ray`` (for cameras on the near plane), ``p`` of z_0, ``pdf_w`` density of the direction given z_0 (solid
+    angle; of a parallel sensor, whose direction is fixed, the density of z_0 over the area across it),
+    ``weight`` W_e cos / all densities, ``arrival`` cos / (density of z_0 * ``pdf_w``), what t = 0 begins with
+    (0 without area), ``position`` on the film in pixels, ``counted`` where the filter counts it (a box
+    filter: at the pixel's corner, as Mitsuba does).
+    """
 
     ray: mi.Ray3f
     p: mi.Point3f
@@ -55,11 +58,13 @@ class CameraJoin:
 
 @dataclass
 class SensorHit:
-    """A light subpath that hits the sensor at z_0: ``dist2`` of its last edge, ``cos`` at z_0,
-    ``pdf_area`` density of z_0 (area measure) and ``pdf_w`` (solid angle) of the way back in camera
-    subpaths, ``importance`` W_e, ``position`` on the film in pixels, ``active``. ``surroundings`` see
-    `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light comes from infinity, None where
-    the subpath's own ray has said so."""
+    """A light subpath that hits the sensor at z_0.
+
+    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_area`` density of z_0 (area measure) and ``pdf_w``
+    (solid angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
+    ``active``. ``surroundings`` see `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light
+    comes from infinity, None where the subpath's own ray has shown it.
+    """
 
     dist2: mi.Float
     cos: mi.Float
