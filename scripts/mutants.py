@@ -76,6 +76,13 @@ MUTANTS = (
         ("tests/test_edits.py::test_edits_are_seen",),
     ),
     Mutant(
+        "edits during a render are not seen",
+        "run/rendering.py",
+        "                    self.findings.expire()\n",
+        "",
+        ("tests/test_edits.py::test_edits_during_a_render_are_seen",),
+    ),
+    Mutant(
         "splats on hidden emitters",
         "transport/techniques.py",
         "        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)\n",

@@ -154,8 +154,10 @@ class Accumulator:
         )
 
     def mean(self):
-        """Mean of the image so far (largest colour, each in its unit), for the scale of roulette: a
-        ``Float64`` of width 1, for which nobody has waited yet."""
+        """Mean of the image so far, the scale of roulette: a ``Float64`` of width 1, not yet evaluated.
+
+        Of the colours, each in its unit, the largest.
+        """
         channels, blocks = self._channels, zip(self._done[0][:2], (self.camera, self.light), strict=True)
         camera, light = (
             [dr.sum(sums[i :: block.channels]) for i in range(channels.colours)] for sums, block in blocks
@@ -213,8 +215,10 @@ class Accumulator:
 
 @dataclass
 class _Pixels:
-    """Sums of an image, shape (height, width, numbers of each kind): those of camera samples, and of
-    ``light``, the splats."""
+    """Sums of an image, shape (height, width, numbers of each kind).
+
+    Those of camera samples, and of ``light``, the splats.
+    """
 
     colours: np.ndarray
     alpha: np.ndarray

@@ -14,8 +14,11 @@ def even(count: int) -> int:
 
 @dataclass(frozen=True)
 class Channels:
-    """Sums of camera samples: ``colours``, ``alpha`` (0 or 1 of it), the filter's weight W, ``features``, so
-    many of each. Splats have the colours alone."""
+    """Order of a pixel's sums of camera samples.
+
+    So many ``colours``, ``alpha`` (0 or 1 of it), the filter's weight W, so many ``features``. Splats have
+    the colours alone.
+    """
 
     colours: int
     alpha: int

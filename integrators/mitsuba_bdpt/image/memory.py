@@ -23,7 +23,7 @@ SINGLE, DOUBLE, ALL = 4, 8, 2 * 8
 
 
 def check_film(film, channels: Channels, variance: bool):
-    """Raise ``ValueError`` if the film is larger than the machine, or than Dr.Jit can count."""
+    """Raise `UsageError` if the film is larger than the machine, or than Dr.Jit can count."""
     width, height = (int(x) for x in film.crop_size())
     numbers = width * height * max(channels.camera, channels.light)
     per_pixel = channels.camera * (SINGLE + ALL) + channels.light * (DOUBLE + ALL)
@@ -38,8 +38,10 @@ def check_film(film, channels: Channels, variance: bool):
 
 
 def check_strategies(film, depth: int):
-    """Raise ``ValueError`` if the strategy images of paths of up to ``depth`` edges take more than
-    `STRATEGY_MEMORY`."""
+    """Raise `UsageError` if strategy images take more than `STRATEGY_MEMORY`.
+
+    They are those of paths of up to ``depth`` edges.
+    """
     width, height = (int(x) for x in film.crop_size())
     # Six channels of each: three weighted, three not.
     needed = strategy_count(depth) * width * height * 6 * (DOUBLE + ALL)

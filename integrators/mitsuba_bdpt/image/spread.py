@@ -29,8 +29,11 @@ class Spread:
         return Spread(1, spp, image, np.zeros_like(image))
 
     def joined(self, other: Spread) -> Spread:
-        """Both: squares about the common mean (T. Chan, G. Golub, R. LeVeque, "Updating formulae and a
-        pairwise algorithm for computing sample variances", 1979, eq. 2.1)."""
+        """Both: squares about the common mean.
+
+        T. Chan, G. Golub, R. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+        variances", 1979, eq. 2.1.
+        """
         if not (self.count and other.count):
             return self if self.count else other
         spp, apart = self.spp + other.spp, other.mean - self.mean

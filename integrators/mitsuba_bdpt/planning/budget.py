@@ -32,9 +32,12 @@ FEW_PIXELS = 64
 
 
 def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
-    """Samples still to come of a render with ``left`` more at most. Under ``timeout`` and ``target_error``
-    nobody knows: as many as are ``done``, or `PROVISIONAL_SAMPLES`. (A pilot that takes half of the render
-    would be as bad as one that sees rare paths which the render does not meet.)"""
+    """Samples still to come of a render with ``left`` more at most.
+
+    Under ``timeout`` and ``target_error`` nobody knows: as many as are ``done``, or `PROVISIONAL_SAMPLES`. (A
+    pilot that takes half of the render would be as bad as one that sees rare paths which the render does not
+    meet.)
+    """
     open_end = settings.target_error > 0 or 0 <= settings.timeout < math.inf
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
@@ -50,8 +53,10 @@ def lanes(samples: int) -> int:
 
 
 def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
-    """What a render begins with: ``full``, with a light subpath for each camera subpath on films of few
-    pixels, unless parameters say how many."""
+    """What a render begins with: ``full``, unless its film has few pixels.
+
+    Then there is a light subpath for each camera subpath, unless parameters say how many.
+    """
     return (
         replace(full, camera_paths_per_light_path=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
     )

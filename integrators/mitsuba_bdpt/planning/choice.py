@@ -62,8 +62,11 @@ class Alternatives:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A candidate with the ``cost`` of a sample (path tracing alone: 1) and its ``variance`` as relMSE,
-    before what points take off that of all candidates."""
+    """The predicted efficiency of a candidate.
+
+    ``cost`` of a sample (path tracing alone: 1); its ``variance`` as relMSE, before what points take off that
+    of all candidates.
+    """
 
     candidate: Configuration
     cost: float
@@ -115,8 +118,10 @@ def _predicted(moments: Moments, alternatives: Alternatives) -> list[Prediction]
 
 
 def _without_doubtful(table: list[Prediction], uniform: bool) -> list[Prediction]:
-    """Without the coefficients of s = 1 that gain too little over the usual one, see `DIRECT_GAIN`, under a
-    nearly ``uniform`` sky or another one."""
+    """Without the coefficients of s = 1 that gain too little over the usual one, see `DIRECT_GAIN`.
+
+    ``uniform``: whether the sky is nearly uniform.
+    """
     usual, gain = (SKY_DIRECT, UNIFORM_GAIN) if uniform else (1, DIRECT_GAIN)
 
     def is_usual(candidate):
@@ -133,8 +138,11 @@ def _put_first(table: list, row):
 
 
 def certainty(moments: Moments, alternatives: Alternatives) -> float:
-    """In what share of `RESAMPLINGS` of the pilot's independent groups the candidate that `choose` puts first
-    is within `LIGHT_GAIN` of the best."""
+    """How sure the choice is: a share of bootstrap samples of the pilot.
+
+    In what share of `RESAMPLINGS` of its independent groups the candidate that `choose` puts first is within
+    `LIGHT_GAIN` of the best.
+    """
     best = choose(moments, alternatives)[0].candidate
     random = np.random.default_rng(len(alternatives.candidates))
     agree = 0
@@ -146,18 +154,22 @@ def certainty(moments: Moments, alternatives: Alternatives) -> float:
 
 
 def _trimmed_mean(draw):
-    """What the draw of a connection adds: the mean of the groups but for the largest quarter. Few samples
-    show its outliers (the unshadowed 1 / dist^2), but not yet those of all else, beside which they are small:
-    in `ajar_door`, 60 % of the variance in 2^11 samples, 10 % in 2^17."""
+    """What the draw of a connection adds: the mean of the groups but for the largest quarter.
+
+    Few samples show its outliers (the unshadowed 1 / dist^2), but not yet those of all else, beside which
+    they are small: in `ajar_door`, 60 % of the variance in 2^11 samples, 10 % in 2^17.
+    """
     calm = np.sort(draw, axis=0)[: len(draw) * 3 // 4].mean(axis=0)
     return np.broadcast_to(calm, draw.shape)
 
 
 def _robust_mean(values):
-    """Mean over the groups (rows), of which the worst quarter counts as much as the next one: each is scaled
-    down until the candidate (column) that suffers least there does so. An outlier that no candidate does
-    anything about would hide how they differ; what only some suffer from, such as path tracing from a
-    caustic, has to count."""
+    """Mean over the groups (rows), of which the worst quarter counts as much as the next one.
+
+    Each is scaled down until the candidate (column) that suffers least there does so. An outlier that no
+    candidate does anything about would hide how they differ; what only some suffer from, such as path tracing
+    from a caustic, has to count.
+    """
     finite = np.isfinite(values).all(axis=0)
     if not finite.any():
         return values.mean(axis=0)

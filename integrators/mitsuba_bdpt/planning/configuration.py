@@ -40,8 +40,11 @@ WEIGHTINGS = (
 
 @dataclass(frozen=True)
 class Configuration:
-    """A way to render: the parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``),
-    the coefficients kappa of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``)."""
+    """A way to render.
+
+    The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
+    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``).
+    """
 
     light_paths: float
     connections: str

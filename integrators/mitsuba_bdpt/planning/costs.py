@@ -30,8 +30,10 @@ FEW_BSDFS, MANY_BSDFS = 4, 16
 
 
 def cost(candidate: Configuration, rays: dict, samples: float = math.inf) -> float:
-    """Cost of a sample in a render of so many ``samples``, what is `FIXED` included; path tracing alone is 1.
-    ``rays`` per sample of the pilot, see `moments.Moments`."""
+    """Cost of a sample in a render of so many ``samples``; that of path tracing alone is 1.
+
+    What is `FIXED` is included. ``rays`` per sample of the pilot, see `moments.Moments`.
+    """
     total = camera = rays["camera"] + rays["shadow_s1"] + FIXED["start"] / samples
     if candidate.light_paths:
         total += FIXED["light"] / samples

@@ -35,8 +35,10 @@ class Decision(Configuration):
 
     @classmethod
     def of(cls, chosen: Configuration, first_pass: int, **predicted: float) -> Decision:
-        """The decision for a configuration of which ``cost``, ``variance`` and ``mean`` are predicted. They
-        have six digits: further ones depend on the order in which a pilot's lanes were added up."""
+        """The decision for a configuration of which ``cost``, ``variance`` and ``mean`` are predicted.
+
+        They have six digits: further ones depend on the order in which a pilot's lanes were added up.
+        """
         predicted = {name: float(f"{number:.6g}") for name, number in predicted.items()}
         return cls(**asdict(chosen), first_pass=first_pass, **predicted)
 
@@ -59,8 +61,11 @@ class Decision(Configuration):
 
 
 def read_decisions(text: str) -> tuple[Decision, ...]:
-    """The parameter ``decisions``: JSON as in ``statistics``, an empty list for a render without a pilot;
-    raises ``ValueError`` saying what is wrong, and in which entry."""
+    """The parameter ``decisions``: JSON as in ``statistics``.
+
+    An empty list means a render without a pilot. Raises `UsageError` saying what is wrong, and in which
+    entry.
+    """
     where, made = "", []
     try:
         entries = json.loads(text)

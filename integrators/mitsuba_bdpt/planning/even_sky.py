@@ -24,9 +24,11 @@ SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_GAIN = 1 / 2, 2, 1 << 20, 1.1
 
 
 def decision(prepared, full: Plan, settings: Settings, samples: int) -> Decision | None:
-    """The decision for a render of so many ``samples`` for which the scene alone suffices, because a pilot
-    would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky
-    wherever its light enters, caustics included, and light subpaths hardly find the way in.)"""
+    """The decision for a render of so many ``samples`` for which the scene alone suffices.
+
+    A pilot would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky
+    wherever its light enters, caustics included, and light subpaths hardly find the way in.)
+    """
     contrast = prepared.emitters.contrast
     most = UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES
     if samples >= most or not contrast <= EVEN:  # also if it is no number

@@ -64,9 +64,12 @@ class Moments:
     lanes: int
 
     def variance(self, draw, stratified: bool = False) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, ``draw``
-        (`Moments.draw`, or 0 for all connections) included, and what grows with it, that of splats; with
-        independent numbers, or with what ``stratified`` points leave of it."""
+        """Relative variance per sample, shape (`GROUPS`, 2, weightings).
+
+        First what does not depend on S, ``draw`` (`Moments.draw`, or 0 for all connections) included, then
+        what grows with it, that of splats; with independent numbers, or with what ``stratified`` points leave
+        of it.
+        """
         base = self.base
         if stratified:
             # Not of splats, which land in pixels by chance: 0.2 to 1.3 is left of these in 22 scenes. (Mean
@@ -77,10 +80,12 @@ class Moments:
         return np.stack([base + draw, self.light], axis=1)
 
     def _left_by_points(self):
-        """What the points of a pixel leave of the variance, by weighting: of what nets of `NET` leave, see
-        `OWN_GAIN`, what 64 leave. (Fitted to pilots with nets of 64 points in 32 scenes: where 8 leave 0.65
-        these leave 0.65 of it again, at 0.3 half, at 0.05 a third, at 0.01 a fifth, within a factor of 1.6 in
-        all but four.)"""
+        """What the points of a pixel leave of the variance, by weighting.
+
+        Of what nets of `NET` leave, see `OWN_GAIN`, what 64 leave. (Fitted to pilots with nets of 64 points
+        in 32 scenes: where 8 leave 0.65 these leave 0.65 of it again, at 0.3 half, at 0.05 a third, at 0.01 a
+        fifth, within a factor of 1.6 in all but four.)
+        """
         possible = np.isfinite(self.base).all(axis=0)
         common = self.gain[possible].mean() if possible.any() else 1.0
         gain = self.gain**OWN_GAIN * common ** (1 - OWN_GAIN)
@@ -104,10 +109,12 @@ class Moments:
 
 @dataclass(frozen=True)
 class Samples:
-    """Camera samples, one row each: the ``estimate`` of each weighting, sums of second moments (``moment``
-    without t <= 1, less the squares that are in the estimate, ``light`` by t <= 1), what drawing one
-    connection adds (``draw``), the fine ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in
-    nets each `NETS` times `NET`."""
+    """Camera samples of a pilot, one row each.
+
+    The ``estimate`` of each weighting, sums of second moments (``moment`` without t <= 1, less the squares
+    that are in the estimate, ``light`` by t <= 1), what drawing one connection adds (``draw``), the fine
+    ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in nets each `NETS` times `NET`.
+    """
 
     estimate: np.ndarray
     moment: np.ndarray
@@ -124,22 +131,28 @@ class Samples:
 
 @dataclass(frozen=True)
 class Splats:
-    """Sums of the splats of so many ``lanes`` light subpaths, by the group of the subpath and fine tile,
-    shape (`GROUPS`, fine tiles, `rows.SPLAT`)."""
+    """Sums of the splats of so many ``lanes`` light subpaths.
+
+    By the group of the subpath and fine tile: shape (`GROUPS`, fine tiles, `rows.SPLAT`).
+    """
 
     sums: np.ndarray
     lanes: int
 
 
 def group(lane):
-    """The independent part to which a sample, or the light subpath of a lane, belongs. The `PER_PIXEL`
-    samples of a pixel, whose products are taken, are in the same."""
+    """The independent part to which a sample, or the light subpath of a lane, belongs.
+
+    The `PER_PIXEL` samples of a pixel, whose products are taken, are in the same.
+    """
     return lane // PER_PIXEL % GROUPS
 
 
 def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) -> Moments:
-    """The moments of a pilot of independent ``samples``, and ``nets``, with ``splats`` as if of one light
-    subpath per camera sample; ``rays`` per camera sample."""
+    """The moments of a pilot of independent ``samples``, and ``nets``.
+
+    ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample.
+    """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
     sizes = SPLAT.of(splats.sums, "size").sum(axis=2) / splats.lanes
@@ -186,8 +199,9 @@ def _by_group(values):
 
 
 def _norms(samples: Samples, half, splats):
-    """What squared errors are divided by, of each fine tile: the squared brightness, and a hundredth of that
-    of the image, as relMSE has it.
+    """What squared errors are divided by, of each fine tile.
+
+    The squared brightness, and a hundredth of that of the image, as relMSE has it.
 
     Shape (2, tiles): for each half of the samples, told by ``half`` (0 or 1 each), fine tiles have the
     brightness that the other half has found: an outlier would hide itself. ``splats`` of the halves, shape

@@ -71,9 +71,11 @@ _OF_LIGHT = ("light", "shadow_t1")
 
 
 class Pilot:
-    """Sink (see `sink`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
-    follow one another each `PER_PIXEL` are of the same pixel, in nets each `batch.NETS` times
-    `batch.NET`."""
+    """Sink (see `sink`) of a pilot's contributions.
+
+    Those of a ``batch``, in which of camera samples that follow one another each `PER_PIXEL` are of the same
+    pixel, in nets each `batch.NETS` times `batch.NET`.
+    """
 
     alpha = False
 
@@ -149,8 +151,11 @@ class Pilot:
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
     def _parts(self, size, c):
-        """A contribution ``c`` of this weighted ``size``: its estimates, of the weightings that have its
-        class, and a dictionary of what it adds to ``moment`` and ``light``, see `rows.SAMPLE`."""
+        """What a contribution ``c`` of this weighted ``size`` adds.
+
+        Its estimates, of the weightings that have its class, and a dictionary of what it adds to ``moment``
+        and ``light``, see `rows.SAMPLE`.
+        """
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
         own, squares, lights = [], [], []
@@ -174,9 +179,11 @@ class Pilot:
         return own, {"moment": squares, "light": lights}
 
     def _rare(self, size, c, squares) -> list:
-        """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that
-        camera subpaths make too rarely for points to help, see `SELDOM`. (Not light that comes from a lamp
-        without a detour: every camera sample finds it with s = 1, if that can find it at all.)"""
+        """Of the ``squares`` of a contribution of light tracing, those that points do not help.
+
+        They are of paths that camera subpaths make too rarely, see `SELDOM`. (Not light that comes from a
+        lamp without a detour: every camera sample finds it with s = 1, if that can find it at all.)
+        """
         shares = _shares(size, c) | {"light": 0}
         often = (c.s == 2) & (shares["direct"] > 0)
         return [
@@ -185,8 +192,10 @@ class Pilot:
         ]
 
     def _size(self, c):
-        """Weighted size of a contribution that counts, in double precision: its square, in any unit of
-        radiance, is too large or too small for single (at 1e12 outliers are, at 1e20 all).
+        """Weighted size of a contribution that counts, in double precision.
+
+        Its square, in any unit of radiance, is too large or too small for single (at 1e12 outliers are, at
+        1e20 all).
 
         Emitters seen directly do not count: relative to what is around them their edges would outweigh all
         else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
@@ -201,8 +210,10 @@ class Pilot:
 
 
 def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
-    """Run a pilot of about ``lanes`` camera samples, spread over the image, each of which ``stands_for`` so
-    many of the render."""
+    """Run a pilot of about ``lanes`` camera samples, spread over the image.
+
+    Each of them ``stands_for`` so many of the render.
+    """
     everything = replace(
         plan,
         connections="none" if plan.connections == "none" else "all",
@@ -233,8 +244,10 @@ def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RARE
 
 
 def _add(target, layout: Layout, found: dict, row, active):
-    """Add what was ``found`` to a row of ``target``, as a packet. (`dr.scatter` would evaluate what was
-    recorded so far.)"""
+    """Add what was ``found`` to a row of ``target``, as a packet.
+
+    (`dr.scatter` would evaluate what was recorded so far.)
+    """
     values = layout.row(found)
     packet = mi.ArrayXd(values + [mi.Float64(0)] * (layout.width - len(values)))
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
@@ -256,8 +269,10 @@ def _none(n: int) -> list:
 
 
 def _sums(total: list, more: list) -> list:
-    """``total`` with ``more``, which has an entry for the last weightings only, added to these. What gets
-    nothing is left as it is: loops do not hold it, see `walk.Walk`."""
+    """``total`` with ``more``, which has an entry for the last weightings only, added to these.
+
+    What gets nothing is left as it is: loops do not hold it, see `walk.Walk`.
+    """
     first = len(total) - len(more)
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 

@@ -30,8 +30,11 @@ SAW_NOTHING = "it saw nothing, or no finite value"
 
 
 class Pilots(NamedTuple):
-    """How many pilots were ``asked``, of how many of these the findings were ``remembered``; ``repeat``:
-    samples per pixel after which the next one is due."""
+    """How many pilots were ``asked``, and when the next one is due.
+
+    Of so many of them the findings were ``remembered``; ``repeat``: samples per pixel after which the next
+    one is due.
+    """
 
     asked: int = 0
     remembered: int = 0
@@ -70,8 +73,10 @@ class Planner:
         self.threshold, self.changes, self.decided = None, 0, Decided()
 
     def begin(self, passes: tuple) -> bool:
-        """Adopt what the scene alone decides, before the first pass; returns whether a pilot is to be asked
-        about what is still to come."""
+        """Adopt what the scene alone decides, before the first pass.
+
+        Returns whether a pilot is to be asked about what is still to come.
+        """
         settled, decision = self._settled(passes)
         if not passes and self._settings.decisions is None:
             self.decided = replace(self.decided, no_pilot=settled)
@@ -105,9 +110,11 @@ class Planner:
         return table
 
     def _measured(self, count: int, samples: int) -> Moments:
-        """What a pilot of ``count`` samples finds (see `pilot.measure`), joined with those before. Where the
-        same one was traced in an earlier render, and nothing was edited since, that is remembered: it would
-        find the same."""
+        """What a pilot of ``count`` samples finds (see `pilot.measure`), joined with those before.
+
+        Where the same one was traced in an earlier render, and nothing was edited since, that is remembered:
+        it would find the same.
+        """
         pilots, before = self.decided.pilots, self.decided.moments
         pilots = pilots._replace(asked=pilots.asked + 1)
         self.decided = replace(self.decided, pilots=pilots)
@@ -137,8 +144,11 @@ class Planner:
         return unreachable_paths(self._prepared, p, self._settings)
 
     def adopt(self, decision: Decision, left_out):
-        """Plan as decided from now on; if that differs from before, with points of their own: lanes serve
-        other samples, and what was half done of the old sequence would not be finished."""
+        """Plan as decided from now on.
+
+        If that differs from before, with points of their own: lanes serve other samples, and what was half
+        done of the old sequence would not be finished.
+        """
         adopted = replace(decision.plan(self.full), skipped=(*self.full.skipped, *left_out))
         begun = self.decided.decisions or decision.first_pass
         if begun and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
@@ -167,8 +177,10 @@ class Planner:
         return f"no pilot: {self._settled(passes)[0] or SAW_NOTHING}"
 
     def _settled(self, passes: tuple) -> tuple[str, Decision | None]:
-        """Why no pilot is asked about the rest of the render, empty if one is; and the decision, if there is
-        one."""
+        """Why no pilot is asked about the rest of the render, and what is decided without one.
+
+        The reason is empty if one is asked; the decision is ``None`` if there is none.
+        """
         if not budget.is_open(self.full, self._settings):
             by_hand = budget.is_by_hand(self._settings)
             why = "chosen by hand" if by_hand else "light subpaths cannot add anything"

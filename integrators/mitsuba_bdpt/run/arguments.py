@@ -22,6 +22,7 @@ def check_made_for(integrator, scene):
 
 
 def check_resumable(start, settings):
+    """Raise `UsageError` or `UsageTypeError` if a render cannot go on from ``start``."""
     if not isinstance(start, Snapshot):
         raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
     if not start.progress.whole:
@@ -34,6 +35,10 @@ def check_resumable(start, settings):
 
 
 def resolve_sensor(scene, sensor):
+    """The sensor that the argument ``sensor`` means, an index or the sensor itself.
+
+    Raises `UsageError` and `UsageTypeError`.
+    """
     if isinstance(sensor, mi.Sensor):
         return sensor
     if not is_index(sensor):
@@ -65,8 +70,10 @@ def samples_per_pixel(sensor, spp, settings) -> int:
 
 
 def _whole_sets(sampler, spp: int, parts: int) -> int:
-    """``spp``, rounded up so that each of ``parts`` (see `schedule.schedule`) is a number of samples that the
-    sampler makes: stratified ones do not make any."""
+    """``spp``, rounded up to what the sampler makes: stratified samplers do not make any number.
+
+    Each of ``parts`` (see `schedule.schedule`) is such a number.
+    """
 
     def made(count):
         sampler.set_sample_count(count)

@@ -64,8 +64,7 @@ def _some(found: list[str]) -> str:
 
 
 def warn_of_late_decisions(decisions, passes: int):
-    """Say which of the ``decisions`` that were given are for a pass that the render of so many did not
-    have."""
+    """Warn of ``decisions`` for passes that the render of so many did not have."""
     late = [decision.first_pass for decision in decisions or () if decision.first_pass >= passes]
     if late:
         mi.Log(
@@ -76,8 +75,10 @@ def warn_of_late_decisions(decisions, passes: int):
 
 
 def warn_of_non_finite(statistics: dict, scene):
-    """Say how many values were not finite, and in what parameters of the scene to look for the cause; of each
-    render, since it is about its image."""
+    """Warn of values that were not finite, and name the parameters in which to look for the cause.
+
+    Of each render, since it is about its image.
+    """
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return

@@ -13,16 +13,20 @@ from .schedule import Step
 
 
 class PassPoints:
-    """Gives each pass of one render its points: sequences of the render's ``seed`` (``UInt32``), or the
-    numbers of the scene's sampler."""
+    """Gives each pass of one render its random numbers.
+
+    They are sequences of the render's ``seed`` (``UInt32``), or the numbers of the scene's sampler.
+    """
 
     def __init__(self, settings: Settings, sensor, seed):
         self._kind, self._sensor, self.seed = settings.points, sensor, seed
         self._samplers = {}
 
     def of(self, step: Step, batch: Batch, changes: int) -> Points:
-        """The points of a batch of the pass ``step``, after so many ``changes`` of the plan, see
-        `Planner.adopt`."""
+        """The points of a batch of the pass ``step``.
+
+        ``changes``: how often the plan changed before, see `Planner.adopt`.
+        """
         seed = self.seed
         number = step.replicate + (CHANGED + changes if changes else 0)
         if number:

@@ -94,8 +94,11 @@ class Render:
         return self.planner.plan
 
     def run(self, on_pass, cancelled=lambda: False):
-        """Trace the samples, fewer under ``timeout``, when ``cancelled()`` after a pass or when
-        interrupted."""
+        """Trace the samples.
+
+        Fewer under ``timeout``, when ``cancelled()`` after a pass, or when interrupted. ``on_pass``, or
+        ``None``, gets a `PassReport` after each pass.
+        """
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         with self._finished():
@@ -133,8 +136,11 @@ class Render:
                 self.accumulator.finish()
 
     def decide(self) -> list[Prediction]:
-        """Adopt what the scene alone or a pilot says, if there is a choice and the render is long enough to
-        pay for a pilot; returns all predictions of the pilot, the best first."""
+        """Adopt what the scene alone or a pilot decides about the rest of the render.
+
+        Only if there is a choice and the render is long enough to pay for a pilot. Returns all predictions of
+        the pilot, the best first.
+        """
         table = []
         if self.planner.begin(self.passes):
             with self.meter.pilot():
@@ -224,15 +230,19 @@ class Render:
         )
 
     def _freeze(self) -> tuple:
-        """Passes, progress and arrays of a snapshot of now, also when the next pass has begun: an
-        interruption may come between any two of its steps. Nothing is copied yet."""
+        """Passes, progress and arrays of a snapshot of now, also when the next pass has begun.
+
+        An interruption may come between any two of its steps. Nothing is copied yet.
+        """
         passes, arrays = self.accumulator.store()
         progress = Progress(self.planner.decided, self.meter.work, self.accumulator.halves, self._small_first)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
-        """The snapshot of the report after so many passes; raises ``ValueError`` if a later one was made
-        (each would keep the sums of its time)."""
+        """The snapshot of the report after so many passes.
+
+        Raises `UsageError` if a later report was made: each would keep the sums of its time.
+        """
         passes, progress, arrays = self._state
         if len(passes) != reported:
             raise UsageError(
@@ -247,8 +257,10 @@ class Render:
         return identity(self.settings, self.accumulator, int(self.points.seed[0]), self.spp)
 
     def resume(self, snapshot: Snapshot, apart_from=()):
-        """Go on after the passes of a snapshot, which raises ``ValueError`` if it is of another render (see
-        `Snapshot.check`)."""
+        """Go on after the passes of a snapshot.
+
+        Raises `UsageError` if it is of another render, see `Snapshot.check`.
+        """
         snapshot.check(self._identity(), apart_from)
         progress, arrays = snapshot.progress, snapshot.arrays
         self.planner.restore(progress.decided)
@@ -259,8 +271,10 @@ class Render:
         self._small_first = progress.small_first
 
     def lost_light(self) -> tuple[dict, str]:
-        """Shares of the image's light that no strategy in use finds, by the index of the emitter, and in
-        words, which are empty where it is little. Looked for once for a scene and choice, until an edit."""
+        """Shares of the image's light that no strategy in use finds, by the index of the emitter.
+
+        Also in words, which are empty where it is little. Estimated once for a scene and plan, until an edit.
+        """
         prepared, plan, max_depth = self.prepared, self.plan, self.settings.max_depth
         if not self.passes or not lost_light.is_possible(prepared, plan, self.settings):
             return {}, ""
@@ -272,8 +286,10 @@ class Render:
 
 
 def raise_interrupt(error: BaseException):
-    """Raise the ``KeyboardInterrupt`` that is behind ``error``, if one is: Dr.Jit makes a ``RuntimeError`` of
-    all that comes while it records a loop or a call."""
+    """Raise the ``KeyboardInterrupt`` that is behind ``error``, if one is.
+
+    Dr.Jit makes a ``RuntimeError`` of all that comes while it records a loop or a call.
+    """
     cause = error
     while cause is not None:
         if isinstance(cause, KeyboardInterrupt):

@@ -22,8 +22,10 @@ FORMAT = 5
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:
-    """What two renders have to have in common for one to go on from the other, besides the scene; as JSON
-    holds it."""
+    """What two renders have to have in common for one to go on from the other, as JSON holds it.
+
+    The scene is not in it.
+    """
     film, values = accumulator.film, asdict(settings)
     del values["timeout"]
     values["target_error"] = bool(settings.target_error)  # the passes depend on whether there is one
@@ -72,8 +74,10 @@ class Snapshot:
                 )
 
     def joined(self, other: Snapshot) -> Snapshot:
-        """Both as one render: sums and counts are added. Raises ``ValueError`` if they differ in more than
-        seed and samples per pixel, or have a seed in common."""
+        """Both as one render: sums and counts are added.
+
+        Raises `UsageError` if they differ in more than seed and samples per pixel, or have a seed in common.
+        """
         self.check(other.identity, ("seed", "spp"))
         seeds, others = _seeds(self), _seeds(other)
         if common := set(seeds) & set(others):

@@ -61,8 +61,10 @@ class Meter:
         return time.perf_counter() - self._started
 
     def rate(self, spp: int) -> float:
-        """Samples per pixel and second of this part of the render, at ``spp`` in all; compiling and pilots
-        do not count."""
+        """Samples per pixel and second of this part of the render, at ``spp`` in all.
+
+        Compiling and pilots do not count.
+        """
         busy = self.elapsed() - (self._noted.idle_seconds - self._earlier.idle_seconds)
         return (spp - self._earlier_spp) / max(busy, 1e-3)
 
@@ -83,8 +85,10 @@ class Meter:
                 self._note_kernel(entry)
 
     def _note_kernel(self, entry: dict):
-        """Note an entry of Dr.Jit's history. What is in the cache is still assembled, which is not
-        compiling."""
+        """Note an entry of Dr.Jit's history.
+
+        What is in the cache is still assembled, which is not compiling.
+        """
         work = self._noted
         if entry["cache_hit"]:
             self._noted = replace(work, cached=work.cached + 1)
@@ -96,7 +100,10 @@ class Meter:
 
     @contextmanager
     def pilot(self):
-        """Inside of it a pilot is asked; passes before it are waited for, whose time is not the pilot's."""
+        """Measures what is done inside of it as a pilot.
+
+        Passes before it are waited for: their time is not the pilot's.
+        """
         self.wait()
         started, compiled = time.perf_counter(), self._noted.compile_seconds
         yield
