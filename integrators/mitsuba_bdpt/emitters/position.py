@@ -30,13 +30,6 @@ class _Cone:
     cos_cutoff: object = -1.0
     pdf_w: object = 1.0
 
-    @staticmethod
-    def of(emitter) -> _Cone:
-        """That of a point light, spot or projector."""
-        return {"PointLight": _of_point, "SpotLight": _of_spot, "Projector": _of_projector}[
-            emitter.class_name()
-        ](emitter)
-
 
 class PositionEmitters(Group):
     """Emitters at a point: their intensity is asked of Mitsuba, their density of directions is known here.
@@ -45,7 +38,7 @@ class PositionEmitters(Group):
     """
 
     def __init__(self, emitters, context: Context):
-        self._cones = table(rows(emitters, _Cone(), _Cone.of))
+        self._cones = table(rows(emitters, _Cone(), lambda emitter: _CONES[emitter.class_name()](emitter)))
         projects = rows(emitters, None, lambda emitter: emitter.class_name() == "Projector")
         self._is_projector = Mask(projects)
         self._projectors = Projectors.of(emitters, projects)
@@ -138,3 +131,6 @@ def _of_projector(emitter) -> _Cone:
 
 def _origin(to_world):
     return dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
+
+
+_CONES = {"PointLight": _of_point, "SpotLight": _of_spot, "Projector": _of_projector}

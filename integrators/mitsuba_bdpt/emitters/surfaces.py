@@ -29,12 +29,13 @@ class _Turned:
 
 
 class Surfaces:
-    """The shapes of a group's ``emitters`` (None where one is of another group).
+    """The shapes of a group of emitters.
 
-    ``inv_area`` of each by its emitter's index, ``smooth``: whether some have interpolated normals.
-    ``spheres`` that they are (`Sphere` or None); ``by_shape``: emitters that Mitsuba samples by their
-    texture, but are sampled here by their shape. Raises ``UsageError`` and ``UnsupportedError`` for shapes
-    that Mitsuba samples wrongly or not at all.
+    Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
+    are (`Sphere` or None), and ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
+    their shape here. ``inv_area`` of each shape, by its emitter's index; ``smooth``: whether one has
+    interpolated normals. Raises ``UsageError`` and ``UnsupportedError`` for shapes that Mitsuba samples
+    wrongly or not at all.
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
