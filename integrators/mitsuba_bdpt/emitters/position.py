@@ -14,7 +14,7 @@ from ..host.introspection import named, own_parameters
 from .group import Context, Group, emitting_point, free_emission, weight_over
 from .projectors import Projectors
 from .records import Chosen, Direct, Emission
-from .tables import Mask, at, rows, table
+from .tables import Mask, look_up, rows, table
 
 
 @dataclass
@@ -54,7 +54,7 @@ class PositionEmitters(Group):
     # -- emission ---------------------------------------------------------------------------
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
-        cone = at(self._cones, chosen.index, active)
+        cone = look_up(self._cones, chosen.index, active)
         local = mi.warp.square_to_uniform_cone(u_direction, cone.cos_cutoff)
         d, pdf_w = cone.x * local.x + cone.y * local.y + cone.z * local.z, cone.pdf_w
         if self._projectors is not None:

@@ -14,7 +14,7 @@ from ..geometry.smooth_meshes import SmoothMeshes
 from ..geometry.to_world import check_to_world
 from ..host.introspection import all_shapes, named
 from .group import Context
-from .tables import Mask, at, rows, table
+from .tables import Mask, look_up, rows, table
 
 CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 
@@ -82,7 +82,7 @@ class Surfaces:
     def upright(self, ps, index, active):
         """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
         if self._turned is not None:
-            sphere = at(self._turned, index, active)
+            sphere = look_up(self._turned, index, active)
             n = sphere_normal(ps.p, sphere.center, sphere.outward)
             ps.n = dr.select(sphere.outward != 0, n, ps.n)
         return ps
