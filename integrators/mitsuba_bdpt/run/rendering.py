@@ -25,6 +25,7 @@ from ..image.layers import strategy_count
 from ..image.sink import Image
 from ..parameters import check_film, check_not_frozen, check_scene, check_variant, integer
 from ..planning import choice, lost_light, pilot
+from ..planning.explain import words
 from ..planning.moments import ARRAYS, Moments
 from ..planning.possible import plan, unreachable_paths
 from ..sampling import points
@@ -229,8 +230,10 @@ class Render:
         for decision in self.settings.decisions:
             if decision.first_pass == number:
                 self._adopt(decision, choice.replayed(decision))
-                for text in sorted({*self._lost(self.plan)} - {*self._lost(self._full)}):
-                    mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {text}")
+                before = self._lost(self._full)
+                for lost in self._lost(self.plan):
+                    if lost not in before:
+                        mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {words(lost)}")
 
     def _lost(self, p):
         return unreachable_paths(self.prepared, p, self.settings)
