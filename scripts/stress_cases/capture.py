@@ -22,6 +22,7 @@ import mitsuba as mi  # isort: skip
 
 from endpoints import Camera, disks_of, dot, lamps_of, length2
 from mitsuba_bdpt.transport import connections
+from mitsuba_bdpt.transport.light_path import StoredVertex
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
@@ -225,7 +226,7 @@ class Capture:
 
     def _inner(self, s, t):
         y, z = self.walked["light"].vertices[s - 2], self.walked["camera"].vertices[t - 2]
-        c = connections.inner(self.kernel, z, y)
+        c = connections.inner(self.kernel, z, StoredVertex.of(y))
         c.active &= y.hit & bsdf.connectible(y.bsdf) & bsdf.connectible(z.bsdf)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         c.active &= ~rays.occluded(self.scene, ray, c.active)

@@ -9,14 +9,15 @@ from ..geometry import rays, rounding
 from ..sampling.points import Purpose
 from . import bsdf, mis
 from .contribution import Contribution, _counts, _one, _roulette, _size, count, finite
-from .light_path import LightPath, read_light_vertex
+from .light_path import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
 
 
-def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
+def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
     """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41).
 
-    ``active`` where the contribution is not zero.
+    ``active`` where the contribution is not zero. The throughputs of ``z`` and ``y`` contain the edges to
+    them; that of ``y`` is over its cosine of incidence, so that of its adjoint factor |n.d| alone is missing.
     """
     h = kernel.heuristic
     k = z.edges + y.edges + 1
@@ -29,8 +30,8 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
     cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
     f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active, kernel.traits)
-    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y / y.cos)
-    value = (z.throughput * f_z.value) * (f_y.value * y.throughput) * inverse
+    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y)
+    value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~bsdf.is_zero(value)
 
     light_side = mis.alternatives(
@@ -134,7 +135,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     return dr.select(active, value / survival, 0)
 
 
-def _sight(kernel, z: Vertex, y: Vertex):
+def _sight(kernel, z: Vertex, y: StoredVertex):
     """`rays.sight` from ``z`` to the light vertex ``y``."""
     return rays.sight(kernel.shape_errors, z.anchor, y.anchor, rounding.met(y.si.shape, y.si.instance), z.si)
 
