@@ -239,8 +239,8 @@ MUTANTS = (
     Mutant(
         "connections: roulette is not divided by",
         "transport/techniques.py",
-        "    c.value, c.active = value / survival, active",
-        "    c.value, c.active = value, active",
+        "replace(c, value=value / survival, active=active, counted=counted)",
+        "replace(c, value=value, active=active, counted=counted)",
         ("tests/test_known_answers.py::test_partial_sums_with_drawn_connections_and_roulette[default-3]",),
     ),
     Mutant(

@@ -24,6 +24,7 @@ from mitsuba_bdpt.run import rendering  # isort: skip
 from mitsuba_bdpt.image import sink  # isort: skip
 from mitsuba_bdpt.geometry import rays  # isort: skip
 from mitsuba_bdpt.transport import connections  # isort: skip
+from mitsuba_bdpt.transport.counters import Counters  # isort: skip
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -71,15 +72,15 @@ class Collector(sink.Image):
         # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
         self.kept = []
 
-    def splat(self, kernel, c, position, shared, counters):
+    def splat(self, kernel, c, shared):
         """Add a contribution with t <= 1."""
-        super().splat(kernel, c, position, shared, counters)
-        self._keep(position, c.weighted() * shared.weight, shared, (c.s, c.t), c.active)
+        self._keep(c.position, c.weighted() * shared.weight, shared, (c.s, c.t), c.active)
+        return super().splat(kernel, c, shared)
 
-    def end(self, kernel, lane, sample, total, seen, counters):
+    def end(self, kernel, lane, sample, total, seen):
         """Add a camera sample."""
-        super().end(kernel, lane, sample, total, seen, counters)
         self._keep(sample.start.counted, total * lane.shared.weight, lane.shared, (0, 0), sample.covered)
+        return super().end(kernel, lane, sample, total, seen)
 
     def _keep(self, position, value, shared, strategy, active):
         colours = mi.Color3f(*self._film.colour(value, shared.wavelengths))
@@ -308,11 +309,12 @@ class Recorder:
         self._note(c, c.weighted())
         return total + c.weighted()
 
-    def splat(self, traced, c, position, shared, counters):
+    def splat(self, traced, c, shared):
         """Add a contribution with t <= 1."""
         self._note(c, c.weighted())
+        return Counters()
 
-    def connect(self, traced, z, lane, stream, counters, total, start):
+    def connect(self, traced, z, lane, stream, total, start):
         """Join the camera vertex ``z`` with the light vertices of its lane."""
         found = []
 
@@ -321,16 +323,16 @@ class Recorder:
             found.append(c)
             return total
 
-        connections.connect_all(traced, z, lane.path, dict(counters), total, add)
+        _, counted = connections.connect_all(traced, z, lane.path, total, add)
         if traced.plan.connections == "all":
             for c in found:
                 total = self.add(traced, c, total, start, lane.shared)
-            return total
-        value, end = self._draw(traced, z, lane, stream, counters)
+            return total, counted
+        value, counted, end = self._draw(traced, z, lane, stream)
         drawn = np.argmin([self._distances(c, end) for c in found], axis=0) if found else None
         for i, c in enumerate(found):
             self._note(c, dr.select(mi.Bool(drawn == i), value, 0))
-        return total + value
+        return total + value, counted
 
     def _distances(self, c, end):
         """How far the light vertex of a connection is from the ``end`` of a visibility ray, in each lane.
@@ -339,8 +341,8 @@ class Recorder:
         y = np.array([self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))])
         return np.where(self._numbers(c.active) > 0, np.linalg.norm(end.T - y, axis=1), np.inf)
 
-    def _draw(self, traced, z, lane, stream, counters):
-        """What the draw of one connection gives, and the position of the vertex drawn."""
+    def _draw(self, traced, z, lane, stream):
+        """What the draw of one connection gives, `Counters`, and the position of the vertex drawn."""
         ends = []
 
         def segment_to(anchor, end, like):
@@ -349,12 +351,13 @@ class Recorder:
 
         original = rays.segment_to
         with mock.patch.object(rays, "segment_to", segment_to):
-            value = connections.connect_one(traced, z, lane.path, stream, counters)
-        return value, ends[-1]
+            value, counted = connections.connect_one(traced, z, lane.path, stream)
+        return value, counted, ends[-1]
 
-    def end(self, traced, lane, sample, total, seen, counters):
+    def end(self, traced, lane, sample, total, seen):
         """The camera sample is complete."""
         self.pdf_w = self._numbers(sample.start.pdf_w)
+        return Counters()
 
     def _note(self, c, value):
         numbers = {name: self._numbers(getattr(c, name)) for name in ("s", "t", "weight", "active")}

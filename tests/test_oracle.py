@@ -34,6 +34,7 @@ from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
 from mitsuba_bdpt.transport import bsdf, connections, kernel, light_path, mis, techniques
+from mitsuba_bdpt.transport.counters import Counters
 from oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
@@ -542,11 +543,10 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     def record(function, edges_of):
         def recorded(kernel_, *arguments):
             out = function(kernel_, *arguments)
-            c = out[0] if isinstance(out, tuple) else out
             s, edges = edges_of(*arguments)
             if edges == k:
-                result[s] = c.weight
-                world.demands.append((c.s == s) & (c.t == k + 1 - s))
+                result[s] = out.weight
+                world.demands.append((out.s == s) & (out.t == k + 1 - s))
             return out
 
         return recorded
@@ -554,12 +554,12 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     def edges(vertex):
         return int(vertex.edges[0])
 
-    def connect_all(kernel_, z, path, counters, total, add):
+    def connect_all(kernel_, z, path, total, add):
         for y in stored:
             # Other pairs are not neighbours on a path of k edges.
             if edges(y) + edges(z) + 1 == k:
                 connections.inner(kernel_, z, y)
-        return total
+        return total, Counters()
 
     for function, edges_of in (
         (techniques.hit_emitter, lambda z: (0, edges(z))),
@@ -587,8 +587,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
     lane = kernel._Lane(place, shared, path)
-    counters = dict.fromkeys(kernel.COUNTERS, u32(0))
-    kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), counters, mi.Bool(True))
+    kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
     return columns(result, world.n)

@@ -22,6 +22,7 @@ import mitsuba as mi  # isort: skip
 
 from endpoints import Camera, disks_of, dot, lamps_of, length2
 from mitsuba_bdpt.transport import connections
+from mitsuba_bdpt.transport.counters import Counters
 from mitsuba_bdpt.transport.light_path import StoredVertex
 from oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 
@@ -132,15 +133,15 @@ class Capture:
             shared = kernel._shared(k, stream)
             kernel._light_subpath(k, self, stream, shared, None)
             common = kernel._Lane(place, shared, None)
-            kernel._camera_subpath(k, self, common, lane, self._counters(), mi.Bool(True))
+            kernel._camera_subpath(k, self, common, lane, mi.Bool(True))
 
     def _join_endpoints(self, original):
-        def joined(k, emission, stream, counters, active):
+        def joined(k, emission, stream, active):
             u = techniques._sensor_points(k, stream)
             join = k.camera.join(emission.si.p, *u)
             distant = k.camera.join_direction(emission.d, *u)
             self.endpoint[1, 1] = dr.select(emission.infinite, distant, join)
-            return original(k, emission, stream, counters, active)
+            return original(k, emission, stream, active)
 
         return joined
 
@@ -152,16 +153,15 @@ class Capture:
         """Nothing found yet."""
         return mi.Float(0)
 
-    def splat(self, kernel_, c, position, shared, counters):
+    def splat(self, kernel_, c, shared):
         """Keep (1,1); walks are seen by `_walk`."""
         dr.eval(c)
         self.found[1, 1] = c
+        return Counters()
 
     def end(self, *_):
         """Nothing to add up."""
-
-    def _counters(self):
-        return dict.fromkeys(kernel.COUNTERS, mi.UInt32(0))
+        return Counters()
 
     def _walk(self, k, side, walk, stream, visit, state):
         """In the place of `walk.random_walk`."""
@@ -189,20 +189,20 @@ class Capture:
         return Point(self._wide(rows(si.p)), self._wide(rows(si.n)), *arrays)
 
     def _visit_light(self, edges, vertex, stream, walk):
-        found, counters = {}, self._counters()
+        found = {}
         if self.plan.arrival:
-            found[edges + 1, 0], _ = techniques.hit_sensor(self.kernel, self.emission, vertex, walk)
+            found[edges + 1, 0] = techniques.hit_sensor(self.kernel, self.emission, vertex, walk)
             self.endpoint[edges + 1, 0] = self._on_lens(vertex, walk)
         if self.plan.splat:
-            found[edges + 1, 1], _ = techniques.splat(self.kernel, vertex, stream, counters)
+            found[edges + 1, 1] = techniques.splat(self.kernel, vertex, stream)
         return found
 
     def _visit_camera(self, edges, vertex, stream, walk):
-        found, counters = {}, self._counters()
+        found = {}
         if self.plan.hit:
             found[0, edges + 1] = techniques.hit_emitter(self.kernel, vertex)
         if self.plan.direct:
-            found[1, edges + 1] = techniques.next_event(self.kernel, vertex, counters)
+            found[1, edges + 1] = techniques.next_event(self.kernel, vertex)
             self.endpoint[1, edges + 1] = mi.Point2f(self.choice)
         return found
 

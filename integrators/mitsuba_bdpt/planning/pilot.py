@@ -36,7 +36,8 @@ import numpy as np
 from ..sampling.points import Points
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
-from ..transport.kernel import COUNTERS, Kernel, trace
+from ..transport.counters import COUNTERS, Counters, one
+from ..transport.kernel import Kernel, trace
 from . import moments
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
 
@@ -98,7 +99,7 @@ def _slices(parts: dict) -> dict:
     return {name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)}
 
 
-# Of `kernel.COUNTERS`, what light subpaths count alone.
+# Of `Counters`, what light subpaths count alone.
 _OF_LIGHT = ("light", "shadow_t1")
 
 
@@ -152,7 +153,7 @@ class Pilot:
         new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
-    def connect(self, kernel, z, lane, stream, counters, total, start):
+    def connect(self, kernel, z, lane, stream, total, start):
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c, visible, total):
@@ -161,33 +162,35 @@ class Pilot:
             new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
             return {name: _sums(total[name], more) for name, more in new.items()}
 
-        tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
         found = {"unshadowed": _none(_PARTS["draw"]), "visible": _none(_PARTS["draw"])}
         found |= {name: total[name] for name in ("moment", "light")}
-        found = connections.connect_all(kernel, z, lane.path, counters, found, add)
+        found, counted = connections.connect_all(kernel, z, lane.path, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
-        joined = total["joined"] + dr.select(counters["shadow_inner"] > tested, mi.UInt32(1), 0)
+        joined = total["joined"] + one(counted.shadow_inner > 0)
         # In the order of `begin`, as a loop's state has to be.
-        return total | found | {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        return total | found, counted
 
-    def splat(self, kernel, c, position, shared, counters):
+    def splat(self, kernel, c, shared) -> Counters:
         """Add a contribution with t <= 1."""
         size = self._size(c)
-        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(position)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(c.position)
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
         columns = [x for name in _SPLAT_PARTS for x in found[name]]
         _add(self._splats, _SPLAT_COLUMNS, columns, row, size > 0)
+        return Counters()
 
-    def end(self, kernel, lane, sample, total, seen, counters):
+    def end(self, kernel, lane, sample, total, seen) -> Counters:
         """Add a camera sample."""
         columns = [x for name in _PARTS for x in total[name]]
         slot = dr.arange(mi.UInt32, self._lanes)
         columns += [mi.Float64(total["joined"]), mi.Float64(self._tile(sample.start.position))]
         _add(self._samples, _COLUMNS, columns, slot, sample.covered)
+        return Counters()
 
     def evaluate(self, counts):
         """Run what was recorded, and ``counts`` with it."""

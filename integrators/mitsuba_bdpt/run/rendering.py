@@ -32,7 +32,8 @@ from ..sampling import points
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
-from ..transport.kernel import COUNTERS, Kernel, trace
+from ..transport.counters import COUNTERS
+from ..transport.kernel import Kernel, trace
 from .schedule import REPLICATES, Step, batches, schedule
 from .snapshot import FORMAT, Snapshot
 

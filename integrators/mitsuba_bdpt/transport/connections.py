@@ -8,7 +8,8 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _one, _roulette, _size, count, finite
+from .contribution import Contribution, _counts, _roulette, _size, finite
+from .counters import Counters, one
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
 
@@ -53,21 +54,20 @@ def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
 
 
-def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
+def connect_all(kernel, z: Vertex, path: LightPath, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
     ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
-    ``visible``: it is active and nothing is in between.
+    ``visible``: it is active and nothing is in between. Returns the ``total`` and `Counters`.
     """
 
     def body(slot, total, nonzero, lost):
         y = read_light_vertex(kernel, path, slot)
-        counted = {"non_finite": lost}
-        c = finite(inner(kernel, z, y), counted)
-        nonzero = nonzero + _one(c.active)
+        c = finite(inner(kernel, z, y))
+        nonzero = nonzero + one(c.active)
         ray, own = _sight(kernel, z, y)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
-        return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
+        return slot + 1, add(c, visible, total), nonzero, lost + c.counted.non_finite
 
     candidates = candidate_count(kernel, z, path)
     _, total, nonzero, lost = dr.while_loop(
@@ -76,24 +76,21 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
         body,
         label="inner connections",
     )
-    counters["non_finite"] += lost
-    counters["evaluated"] += candidates
-    counters["zero"] += candidates - nonzero
-    counters["shadow_inner"] += nonzero
-    return total
+    counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
+    return total, counted
 
 
-def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
+def connect_one(kernel, z: Vertex, path: LightPath, stream):
     """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
 
     The draw is a running one over all candidates; the estimate is that of all of them. One random
-    number serves the whole draw: what is left of it after each decision is uniform again.
+    number serves the whole draw: what is left of it after each decision is uniform again. Returns what it
+    adds to the sample, weighted, and `Counters`.
     """
 
     def body(slot, chosen, total, end, u, nonzero, lost):
         y = read_light_vertex(kernel, path, slot)
-        counted = {"non_finite": lost}
-        c = finite(inner(kernel, z, y), counted)
+        c = finite(inner(kernel, z, y))
         value = c.weighted()
         size = _size(value)
         before, total = total, total + size
@@ -105,7 +102,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         chosen = dr.select(take, value, chosen)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
-        return slot + 1, chosen, total, end, u, nonzero + _one(c.active), counted["non_finite"]
+        return slot + 1, chosen, total, end, u, nonzero + one(c.active), lost + c.counted.non_finite
 
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
@@ -117,14 +114,13 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         body,
         label="draw an inner connection",
     )
-    counters["evaluated"] += candidates
-    counters["zero"] += candidates - nonzero
-    counters["non_finite"] += lost
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
     value = (chosen / _size(chosen)) * total
     active = total > 0
-    active, survival = _roulette(kernel, value, u, active, counters)
-    count(counters, "shadow_inner", active)
+    active, survival, rouletted = _roulette(kernel, value, u, active)
+    counted = rouletted + Counters(
+        shadow_inner=one(active), evaluated=candidates, zero=candidates - nonzero, non_finite=lost
+    )
     own = None
     if small:
         y = read_light_vertex(kernel, path, end)
@@ -132,7 +128,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return dr.select(active, value / survival, 0)
+    return dr.select(active, value / survival, 0), counted
 
 
 def _sight(kernel, z: Vertex, y: StoredVertex):

@@ -9,7 +9,7 @@ or image size.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -19,28 +19,12 @@ from ..sampling.points import Points, Purpose
 from ..settings import MAX_STORED, UNLIMITED
 from . import bsdf, contribution, light_path, mis, techniques
 from .batch import Batch, Places
+from .counters import Counters, counted_by_camera, counted_by_light, one
 from .sharing import Sharing
 from .walk import Side, Walk, random_walk
 
 # Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
 STORE_SIZES = (64, MAX_STORED)
-
-
-# What lanes count (``UInt32``): rays by kind, inner connections by what became of them (``rouletted``: splats
-# too), values that count as zero because they are not finite: contributions (those of s = 1 and t <= 1 if
-# they are visible, inner ones before it is known), subpaths that end for want of a finite throughput,
-# features.
-COUNTERS = (
-    "camera",
-    "light",
-    "shadow_s1",
-    "shadow_t1",
-    "shadow_inner",
-    "evaluated",
-    "zero",
-    "rouletted",
-    "non_finite",
-)
 
 
 @dataclass
@@ -112,8 +96,8 @@ class Kernel:
 
 def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     """Trace one batch and put its contributions into ``sink`` (see `sink`); ``spp`` is the render's total,
-    which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
-    after the other); nothing is evaluated yet."""
+    which places the batch in the image's point sequence. Returns `Counters.summed`; nothing is evaluated
+    yet."""
     sharing = shared_by(kernel, batch, points)
     kernel = kernel.bound(points, _count_light(batch, sharing))
     lane = dr.arange(mi.UInt32, sharing.lanes)
@@ -121,9 +105,9 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
 
     def serve(slot, counters):
         active = slot < dr.opaque(mi.UInt32, batch.size)
-        return _camera_subpath(kernel, sink, common, slot, counters, active)
+        return counters + _camera_subpath(kernel, sink, common, slot, active)
 
-    counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
+    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
     if not kernel.plan.light:
         counters = serve(lane, counters)
     else:
@@ -134,7 +118,7 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
             lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
             label="camera subpaths of one light subpath",
         )
-    return _sum(of_light, counters)
+    return (of_light + counters).summed()
 
 
 def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
@@ -143,8 +127,7 @@ def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
     sharing = shared_by(kernel, batch, points)
     kernel = kernel.bound(points, _count_light(batch, sharing))
     common, of_light = _begin(kernel, sink, Places(kernel, batch, spp), sharing.lane(slot))
-    counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
-    return _sum(of_light, _camera_subpath(kernel, sink, common, slot, counters, mi.Bool(True)))
+    return (of_light + _camera_subpath(kernel, sink, common, slot, mi.Bool(True))).summed()
 
 
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
@@ -166,7 +149,7 @@ def _begin(kernel, sink, place: Places, lane):
     stream = kernel.points.stream("light", place.index(lane), lane)
     shared = _shared(kernel, stream)
     path = light_path.allocate_light_path(kernel, dr.width(lane))
-    counters = {}
+    counters = Counters()
     if kernel.plan.light:
         path, counters = _light_subpath(kernel, sink, stream, shared, path)
     return _Lane(place, shared, path), counters
@@ -204,22 +187,6 @@ def _shared(kernel, stream) -> Shared:
     return Shared(time, wavelengths, weight, u)
 
 
-def _zeros(*names) -> dict:
-    """Counters of these ``names``. Loops hold only those that they change, see `Walk`."""
-    return {name: mi.UInt32(0) for name in names}
-
-
-def _counted_by_light(plan):
-    names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
-    return names + ["non_finite"] * (plan.splat or plan.arrival)
-
-
-def _counted_by_camera(plan):
-    one = plan.connections == "one"
-    names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
-    return names + ["shadow_inner", "evaluated", "zero"] * (plan.connections != "none")
-
-
 def _light_subpath(kernel, sink, stream, shared, path):
     points, h, emitters = kernel.points, kernel.heuristic, kernel.emitters
     e = emitters.sample_emission(
@@ -228,13 +195,13 @@ def _light_subpath(kernel, sink, stream, shared, path):
         shared,
         mi.Bool(True),
     )
-    counters = _zeros("shadow_t1", "light", "non_finite")
+    counters = Counters()
     if kernel.plan.endpoints:
-        c, position = techniques.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
-        sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
+        c = techniques.join_endpoints(kernel, e, stream, mi.Bool(True))
+        counters += _splat(kernel, sink, c, shared)
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = active & ~bsdf.is_finite(e.weight)
-    contribution.count(counters, "non_finite", broken)
+    counters += Counters(non_finite=one(broken))
     active &= ~broken
     inverse = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
@@ -256,33 +223,26 @@ def _light_subpath(kernel, sink, stream, shared, path):
     def visit(vertex, state, walk):
         path, counters = state
         if kernel.plan.arrival:
-            c, position = techniques.hit_sensor(kernel, e, vertex, walk)
-            sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
+            counters += _splat(kernel, sink, techniques.hit_sensor(kernel, e, vertex, walk), shared)
         if kernel.plan.splat:
-            c, position = techniques.splat(kernel, vertex, stream, counters)
-            sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
+            counters += _splat(kernel, sink, techniques.splat(kernel, vertex, stream), shared)
         if kernel.plan.connections != "none":
             light_path.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    state = path, _zeros(*_counted_by_light(kernel.plan))
+    state = path, counted_by_light(kernel.plan)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters = _added(counters, counted)
-    counters["light"] += dr.select(active, walk.traced(), 0)
-    contribution.count(counters, "non_finite", walk.broken)
-    return path, counters
+    counters += counted
+    return path, counters + Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
 
 
-def _added(*several) -> dict:
-    """Counters added up by name."""
-    total = {}
-    for counters in several:
-        for name, value in counters.items():
-            total[name] = total[name] + value if name in total else value
-    return total
+def _splat(kernel, sink, c, shared) -> Counters:
+    """Hand a contribution with t <= 1 to the sink."""
+    c = contribution.finite(c)
+    return c.counted + sink.splat(kernel, c, shared)
 
 
-def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
+def _camera_subpath(kernel, sink, lane: _Lane, slot, active) -> Counters:
     points, plan = kernel.points, kernel.plan
     place, shared = lane.place, lane.shared
     stream = points.stream("camera", place.index(slot), slot)
@@ -296,26 +256,27 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
     walk = _camera_walk(kernel, start, active)
 
     def add_hit(z, total, lost):
-        counted = {"non_finite": lost}
-        c = contribution.finite(techniques.hit_emitter(kernel, z), counted)
-        return sink.add(kernel, c, total, start, shared), counted["non_finite"]
+        c = contribution.finite(techniques.hit_emitter(kernel, z))
+        return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
     def visit(z, state, _):
         total, counters = state
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
-            total, counters["non_finite"] = dr.if_stmt(
-                (z, total, counters["non_finite"]),
+            total, lost = dr.if_stmt(
+                (z, total, counters.non_finite),
                 techniques.sees_emitter(kernel, z),
                 add_hit,
                 lambda z, total, lost: (total, lost),
                 label="s = 0",
             )
+            counters = replace(counters, non_finite=lost)
         if plan.direct:
-            c = contribution.finite(techniques.next_event(kernel, z, counters), counters)
-            total = sink.add(kernel, c, total, start, shared)
+            c = contribution.finite(techniques.next_event(kernel, z))
+            total, counters = sink.add(kernel, c, total, start, shared), counters + c.counted
         if plan.connections != "none":
-            total = sink.connect(kernel, z, lane, stream, counters, total, start)
+            total, counted = sink.connect(kernel, z, lane, stream, total, start)
+            counters += counted
         return total, counters
 
     side = Side(
@@ -329,13 +290,10 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
         parallel=kernel.camera.parallel,
         join=(lambda z: techniques.choose_emitter(kernel, z, stream)) if plan.direct else None,
     )
-    state = (sink.begin(), _zeros(*_counted_by_camera(plan)))
-    (total, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters = _added(counters, counted)
-    counters["camera"] += dr.select(active, walk.traced(), 0)
-    contribution.count(counters, "non_finite", walk.broken)
-    sink.end(kernel, lane, sample, total, walk.seen, counters)
-    return counters
+    state = sink.begin(), counted_by_camera(plan)
+    (total, counters), walk = random_walk(kernel, side, walk, stream, visit, state)
+    counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
+    return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 
 def _camera_walk(kernel, start, active) -> Walk:
@@ -356,15 +314,6 @@ def _first_partial(kernel, start):
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
         arrival = h.present(arrival)
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
-
-
-def _sum(*several):
-    """The lanes' counters added up, ``UInt64`` in the order of `COUNTERS`."""
-    total = dr.zeros(mi.UInt64, len(COUNTERS))
-    for name, value in _added(*several).items():
-        index = mi.UInt32(COUNTERS.index(name))
-        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt64(value), index, mode=dr.ReduceMode.Expand)
-    return total
 
 
 def _coefficients(plan, by_class: bool) -> Coefficients:

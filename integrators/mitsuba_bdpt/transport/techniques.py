@@ -4,12 +4,11 @@ All return a `Contribution`: the full *unweighted* estimate f / p of the strateg
 class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone.
 Densities and cosines are geometric, throughputs contain everything up to and including the edge to
 the vertex. Equation numbers: Georgiev 2012, see `mis`.
-
-What a lane accumulates (``counters``, a dictionary, and ``path``) is changed in place: these are state of the
-loops around, and each statement binds a new array to a name.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +16,8 @@ import mitsuba as mi
 from ..geometry import rays
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _roulette, count
+from .contribution import Contribution, _counts, _roulette
+from .counters import Counters, one
 from .walk import Vertex, newest_coefficient
 
 
@@ -71,7 +71,7 @@ def choose_emitter(kernel, z: Vertex, stream):
     return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
 
 
-def next_event(kernel, z: Vertex, counters) -> Contribution:
+def next_event(kernel, z: Vertex) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
@@ -95,16 +95,13 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    count(counters, "shadow_s1", active)
+    counted = Counters(shadow_s1=one(active))
     active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct")
+    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", counted=counted)
 
 
-def join_endpoints(kernel, emission, stream, counters, active):
-    """(1,1): a sampled emitter point seen directly by the sensor.
-
-    Returns the `Contribution` and the film position.
-    """
+def join_endpoints(kernel, emission, stream, active) -> Contribution:
+    """(1,1): a sampled emitter point seen directly by the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
     join = kernel.camera.join(emission.si.p, *u)
@@ -137,9 +134,10 @@ def join_endpoints(kernel, emission, stream, counters, active):
     away = rays.spawn(join.anchor, -join.d, emission.si)
     away.maxt = join.reach  # camera rays see the surroundings behind the far plane
     ray = dr.select(emission.infinite, away, ray)
-    count(counters, "shadow_t1", active)
+    counted = Counters(shadow_t1=one(active))
     active &= ~rays.occluded(kernel.scene, ray, active)
-    return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active, shares, "light"), join.position
+    ends = mi.UInt32(1), mi.UInt32(1)
+    return Contribution(value, weight, *ends, active, shares, "light", join.position, counted)
 
 
 def look_at_sensor(kernel, y: Vertex, stream):
@@ -154,11 +152,8 @@ def look_at_sensor(kernel, y: Vertex, stream):
     return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
 
 
-def splat(kernel, y: Vertex, stream, counters):
-    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47).
-
-    Returns the `Contribution` and the film position.
-    """
+def splat(kernel, y: Vertex, stream) -> Contribution:
+    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47)."""
     h, scene, join, f = kernel.heuristic, kernel.scene, y.endpoint, y.f
     to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
@@ -174,24 +169,23 @@ def splat(kernel, y: Vertex, stream, counters):
     active &= _counts(kernel, value, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
-    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light")
-    active, survival = _roulette(kernel, c.weighted(), u, active, counters)
-    count(counters, "shadow_t1", active)
+    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
+    active, survival, rouletted = _roulette(kernel, c.weighted(), u, active)
+    counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
         pi, _ = rays.intersect_past_emitters(scene, kernel.shape_errors, ray, active, coherent=False)
         active &= ~pi.is_valid()
     else:
         active &= ~rays.occluded(scene, ray, active)
-    c.value, c.active = value / survival, active
-    return c, join.position
+    return replace(c, value=value / survival, active=active, counted=counted)
 
 
-def hit_sensor(kernel, emission, y: Vertex, walk):
+def hit_sensor(kernel, emission, y: Vertex, walk) -> Contribution:
     """t = 0: the last edge of a light subpath hits the sensor.
 
     ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
-    are those of the scene's surface behind. Returns the `Contribution` and the film position.
+    are those of the scene's surface behind.
     """
     h = kernel.heuristic
     directly = walk.edges == 1
@@ -214,7 +208,7 @@ def hit_sensor(kernel, emission, y: Vertex, walk):
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
-    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light"), z.position
+    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light", z.position)
 
 
 def _sensor_points(kernel, stream, edges=0):
