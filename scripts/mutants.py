@@ -131,8 +131,8 @@ MUTANTS = (
     Mutant(
         "numbers of the light subpath for the camera's",
         "transport/kernel.py",
-        'points.stream("camera", place.index(slot), slot)',
-        'points.stream("light", place.index(slot), slot)',
+        'points.stream("camera", lane.place.index(slot), slot)',
+        'points.stream("light", lane.place.index(slot), slot)',
         ("tests/test_plausible_bugs.py::test_subpaths_draw_from_their_own_streams",),
     ),
     Mutant(

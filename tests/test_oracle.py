@@ -33,7 +33,7 @@ from mitsuba_bdpt.geometry import rays, rounding
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
-from mitsuba_bdpt.transport import bsdf, connections, kernel, light_path, mis, techniques
+from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, light_path, mis, techniques
 from mitsuba_bdpt.transport.counters import Counters
 from oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
@@ -516,6 +516,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         strategy_images=False,
         store_size=64,
         surfaces=True,
+        observer=None,
         max_depth=u32(k),
         rr_depth=u32(10**6),
         last_stored=u32(k - 2 if k > 2 else 0),
@@ -524,7 +525,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         last_arrival=u32(k),
         last_light=u32(k if plan.arrival else k - 1),
         count_light=f(1),
-        kappa=kernel.Coefficients(
+        kappa=inputs.Coefficients(
             hit=f(1),
             direct=f(1),
             splat=f(kappa.splat) if plan.splat else 0,

@@ -125,8 +125,11 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream):
     if small:
         y = read_light_vertex(kernel, path, end)
         ray, own = _sight(kernel, z, y)
+        end = y.si.p
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
+    if kernel.observer is not None:
+        kernel.observer.drawn(end)
     active &= ~rays.occluded(kernel.scene, ray, active, own)
     return dr.select(active, value / survival, 0), counted
 
