@@ -246,7 +246,7 @@ MUTANTS = (
     Mutant(
         "emission: start of a light subpath lacks its density",
         "transport/kernel.py",
-        "partial = mis.Partial(h.start(inverse), h.present(hit))",
+        "partial = mis.Partial(h.start(inverse_pdf), h.present(hit))",
         "partial = mis.Partial(h.start(dr.rcp(e.pdf_second)), h.present(hit))",
         ("tests/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-n1c1]",),
     ),

@@ -429,7 +429,7 @@ class Sensor:
         return sensor_records.SensorHit(
             dist2=self.dist2,
             cos=self.cos,
-            pdf_area=self.lens_pdf,
+            pdf_a=self.lens_pdf,
             pdf_w=self.density,
             importance=mi.Float(1),
             position=mi.Point2f(0.5),

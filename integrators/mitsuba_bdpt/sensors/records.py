@@ -56,14 +56,14 @@ class CameraJoin:
 @dataclass
 class SensorHit:
     """A light subpath that hits the sensor at z_0: ``dist2`` of its last edge, ``cos`` at z_0,
-    ``pdf_area`` density of z_0 (area measure) and ``pdf_w`` (solid angle) of the way back in camera
+    ``pdf_a`` density of z_0 (area measure) and ``pdf_w`` (solid angle) of the way back in camera
     subpaths, ``importance`` W_e, ``position`` on the film in pixels, ``active``. ``surroundings`` see
     `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light comes from infinity, None where
     the subpath's own ray has said so."""
 
     dist2: object
     cos: object
-    pdf_area: object
+    pdf_a: object
     pdf_w: object
     importance: object
     position: object

@@ -222,12 +222,12 @@ def _light_walk(kernel, e, shared) -> Walk:
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
     active &= ~broken
-    inverse = dr.rcp(e.pdf_first * e.pdf_second)
+    inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     # s = 0 is an older alternative, that of making y_0 by a hit.
-    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse)), kernel.kappa.hit)
-    partial = mis.Partial(h.start(inverse), h.present(hit))
+    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
+    partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
     return Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, broken)
 
 

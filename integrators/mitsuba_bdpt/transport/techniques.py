@@ -36,13 +36,14 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     active = sees_emitter(kernel, z)
     radiance = emitters.emitted(z.si, active)
     active &= ~bsdf.is_zero(radiance)
-    connect, first, second = emitters.hit_densities(z.si, z.previous, active)
+    # Area measure; of what is in the surroundings solid angle, and disk area: `Emitters.hit_densities`.
+    pdf_connect, pdf_first, pdf_second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
-    endpoints = mis.times(kernel.kappa.endpoints, first)
+    endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need just this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
-    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, connect))
-    older = dr.select(kernel.within_store(z.edges), first * second, 0)
+    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, pdf_connect))
+    older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
@@ -50,15 +51,15 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vc, older),
     )
     weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
-    value = _known(z.throughput * radiance, connect, first, second)
+    value = _known(z.throughput * radiance, pdf_connect, pdf_first, pdf_second)
     return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
 
 
-def _known(value, *densities):
-    """``value``, NaN where one of the ``densities`` of other strategies is not finite: no weight follows."""
+def _known(value, *pdfs):
+    """``value``, NaN where one of the ``pdfs`` of other strategies is not finite: no weight follows."""
     finite = mi.Bool(True)
-    for density in densities:
-        finite &= dr.isfinite(density)
+    for pdf in pdfs:
+        finite &= dr.isfinite(pdf)
     return dr.select(finite, value, dr.nan)
 
 
@@ -122,10 +123,10 @@ def join_endpoints(kernel, emission, stream, active) -> Contribution:
     light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
     camera_side = 0
     if kernel.plan.arrival:
-        towards = kernel.emitters.direction_density(emission, join.p, join.d, active)
+        pdf_second = kernel.emitters.direction_density(emission, join.p, join.d, active)
         covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
-        towards = dr.select(covered, towards, 0)
-        camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
+        pdf_second = dr.select(covered, pdf_second, 0)
+        camera_side = h.scale(h.start(pdf_second * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
     active &= _counts(kernel, value, weight)
 
@@ -202,7 +203,7 @@ def hit_sensor(kernel, emission, y: Vertex, walk) -> Contribution:
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
     partial = mis.to_area(h, before, dist2, z.cos)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
-    light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
+    light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= _counts(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:

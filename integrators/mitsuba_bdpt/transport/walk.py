@@ -169,10 +169,10 @@ def _vertex(kernel, side: Side, walk: Walk) -> Vertex:
     partial, throughput = walk.partial, walk.throughput
     if side.complete is not None:
         first = hit & (walk.edges == 1)
-        density = dr.select(first, side.complete(si, first), 1)
+        pdf_connect = dr.select(first, side.complete(si, first), 1)
         # No weight follows from such a density.
-        throughput = dr.select(dr.isfinite(density), throughput, dr.nan)
-        partial = mis.Partial(h.scale(partial.d_vcm, density), partial.d_vc)
+        throughput = dr.select(dr.isfinite(pdf_connect), throughput, dr.nan)
+        partial = mis.Partial(h.scale(partial.d_vcm, pdf_connect), partial.d_vc)
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
     if side.parallel:
         dist2 = dr.select(walk.edges == 1, 1, dist2)
