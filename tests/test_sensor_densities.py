@@ -175,7 +175,7 @@ def test_an_arrival_is_a_start_in_reverse(name):
     cos = column(arrival.cos)
     keep = active & (cos > 0.05)
     assert active.mean() > (0.999 if lens else 0.4)  # before a meter lies the scene
-    cos, both = cos[keep], (column(arrival.pdf_area) * column(arrival.pdf_w))[keep]
+    cos, both = cos[keep], (column(arrival.pdf_a) * column(arrival.pdf_w))[keep]
     weight = column(arrival.importance)[keep] * cos / both
     np.testing.assert_allclose(weight, column(start.weight)[keep], rtol=5e-3)
     np.testing.assert_allclose(column(arrival.pdf_w)[keep], column(start.pdf_w)[keep], rtol=5e-3)

@@ -36,7 +36,8 @@ import numpy as np
 from ..sampling.points import Points
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
-from ..transport.kernel import COUNTERS, Kernel, trace
+from ..transport.counters import COUNTERS, Counters, one
+from ..transport.kernel import Kernel, trace
 from . import moments
 from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
@@ -66,7 +67,7 @@ LIGHT_TIMES = 4
 SELDOM = 16
 
 
-# Of `kernel.COUNTERS`, what light subpaths count alone.
+# Of `Counters`, what light subpaths count alone.
 _OF_LIGHT = ("light", "shadow_t1")
 
 
@@ -97,7 +98,7 @@ class Pilot:
         new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
-    def connect(self, kernel, z, lane, stream, counters, total, start):
+    def connect(self, kernel, z, lane, stream, total, start):
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c, visible, total):
@@ -106,32 +107,34 @@ class Pilot:
             new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
             return {name: _sums(total[name], more) for name, more in new.items()}
 
-        tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
         found = {name: _none(SAMPLE.parts["draw"]) for name in ("unshadowed", "visible")}
         found |= {name: total[name] for name in ("moment", "light")}
-        found = connections.connect_all(kernel, z, lane.path, counters, found, add)
+        found, counted = connections.connect_all(kernel, z, lane.path, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
-        joined = total["joined"] + dr.select(counters["shadow_inner"] > tested, mi.UInt32(1), 0)
+        joined = total["joined"] + one(counted.shadow_inner > 0)
         # In the order of `begin`, as a loop's state has to be.
-        return total | found | {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        return total | found, counted
 
-    def splat(self, kernel, c, position, shared, counters):
+    def splat(self, kernel, c, shared) -> Counters:
         """Add a contribution with t <= 1."""
         size = self._size(c)
-        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(position)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(c.position)
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
         _add(self._splats, SPLAT, found, row, size > 0)
+        return Counters()
 
-    def end(self, kernel, lane, sample, total, seen, counters):
+    def end(self, kernel, lane, sample, total, seen) -> Counters:
         """Add a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
         others = {"joined": total["joined"], "tile": self._tile(sample.start.position)}
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
+        return Counters()
 
     def evaluate(self, counts):
         """Run what was recorded, and ``counts`` with it."""

@@ -15,6 +15,7 @@ from ..transport.plan import Plan
 from . import budget, choice, even_sky, pilot
 from .candidates import candidates
 from .decision import Decision, replayed
+from .explain import words
 from .findings import Findings
 from .moments import Moments
 from .possible import plan, unreachable_paths
@@ -137,8 +138,10 @@ class Planner:
         for decision in self._settings.decisions or ():
             if decision.first_pass == len(passes):
                 self.adopt(decision, replayed(decision))
-                for text in sorted({*self._lost(self.plan)} - {*self._lost(self.full)}):
-                    mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {text}")
+                before = self._lost(self.full)
+                for lost in self._lost(self.plan):
+                    if lost not in before:
+                        mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {words(lost)}")
 
     def _lost(self, p: Plan):
         return unreachable_paths(self._prepared, p, self._settings)

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field, fields, replace
 
 import drjit as dr
 
-from ..transport.kernel import COUNTERS
+from ..transport.counters import COUNTERS
 
 
 @dataclass(frozen=True)
 class Work:
     """What is counted; a part of a render's progress.
 
-    ``counts``: sums of `kernel.COUNTERS` by name; kernels ``compiled``, and found ``cached``; ``seconds`` in
-    all, of which ``compile_seconds`` compile kernels and ``pilot_seconds`` are those of pilots (apart from
+    ``counts``: sums of `counters.COUNTERS` by name; kernels ``compiled``, and found ``cached``; ``seconds``
+    in all, of which ``compile_seconds`` compile kernels and ``pilot_seconds`` are those of pilots (apart from
     their compiling)."""
 
     counts: dict = field(default_factory=lambda: dict.fromkeys(COUNTERS, 0))

@@ -200,13 +200,13 @@ class Camera(Sensor):
         within = distant | ((o.z >= view.near) & (o.z <= view.far))
         z0 = _transform(view.to_world, local, 1)
         position, _, inside = self._project(mi.UInt32(0), view, -walk.d, local)
-        pdf_area, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
+        pdf_a, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
         return SensorHit(
             dist2=dr.square(distance),
             cos=slope,
-            pdf_area=pdf_area,
+            pdf_a=pdf_a,
             pdf_w=pdf_w,
-            importance=pdf_area * pdf_w / slope,
+            importance=pdf_a * pdf_w / slope,
             position=position,
             active=towards & on_lens & unhidden & within & inside,
             # Camera rays see the surroundings behind the far plane, and whatever is there does not hide them.

@@ -198,7 +198,7 @@ class IrradianceMeter(Sensor):
         return SensorHit(
             dist2=dr.squared_norm(si.p - walk.previous),
             cos=cos,  # as in `start` and `join`: weights of all strategies have the same idea of it
-            pdf_area=self._density,
+            pdf_a=self._density,
             pdf_w=cos * dr.inv_pi,
             importance=self._density * cos / vertex.cos,
             position=self.region.to_position(mi.Point2f(0.5)),

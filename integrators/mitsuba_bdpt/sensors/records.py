@@ -60,7 +60,7 @@ class CameraJoin:
 class SensorHit:
     """A light subpath that hits the sensor at z_0.
 
-    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_area`` density of z_0 (area measure) and ``pdf_w``
+    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_a`` density of z_0 (area measure) and ``pdf_w``
     (solid angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
     ``active``. ``surroundings`` see `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light
     comes from infinity, None where the subpath's own ray has shown it.
@@ -68,7 +68,7 @@ class SensorHit:
 
     dist2: mi.Float
     cos: mi.Float
-    pdf_area: mi.Float
+    pdf_a: mi.Float
     pdf_w: mi.Float
     importance: mi.Float
     position: mi.Point2f
