@@ -21,7 +21,7 @@ from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
 from .surfaces import CURVES, Surfaces, refuse_curves, spheres_of
-from .tables import Mask, at, table
+from .tables import Mask, look_up, table
 
 _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
 
@@ -112,7 +112,7 @@ class AreaEmitters(Group):
         pdf_w = emitter.pdf_direction(it, ds, active)
         by_area = mi.Bool(False)
         if self.any_inner:
-            sphere = at(self._spheres, index, active)
+            sphere = look_up(self._spheres, index, active)
             by_area |= active & (dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius))
         if self._by_shape.any:
             by_area |= self._by_shape.at(index, active)
@@ -126,7 +126,7 @@ class AreaEmitters(Group):
 
     def _cone_pdf_w(self, index, p, active):
         """`quadrics.cone_pdf_w` of the emitter ``index``; 0 for one that is no small sphere."""
-        sphere = at(self._spheres, index, active)
+        sphere = look_up(self._spheres, index, active)
         return dr.select(active, cone_pdf_w(sphere.center, sphere.cone_radius, p), 0)
 
     def upright(self, ps, index, active):

@@ -122,7 +122,8 @@ class Emitters:
 
         ``answering``: groups that have one; for emitters of other groups the answer has no meaning.
         ``possible``: those that the emitters ``index`` can be of, all if left out. What only one group can
-        answer is recorded without a choice, and nothing is recorded of groups that the scene has not.
+        answer is recorded without a choice, and nothing is recorded of groups that the scene has not. None
+        where no group has an answer.
         """
         possible = self.groups if possible is None else possible
         found = None

@@ -14,7 +14,7 @@ from ..host.introspection import named, own_parameters
 from .group import Context, Group, emitting_point, free_emission, weight_over
 from .projectors import Projectors
 from .records import Chosen, Direct, Emission
-from .tables import Mask, at, rows, table
+from .tables import Mask, look_up, rows, table
 
 
 @dataclass
@@ -30,13 +30,6 @@ class _Cone:
     cos_cutoff: object = -1.0
     pdf_w: object = 1.0
 
-    @staticmethod
-    def of(emitter) -> _Cone:
-        """That of a point light, spot or projector."""
-        return {"PointLight": _of_point, "SpotLight": _of_spot, "Projector": _of_projector}[
-            emitter.class_name()
-        ](emitter)
-
 
 class PositionEmitters(Group):
     """Emitters at a point: their intensity is asked of Mitsuba, their density of directions is known here.
@@ -45,7 +38,7 @@ class PositionEmitters(Group):
     """
 
     def __init__(self, emitters, context: Context):
-        self._cones = table(rows(emitters, _Cone(), _Cone.of))
+        self._cones = table(rows(emitters, _Cone(), lambda emitter: _CONES[emitter.class_name()](emitter)))
         projects = rows(emitters, None, lambda emitter: emitter.class_name() == "Projector")
         self._is_projector = Mask(projects)
         self._projectors = Projectors.of(emitters, projects)
@@ -61,7 +54,7 @@ class PositionEmitters(Group):
     # -- emission ---------------------------------------------------------------------------
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
-        cone = at(self._cones, chosen.index, active)
+        cone = look_up(self._cones, chosen.index, active)
         local = mi.warp.square_to_uniform_cone(u_direction, cone.cos_cutoff)
         d, pdf_w = cone.x * local.x + cone.y * local.y + cone.z * local.z, cone.pdf_w
         if self._projectors is not None:
@@ -138,3 +131,6 @@ def _of_projector(emitter) -> _Cone:
 
 def _origin(to_world):
     return dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
+
+
+_CONES = {"PointLight": _of_point, "SpotLight": _of_spot, "Projector": _of_projector}

@@ -14,7 +14,7 @@ from ..geometry.smooth_meshes import SmoothMeshes
 from ..geometry.to_world import check_to_world
 from ..host.introspection import all_shapes, named
 from .group import Context
-from .tables import Mask, at, rows, table
+from .tables import Mask, look_up, rows, table
 
 CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 
@@ -29,12 +29,13 @@ class _Turned:
 
 
 class Surfaces:
-    """The shapes of a group's ``emitters`` (None where one is of another group).
+    """The shapes of a group of emitters.
 
-    ``inv_area`` of each by its emitter's index, ``smooth``: whether some have interpolated normals.
-    ``spheres`` that they are (`Sphere` or None); ``by_shape``: emitters that Mitsuba samples by their
-    texture, but are sampled here by their shape. Raises ``UsageError`` and ``UnsupportedError`` for shapes
-    that Mitsuba samples wrongly or not at all.
+    Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
+    are (`Sphere` or None), and ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
+    their shape here. ``inv_area`` of each shape, by its emitter's index; ``smooth``: whether one has
+    interpolated normals. Raises ``UsageError`` and ``UnsupportedError`` for shapes that Mitsuba samples
+    wrongly or not at all.
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
@@ -81,7 +82,7 @@ class Surfaces:
     def upright(self, ps, index, active):
         """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
         if self._turned is not None:
-            sphere = at(self._turned, index, active)
+            sphere = look_up(self._turned, index, active)
             n = sphere_normal(ps.p, sphere.center, sphere.outward)
             ps.n = dr.select(sphere.outward != 0, n, ps.n)
         return ps

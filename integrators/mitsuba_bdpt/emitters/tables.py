@@ -18,7 +18,7 @@ def rows(emitters, default, row) -> list:
 
 
 def table(records: list):
-    """Dataclasses of scalars and points as one of opaque columns that `at` can look up."""
+    """Dataclasses of scalars and points as one of opaque columns for `look_up`."""
 
     def column(name):
         # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
@@ -32,7 +32,7 @@ def table(records: list):
     return made
 
 
-def at(columns, index, active):
+def look_up(columns, index, active):
     """The row ``index`` of a `table`."""
     return replace(columns, **{k: dr.gather(type(v), v, index, active) for k, v in vars(columns).items()})
 

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
-from ..geometry.agreement import CHECKED, OFF, spread_points
 from ..host.introspection import named, own_parameters
+from .agreement import CHECKED, OFF, spread_points
 
 
 class SmoothMeshes:

@@ -13,7 +13,7 @@ from ..transport.plan import Plan
 # and recording it longer than all of a short pilot's samples (scripts/overhead.py): 2 % of a render of
 # `CHEAP_SAMPLES` of path tracing alone. In between a pilot is asked where the scene alone does not tell what
 # pays: it is asked once for all renders of a scene, and what it decides is faster than a guess even in the
-# first (docs/skipping.md).
+# first (docs/method/skipping.md).
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24

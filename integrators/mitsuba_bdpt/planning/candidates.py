@@ -15,8 +15,8 @@ SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 def candidates(prepared, full: Plan, settings: Settings) -> list[Configuration]:
     """All configurations that lose no light which ``full`` finds, with one inner connection or none.
 
-    (All of them gain 1.02 at most in the scenes of docs/choices.json, 1.13 in one of a small caustic, and one
-    pilot of 32 chose them where they take 2.1 times as long.)
+    (All of them gain 1.02 at most in the scenes of docs/reports/choices.json, 1.13 in one of a small caustic,
+    and one pilot of 32 chose them where they take 2.1 times as long.)
     """
 
     def lost_without_arrival(plan):

@@ -7,8 +7,8 @@ import math
 from .configuration import Configuration
 
 # What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
-# it). Fitted to candidates in 29 scenes on two cores (docs/choices.json): off by 6 % (root mean square) for
-# the ratios of their times.
+# it). Fitted to candidates in 29 scenes on two cores (docs/reports/choices.json): off by 6 % (root mean
+# square) for the ratios of their times.
 COSTS = {
     "light_path": 1.7,  # to start a light subpath
     "far": 2.0,  # beside it, to start one from infinity

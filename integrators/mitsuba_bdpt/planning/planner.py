@@ -63,7 +63,7 @@ class Planner:
     with the render. All methods take ``passes``, the samples per pixel of each pass that is done."""
 
     # What pilots draw is the same in renders of all seeds, so that all decide alike. (Of 32 the one
-    # whose choices have the least time times error in the scenes of docs/choices.json.)
+    # whose choices have the least time times error in the scenes of docs/reports/choices.json.)
     pilot_seed = 30
 
     def __init__(self, prepared, settings: Settings, spp: int, findings: Findings):
