@@ -10,7 +10,7 @@ taken to reflect evenly what it reflects in all, glossy ones too: of these a sin
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -97,6 +97,18 @@ class _Ends:
         ends = dr.gather(_Ends, self, index)
         dr.eval(ends, index)
         return ends, index, found / kept
+
+
+@dataclass
+class _Walk:
+    """A subpath on its way: its ray, what it carries, its edges, the distance that it has come; whether it
+    goes on."""
+
+    ray: object
+    weight: object
+    edges: object
+    distance: object
+    active: object
 
 
 def is_possible(prepared, plan, settings) -> bool:
@@ -266,29 +278,34 @@ def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) 
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
     last, adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
 
-    def body(ray, weight, edges, distance, active, generator, ends):
-        si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-        active = active & si.is_valid()
-        distance += dr.select(active, si.t, 0)
+    def body(walk, generator, ends):
+        ray, weight = walk.ray, walk.weight
+        si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=walk.active)
+        active = walk.active & si.is_valid()
+        distance = walk.distance + dr.select(active, si.t, 0)
         surface = si.bsdf()
         smooth, delta = (_has(surface, kind) for kind in (mi.BSDFFlags.Smooth, mi.BSDFFlags.Delta))
         both = active & smooth & delta
         here = active & smooth & (~both | (generator.next_float32() < 0.5))
         weight = dr.select(both, weight * 2, weight)
         reflectance = _reflectance(si, surface, generator, here)
-        ends = dr.select(here, _end(si, surface, ray, weight, edges, distance, reflectance, here), ends)
-        active = active & ~here & delta & (edges < last)
+        arrived = replace(walk, weight=weight, distance=distance, active=here)
+        ends = dr.select(here, _end(si, surface, arrived, reflectance), ends)
+        active = active & ~here & delta & (walk.edges < last)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
         active &= ~bsdf.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)
-        edges += dr.select(active, mi.UInt32(1), 0)
-        return rays.spawn(anchor, si.to_world(bs.wo), ray), weight, edges, distance, active, generator, ends
+        edges = walk.edges + dr.select(active, mi.UInt32(1), 0)
+        ray = rays.spawn(anchor, si.to_world(bs.wo), ray)
+        return _Walk(ray, weight, edges, distance, active), generator, ends
 
-    state = ray, weight, mi.UInt32(1), mi.Float(0), active, generator, _nowhere()
-    *_, ends = dr.while_loop(state, lambda *state: state[4], body, label="delta events")
+    walk = _Walk(ray, weight, mi.UInt32(1), mi.Float(0), active)
+    *_, ends = dr.while_loop(
+        (walk, generator, _nowhere()), lambda walk, *_: walk.active, body, label="delta events"
+    )
     dr.eval(ends)
     return ends
 
@@ -313,21 +330,21 @@ def _reflectance(si, surface, generator, active):
     return _carried(dr.select(diffuse, dr.minimum(even, 1), glossy))
 
 
-def _end(si, surface, ray, weight, edges, distance, reflectance, active) -> _Ends:
+def _end(si, surface, walk: _Walk, reflectance) -> _Ends:
     """The end of a subpath at ``si``."""
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
     seen = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, front, back)  # the other side of most BSDFs is black
-    opacity = 1 - surface.eval_null_transmission(si, active)  # `mask` answers for what is inside of it
+    opacity = 1 - surface.eval_null_transmission(si, walk.active)  # `mask` answers for what is inside of it
     return _Ends(
         p=mi.Point3f(si.p),
-        n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d))),
+        n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, walk.ray.d))),
         through=_has(surface, kinds[0]) | _has(surface, kinds[1]),
-        weight=_carried(weight),
-        edges=edges,
-        distance=distance,
+        weight=_carried(walk.weight),
+        edges=walk.edges,
+        distance=walk.distance,
         reflectance=reflectance * opacity,
-        active=active & seen,
+        active=walk.active & seen,
     )
 
 
