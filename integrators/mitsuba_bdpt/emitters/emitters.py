@@ -15,7 +15,7 @@ from ..geometry import rounding
 from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
 from .group import Context
-from .infinite import InfiniteEmitters, contrast
+from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party, needs_evaluation
 from .records import Chosen, Direct, Emission, Hit
 from .tables import Mask, inverse_table
@@ -62,8 +62,7 @@ class Emitters:
         self._group = mi.UInt32([present.index(t) for t in types])
         self._starts = Mask([t.supports_emission for t in types])
         self._lights = Mask([t.supports_next_event for t in types])
-        infinite = next((group for group in self.groups if isinstance(group, InfiniteEmitters)), None)
-        self.disks = infinite.disks if infinite is not None else None
+        self.disks = next((group.disks for group in self.groups if group.at_infinity), None)
         dr.make_opaque(self._group, self._pmf, self._inverse)
 
     def _summarize(self, emitters, types, weights):

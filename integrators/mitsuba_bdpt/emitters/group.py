@@ -29,9 +29,9 @@ class Group:
     `Context`. What a group supports: ``hittable``, camera subpaths can hit its emitters (all, if
     `is_hittable` does not say otherwise); ``supports_next_event``, next-event estimation can choose it;
     ``supports_emission``, light subpaths can start from it; ``connectible_to_sensor``, a point that emission
-    has chosen can be joined with a sensor; ``at_infinity``, its light subpaths start there. ``limits`` says
-    why it does not support all. Methods of what a group does not support are never called. Lanes that are not
-    ``active`` are of other groups: what is returned for them has no meaning.
+    has chosen can be joined with a sensor; ``at_infinity``, its light subpaths start there, on its ``disks``.
+    ``limits`` says why it does not support all. Methods of what a group does not support are never called.
+    Lanes that are not ``active`` are of other groups: what is returned for them has no meaning.
     """
 
     hittable = False
