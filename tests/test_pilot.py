@@ -1009,8 +1009,8 @@ def test_records_are_short_and_plain():
 
 def test_rays_of_light_subpaths_are_counted_for_each():
     """Rationale: a pilot traces several light subpaths for each camera sample, most of them without one, and
-    what they cost is told by their rays. Expected: rays per light subpath and per camera sample are those of a
-    render with a light subpath for each sample, within 3 % (some 4,096 subpaths of three rays on average,
+    what they cost is told by their rays. Expected: rays per light subpath and per camera sample are those of
+    a render with a light subpath for each sample, within 3 % (some 4,096 subpaths of three rays on average,
     whose number has a standard deviation of two: 1 %)."""
     found = moments_of(cornell(32), 4096, max_depth=6, rr_depth=100).rays
     integrator = bdpt(max_depth=6, rr_depth=100, skip="none", light_paths=1)
