@@ -24,8 +24,8 @@ import reference
 from metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from mistakes import answered, check_output
 from mitsuba_bdpt.cli.arguments import number
-from mitsuba_bdpt.cli.files import replacing
-from mitsuba_bdpt.cli.loading import choose_sensor
+from mitsuba_bdpt.files.loading import choose_sensor
+from mitsuba_bdpt.files.whole import replacing
 from reference import RESOLUTION, benchmark_depth
 from timing import timed
 

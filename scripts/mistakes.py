@@ -23,8 +23,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import mitsuba_bdpt
-from mitsuba_bdpt.cli.files import check_format, check_writable
-from mitsuba_bdpt.cli.render import message, prepare_output
+from mitsuba_bdpt.errors import message
+from mitsuba_bdpt.files.images import prepare_output
+from mitsuba_bdpt.files.whole import check_format, check_writable
 
 STATUS = 2
 SOURCES = Path(__file__).resolve().parent, Path(mitsuba_bdpt.__file__).resolve().parent

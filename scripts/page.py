@@ -23,7 +23,7 @@ import reference
 import report
 from analysis import NOTHING, RIVALS, Biased, Refused, Results
 from mistakes import answered, check_output
-from mitsuba_bdpt.cli.files import replacing
+from mitsuba_bdpt.files.whole import replacing
 from mitsuba_bdpt.planning.explain import subpaths
 
 FRAME = Path(__file__).with_suffix(".html")

@@ -47,11 +47,12 @@ from metrics import (
 from mistakes import answered
 
 import mitsuba as mi  # isort: skip
-from mitsuba_bdpt.cli import files, render  # isort: skip
+from mitsuba_bdpt.files import whole  # isort: skip
+from mitsuba_bdpt.host.versions import versions  # isort: skip
 from mitsuba_bdpt.cli.arguments import number, property_  # isort: skip
-from mitsuba_bdpt.cli.checkpoints import named_files  # isort: skip
-from mitsuba_bdpt.cli.files import replacing  # isort: skip
-from mitsuba_bdpt.cli.loading import in_proportion  # isort: skip
+from mitsuba_bdpt.files.named import named_files  # isort: skip
+from mitsuba_bdpt.files.whole import replacing  # isort: skip
+from mitsuba_bdpt.files.loading import in_proportion  # isort: skip
 from mitsuba_bdpt.run.rendering import raise_interrupt  # isort: skip
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -413,7 +414,7 @@ def _provenance(job: Job, depth: int, **more) -> dict:
         "max_depth": depth,
         "date": datetime.date.today().isoformat(),
         "machine": platform.machine(),
-        "versions": render.versions(),
+        "versions": versions(),
         **more,
     }
 
@@ -523,7 +524,7 @@ def read_exr(path: Path, *layers: str):
     ``ValueError`` for another file."""
     with path.open("rb") as file:  # OpenEXR does not say what hinders it
         start = file.read(4)
-    if start != files.MAGIC[".exr"]:
+    if start != whole.MAGIC[".exr"]:
         raise ValueError(f"{str(path)!r} is not an EXR")
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels, header = file.channels(), dict(file.header())

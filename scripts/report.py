@@ -41,7 +41,7 @@ from analysis import (
 )
 from metrics import rel_mse_epsilon
 from mistakes import answered
-from mitsuba_bdpt.cli.files import replacing
+from mitsuba_bdpt.files.whole import replacing
 from tables import ranged, ratio, said, table
 
 

@@ -29,7 +29,7 @@ import reference  # noqa: E402
 from metrics import tone_map  # noqa: E402
 from mistakes import answered, check_output  # noqa: E402
 from mitsuba_bdpt.cli.arguments import number  # noqa: E402
-from mitsuba_bdpt.cli.render import write_images  # noqa: E402
+from mitsuba_bdpt.files.images import write_images  # noqa: E402
 
 KINDS = ("weighted", "unweighted")
 

@@ -47,8 +47,10 @@ from timing import timed
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
-from mitsuba_bdpt.cli import cluster, render  # isort: skip
-from mitsuba_bdpt.cli.files import replacing  # isort: skip
+from mitsuba_bdpt import workers  # isort: skip
+from mitsuba_bdpt.errors import message  # isort: skip
+from mitsuba_bdpt.host.versions import versions  # isort: skip
+from mitsuba_bdpt.files.whole import replacing  # isort: skip
 from mitsuba_bdpt.run.rendering import raise_interrupt  # isort: skip
 
 CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
@@ -82,7 +84,7 @@ class Cell:
 
 def software() -> dict:
     """Versions of what renders, the plugin's source among them."""
-    return render.versions() | {"source": reference.source_digest()}
+    return versions() | {"source": reference.source_digest()}
 
 
 def machine() -> str:
@@ -293,7 +295,7 @@ def on_worker(scripts: str, *arguments):
 
 def measured(preset: str, scene: str, cells: list[dict]) -> list:
     """Row and image of each cell, or why it failed, as text; one after the other."""
-    with cluster.one_at_a_time:
+    with workers.one_at_a_time:
         mi.set_variant("llvm_ad_rgb")
         bench, found = _bench(preset, scene, cells[0]["scene_sha256"]), []
         for entry in cells:
@@ -305,7 +307,7 @@ def measured(preset: str, scene: str, cells: list[dict]) -> list:
             try:
                 found.append(measure(bench, cell))
             except Exception as error:  # one cell must not cost the others
-                found.append(render.message(error))
+                found.append(message(error))
         return found
 
 
@@ -405,7 +407,7 @@ class Sweep:
             self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
             raise_interrupt(error)
-            self.failed.append(f"{_description(cell)}: {render.message(error)}")
+            self.failed.append(f"{_description(cell)}: {message(error)}")
         self.progress.advance(self._task)
 
     def _store(self, cells: Cells, cell: Cell, result):
@@ -428,7 +430,7 @@ class Sweep:
                 (scripts, preset, cells.subject.name, [asdict(cell) for cell in group])
                 for cells, group in groups
             ]
-            for index, results in cluster.results(client, on_worker, calls):
+            for index, results in workers.results(client, on_worker, calls):
                 cells, group = groups[index]
                 for cell, result in zip(group, results, strict=True):
                     if isinstance(result, str):
@@ -571,7 +573,7 @@ def main() -> int:
     with Progress(*columns) as progress:
         sweep = Sweep(preset, output, progress)
         if args.scheduler:
-            with cluster.connected(args.scheduler) as client:
+            with workers.connected(args.scheduler) as client:
                 sweep.run((client, args.preset.read_text()))
         else:
             sweep.run()

@@ -310,7 +310,7 @@ def test_a_sweep_on_a_cluster(folder, monkeypatch, workers):
         here, remote = (table[key] for table in ours)
         assert remote["rel_mse"] == pytest.approx(here["rel_mse"], rel=1e-3) and remote["seconds"] > 0
         assert (folder / "there" / "images" / "cornell_box" / f"{key}.exr").exists()
-    monkeypatch.setattr(sweep.cluster, "results", None)
+    monkeypatch.setattr(sweep.workers, "results", None)
     assert sweep.main() == 0
 
 

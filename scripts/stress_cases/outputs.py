@@ -15,7 +15,8 @@ from unittest import mock
 
 import reference
 from mitsuba_bdpt.cli import arguments as __main__
-from mitsuba_bdpt.cli import files, render
+from mitsuba_bdpt.cli import render
+from mitsuba_bdpt.files.whole import MAGIC
 
 import mitsuba as mi  # isort: skip
 
@@ -131,7 +132,7 @@ def _no_file(folder: Path, kind: str) -> Path:
     elif kind == "a text":
         (folder / "a.exr").write_text("precious")
     elif kind == "a PNG named EXR":
-        (folder / "a.exr").write_bytes(files.MAGIC[".png"] + b"precious")
+        (folder / "a.exr").write_bytes(MAGIC[".png"] + b"precious")
     elif kind == "a folder where the checkpoint goes":
         (folder / "a.checkpoint.npz").mkdir()
     elif kind == "no name":
