@@ -17,17 +17,16 @@ import statistics
 import sys
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
-from tables import table
+from mitsuba_bdpt.measure.tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr
-import metrics
-import reference
-from mistakes import answered
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import metrics, reference
+from mitsuba_bdpt.measure.reference import RESOLUTION, benchmark_depth
+from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.planning import choice, moments, pilot
 from mitsuba_bdpt.run import rendering
-from reference import RESOLUTION, benchmark_depth
-from timing import timed
 
 SPP, LANES, ROUNDS = 64, 1 << 15, 4
 

@@ -29,13 +29,13 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
-import reference
-from mistakes import answered
 from mitsuba_bdpt.cli import arguments as command
+from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.render import INTERRUPTED
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.report import replace_part, write_text
+from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.settings import HEURISTICS
-from report import replace_part, write_text
-from tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip

@@ -23,7 +23,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from mistakes import answered
+from mitsuba_bdpt.cli.mistakes import answered
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"

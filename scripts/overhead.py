@@ -23,11 +23,11 @@ import sys
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import reference
-from mistakes import answered
-from reference import benchmark_depth
-from tables import table
-from timing import timed
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.reference import benchmark_depth
+from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.timing import timed
 
 ROUNDS, SHORT, LONG = 7, 4, 64
 

@@ -16,12 +16,11 @@ import sys
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import metrics
 import numpy as np
-import reference
-from mistakes import answered
-from reference import RESOLUTION, benchmark_depth
-from tables import table
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import metrics, reference
+from mitsuba_bdpt.measure.reference import RESOLUTION, benchmark_depth
+from mitsuba_bdpt.measure.tables import table
 
 BUDGETS, SEEDS = (16, 64), 5
 

@@ -18,11 +18,11 @@ import statistics
 import sys
 import tempfile
 
-from mistakes import answered
 from mitsuba_bdpt.cli import arguments as command
-from probes import numbers
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure.probes import numbers
+from mitsuba_bdpt.measure.tables import table
 from room import MOST
-from tables import table
 
 COUNTS = ((1, 1), (30, 1), (300, 1), (1, 10), (1, 100))
 

@@ -13,11 +13,11 @@ import argparse
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-import reference
-from metrics import rel_mse
-from mistakes import answered
 from mitsuba_bdpt.cli.arguments import number
-from reference import RESOLUTION, benchmark_depth
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.metrics import rel_mse
+from mitsuba_bdpt.measure.reference import RESOLUTION, benchmark_depth
 
 import mitsuba as mi  # isort: skip
 

@@ -14,14 +14,14 @@ import sys
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-from metrics import TRIM
-from mistakes import answered
-from reference import benchmark_depth
-from tables import table
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure.metrics import TRIM
+from mitsuba_bdpt.measure.reference import benchmark_depth
+from mitsuba_bdpt.measure.tables import table
 
 import mitsuba as mi  # isort: skip
-import reference
-from strategies import technique_images
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.pyramid import technique_images
 
 RESOLUTION, SPP, RENDERS, SHOWN = 64, 8, 24, 6
 

@@ -19,9 +19,9 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
-import reference
 from mitsuba_bdpt.cli.arguments import number
-from report import replace_part, table, write_text
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.report import replace_part, table, write_text
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
 

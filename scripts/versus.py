@@ -26,11 +26,11 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-import reference
-from metrics import TRIM, rel_mse
-from mistakes import answered
 from mitsuba_bdpt.cli.arguments import number
-from tables import table
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from mitsuba_bdpt.measure.tables import table
 
 import mitsuba as mi  # isort: skip
 

@@ -6,18 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import analysis
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-import reference
-import report
-from analysis import Biased, Refused, Results
-from metrics import Means
-from preset import read_preset
-from reference import Reference
+from mitsuba_bdpt.measure import analysis, reference, report
+from mitsuba_bdpt.measure.analysis import Biased, Refused, Results
+from mitsuba_bdpt.measure.metrics import Means
+from mitsuba_bdpt.measure.preset import read_preset
+from mitsuba_bdpt.measure.reference import Reference
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUE = np.full(51, 2.0)

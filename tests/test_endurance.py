@@ -12,7 +12,7 @@ import endurance
 import mitsuba as mi
 import numpy as np
 import pytest
-import reference
+from mitsuba_bdpt.measure import reference
 
 SCRIPT = Path(endurance.__file__)
 TINY = ["--render-samples", "2048"]

@@ -3,12 +3,10 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
-import fireflies
 import mitsuba as mi
 import numpy as np
 import pytest
-import reconstruct
-import recording
+from mitsuba_bdpt.measure import fireflies, reconstruct, recording
 from scene_parts import T, grey
 
 

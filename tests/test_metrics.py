@@ -7,13 +7,13 @@ import os
 import subprocess
 import sys
 
-import metrics
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from metrics import Estimate, Measurement, Sample
+from mitsuba_bdpt.measure import metrics
+from mitsuba_bdpt.measure.metrics import Estimate, Measurement, Sample
 from scipy import stats
 
 quick = settings(deadline=None, max_examples=40, derandomize=True)

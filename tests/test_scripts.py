@@ -7,16 +7,14 @@ import shutil
 import sys
 from pathlib import Path
 
-import compare
-import equal_time
 import matplotlib.image
-import mistakes
 import mitsuba as mi
 import mutants
 import numpy as np
 import pytest
-import reference
 import versus
+from mitsuba_bdpt.cli import mistakes
+from mitsuba_bdpt.measure import compare, equal_time, reference
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 

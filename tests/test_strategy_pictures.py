@@ -1,11 +1,10 @@
-"""Pictures of single strategies: scripts/strategies.py."""
+"""Pictures of single strategies: scripts/pyramid.py."""
 
 import matplotlib.image
 import numpy as np
 import OpenEXR
 import pytest
-import reference
-import strategies
+from mitsuba_bdpt.measure import pyramid, reference
 
 SCENE = """<scene version="3.0.0">
     <default name="spp" value="4"/> <default name="resolution" value="16"/>
@@ -29,7 +28,7 @@ def test_pyramid(tmp_path, capsys):
     file = tmp_path / "room.xml"
     file.write_text(SCENE)
     output = tmp_path / "made" / "room"
-    strategies.main([str(file), "-o", str(output), "--max-depth", "3", "--spp", "8", "--resolution", "16"])
+    pyramid.main([str(file), "-o", str(output), "--max-depth", "3", "--spp", "8", "--resolution", "16"])
     said = capsys.readouterr().out.split()
     assert said == [f"{output}_weighted.png", f"{output}_unweighted.png"]
     with OpenEXR.File(str(output.with_suffix(".exr")), separate_channels=True) as opened:
@@ -52,9 +51,9 @@ def test_panels_are_those_that_contribute():
     for name in ("weighted.s0t2.R", "weighted.s1t2.G"):
         image[..., 3 + names.index(name)] = 1
     image[0, 0, 3 + names.index("weighted.s2t2.B")] = 1
-    images = strategies.technique_images(image, names, "weighted")
+    images = pyramid.technique_images(image, names, "weighted")
     assert images[2, 1, 2].shape == (2, 2, 3) and len(images) == 12
-    assert list(strategies.panels(images)) == [(2, 1, 2), (3, 2, 2)]
+    assert list(pyramid.panels(images)) == [(2, 1, 2), (3, 2, 2)]
 
 
 def test_scenes_by_name_or_file(tmp_path):

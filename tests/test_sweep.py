@@ -9,17 +9,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import analysis
-import metrics
 import mitsuba as mi
 import numpy as np
 import OpenEXR
-import probes
 import pyarrow.parquet
 import pytest
-import reference
-import sweep
-from preset import read_preset
+from mitsuba_bdpt.measure import analysis, metrics, probes, reference, sweep
+from mitsuba_bdpt.measure.preset import read_preset
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESET = """
@@ -508,8 +504,7 @@ def test_a_killed_sweep_loses_one_cell_at_most(folder):
     reference.make(job(3))
     path, output = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 10")), folder / "out"
     code = (
-        f"import sys; sys.path.insert(0, {str(ROOT / 'scripts')!r})\n"
-        "import sweep, reference; from pathlib import Path\n"
+        "import sys; from mitsuba_bdpt.measure import sweep, reference; from pathlib import Path\n"
         f"reference.REFERENCES = Path({str(folder / 'references')!r})\n"
         f"sys.argv = ['sweep.py', {str(path)!r}, '-o', {str(output)!r}]\n"
         "sys.exit(sweep.main())\n"

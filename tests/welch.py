@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from metrics import Sample, sidak, tile_means  # noqa: F401  (tile_means for the tests)
-from metrics import welch as difference
+from mitsuba_bdpt.measure.metrics import Sample, sidak, tile_means  # noqa: F401  (tile_means for the tests)
+from mitsuba_bdpt.measure.metrics import welch as difference
 from scipy import stats
 
 # Level of a whole family of comparisons, after Sidak's correction. Seeds are fixed, so a test

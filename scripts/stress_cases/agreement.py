@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from metrics import Sample, sidak, tile_means, welch
+from mitsuba_bdpt.measure.metrics import Sample, sidak, tile_means, welch
 from scipy import stats
 
 import mitsuba as mi  # isort: skip

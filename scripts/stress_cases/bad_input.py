@@ -7,9 +7,9 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import reference
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from mitsuba_bdpt.measure import reference
 from mitsuba_bdpt.settings import Settings
 
 import mitsuba as mi  # isort: skip

@@ -20,9 +20,9 @@ from mitsuba_bdpt.transport import bsdf, kernel, techniques
 
 import mitsuba as mi  # isort: skip
 
-from endpoints import Camera, disks_of, dot, lamps_of, length2
+from mitsuba_bdpt.measure.endpoints import Camera, disks_of, dot, lamps_of, length2
+from mitsuba_bdpt.measure.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 from mitsuba_bdpt.transport import connections
-from oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.

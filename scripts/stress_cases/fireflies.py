@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-import fireflies
 import numpy as np
-import reference
-from reference import benchmark_depth
+from mitsuba_bdpt.measure import fireflies, reference
+from mitsuba_bdpt.measure.reference import benchmark_depth
 
 import mitsuba as mi  # isort: skip
 

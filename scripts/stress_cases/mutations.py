@@ -8,7 +8,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import reference
+from mitsuba_bdpt.measure import reference
 
 VALUES = ("nan", "inf", "-inf", "1e39", "1e-39", "-1", "0", "", "x" * 100_000, "true", "1e9", "0.5, 0.5", "7")
 TAGS = ("float", "integer", "string", "boolean", "rgb", "spectrum", "point", "vector", "transform", "texture")

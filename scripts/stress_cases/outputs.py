@@ -13,10 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
-import reference
 from mitsuba_bdpt.cli import arguments as __main__
 from mitsuba_bdpt.cli import render
 from mitsuba_bdpt.files.whole import MAGIC
+from mitsuba_bdpt.measure import reference
 
 import mitsuba as mi  # isort: skip
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import reference
-from metrics import Sample
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.metrics import Sample
 
 import mitsuba as mi  # isort: skip
 

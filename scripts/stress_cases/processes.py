@@ -16,7 +16,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
-import reference
+from mitsuba_bdpt.measure import reference
 from mitsuba_bdpt.planning import choice
 
 import mitsuba as mi  # isort: skip

@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 
 import mitsuba as mi  # isort: skip
 
-import oracle
-from oracle import Paths
+from mitsuba_bdpt.measure import oracle
+from mitsuba_bdpt.measure.oracle import Paths
 
 from .capture import Capture
 from .case import Case, Outcome

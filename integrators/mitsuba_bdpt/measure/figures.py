@@ -10,7 +10,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from analysis import (  # noqa: E402
+from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
+
+from .analysis import (  # noqa: E402
     ALONE,
     INDEPENDENT,
     LIGHT_TRACER,
@@ -22,7 +24,6 @@ from analysis import (  # noqa: E402
     check_judged,
     select,
 )
-from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from metrics import (
+
+from .metrics import (
     FEWEST_RUNS,
     BiasCheck,
     Estimate,

@@ -37,7 +37,8 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 """
 
 FLOOR = """
-import sys, floor, mitsuba as mi
+import sys, mitsuba_bdpt, mitsuba as mi
+from mitsuba_bdpt.measure import floor
 mi.set_variant('llvm_ad_rgb')
 print(*floor.measure(sys.argv[1], int(sys.argv[2])))
 """

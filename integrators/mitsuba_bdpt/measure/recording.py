@@ -13,17 +13,15 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from unittest import mock
 
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import drjit as dr  # isort: skip
-import mitsuba as mi  # isort: skip
-from mitsuba_bdpt.transport import bsdf, kernel  # isort: skip
-from mitsuba_bdpt.emitters import emitters  # isort: skip
-from mitsuba_bdpt.run import rendering  # isort: skip
-from mitsuba_bdpt.image import sink  # isort: skip
-from mitsuba_bdpt.geometry import rays  # isort: skip
-from mitsuba_bdpt.transport import connections  # isort: skip
+from ..emitters import emitters
+from ..geometry import rays
+from ..image import sink
+from ..run import rendering
+from ..transport import bsdf, connections, kernel
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8

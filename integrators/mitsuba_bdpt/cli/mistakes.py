@@ -28,7 +28,7 @@ from mitsuba_bdpt.files.images import prepare_output
 from mitsuba_bdpt.files.whole import check_format, check_writable
 
 STATUS = 2
-SOURCES = Path(__file__).resolve().parent, Path(mitsuba_bdpt.__file__).resolve().parent
+SOURCES = Path(mitsuba_bdpt.__file__).resolve().parent, Path.cwd() / "scripts"
 
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 

@@ -38,9 +38,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import probes
-import reference
-from metrics import TILES
+from . import probes, reference
+from .metrics import TILES
 
 MATCHES = ("seconds", "spp")
 
