@@ -22,11 +22,11 @@ from mitsuba_bdpt.measure.tables import table
 import mitsuba as mi  # isort: skip
 import drjit as dr
 from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure import metrics, reference
-from mitsuba_bdpt.measure.reference import RESOLUTION, benchmark_depth
+from mitsuba_bdpt.measure import metrics
 from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.planning import choice, moments, pilot
 from mitsuba_bdpt.run import rendering
+from repository import RESOLUTION, benchmark_depth, load_reference, load_scene
 
 SPP, LANES, ROUNDS = 64, 1 << 15, 4
 
@@ -76,8 +76,8 @@ def rendered(scene, depth: int, made: choice.Decision, expected) -> tuple[float,
 
 def lines(name: str, depth: int) -> list:
     """Rows of a scene's table."""
-    scene = reference.load_scene(name, resolution=RESOLUTION)
-    expected = reference.load_reference(name, RESOLUTION, depth).image
+    scene = load_scene(name, resolution=RESOLUTION)
+    expected = load_reference(name, RESOLUTION, depth).image
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     moments = predicted(scene, settings)
     rows, alone = [], None

@@ -1,9 +1,8 @@
-"""The same as `mitsuba_bdpt.measure.compare`."""
+"""Two ways to render, alternating: ``python -m mitsuba_bdpt compare``, in this repository."""
 
 import sys
 
-from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.compare import main
+from repository import verb
 
 if __name__ == "__main__":
-    sys.exit(answered(main))
+    sys.exit(verb("compare"))

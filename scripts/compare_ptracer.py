@@ -20,7 +20,8 @@ from pathlib import Path
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.report import replace_part, write_text
+from mitsuba_bdpt.files.texts import write_text
+from mitsuba_bdpt.measure.report import replace_part
 from mitsuba_bdpt.measure.tables import table
 
 import mitsuba as mi  # isort: skip

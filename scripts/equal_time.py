@@ -1,9 +1,8 @@
-"""The same as `mitsuba_bdpt.measure.equal_time`."""
+"""Integrators side by side at equal time: ``python -m mitsuba_bdpt equal-time``, in this repository."""
 
 import sys
 
-from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.equal_time import main
+from repository import verb
 
 if __name__ == "__main__":
-    sys.exit(answered(main))
+    sys.exit(verb("equal-time"))

@@ -1,9 +1,8 @@
-"""The same as `mitsuba_bdpt.measure.fireflies`."""
+"""The paths behind the worst values: ``python -m mitsuba_bdpt fireflies``, in this repository."""
 
 import sys
 
-from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.fireflies import main
+from repository import verb
 
 if __name__ == "__main__":
-    sys.exit(answered(main))
+    sys.exit(verb("fireflies"))

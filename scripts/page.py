@@ -1,9 +1,8 @@
-"""The same as `mitsuba_bdpt.measure.page`."""
+"""A sweep as one HTML file: ``python -m mitsuba_bdpt page``, in this repository."""
 
 import sys
 
-from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.page import main
+from repository import verb
 
 if __name__ == "__main__":
-    sys.exit(answered(main))
+    sys.exit(verb("page"))

@@ -24,7 +24,7 @@ import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
-from mitsuba_bdpt.measure.reference import RESOLUTION, load_reference, load_scene
+from repository import RESOLUTION, load_reference, load_scene
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

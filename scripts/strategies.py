@@ -1,9 +1,8 @@
-"""The same as `mitsuba_bdpt.measure.pyramid`."""
+"""The technique pyramid of a scene: ``python -m mitsuba_bdpt pyramid``, in this repository."""
 
 import sys
 
-from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.pyramid import main
+from repository import verb
 
 if __name__ == "__main__":
-    sys.exit(answered(main))
+    sys.exit(verb("pyramid"))

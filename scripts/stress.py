@@ -19,16 +19,18 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
-from mitsuba_bdpt.cli.arguments import number
+import repository
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.measure import reference
-from mitsuba_bdpt.measure.report import replace_part, table, write_text
+from mitsuba_bdpt.measure.report import replace_part, table
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
 
 import mitsuba as mi  # isort: skip
 
-RECORD = reference.ROOT / "docs" / "stress.json"
-PAGE = reference.ROOT / "docs" / "stress.md"
+RECORD = repository.ROOT / "docs" / "stress.json"
+PAGE = repository.ROOT / "docs" / "stress.md"
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.

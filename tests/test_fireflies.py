@@ -1,4 +1,4 @@
-"""The paths behind the worst values: scripts/fireflies.py, with recording.py and reconstruct.py."""
+"""The paths behind the worst values: the command `fireflies`, its recording and its reconstruction."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -3,7 +3,6 @@
 Each docstring or comment has the arithmetic. Where a bound is statistical it is named; seeds are fixed.
 """
 
-import os
 import subprocess
 import sys
 
@@ -204,7 +203,8 @@ def test_hdr_flip_refuses_what_ends_the_process():
     In a process of its own: the output of C++ does not pass through Python.
     """
     code = """
-import numpy as np, metrics
+import numpy as np
+from mitsuba_bdpt.measure import metrics
 dark, gray = np.zeros((4, 4, 3)), np.ones((4, 4, 3))
 for image, reference in ((gray, dark), (gray, 2.3e-7 * gray), (-gray, gray), (1e39 * gray, gray)):
     try:
@@ -215,10 +215,7 @@ for image, reference in ((gray, dark), (gray, 2.3e-7 * gray), (-gray, gray), (1e
 metrics.hdr_flip(gray, 2.5e-7 * gray)
 metrics.hdr_flip(dark, gray)
 """
-    path = os.path.dirname(metrics.__file__)
-    found = [path, *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(found)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 

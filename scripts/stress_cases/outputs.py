@@ -13,10 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
+import repository
 from mitsuba_bdpt.cli import arguments as __main__
 from mitsuba_bdpt.cli import render
 from mitsuba_bdpt.files.whole import MAGIC
-from mitsuba_bdpt.measure import reference
 
 import mitsuba as mi  # isort: skip
 
@@ -91,7 +91,7 @@ def missing_files() -> Outcome:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "folder").mkdir()
-        mesh, texture = next((reference.ROOT / "scenes" / "meshes").glob("*.ply")), folder / "whole.exr"
+        mesh, texture = next((repository.ROOT / "scenes" / "meshes").glob("*.ply")), folder / "whole.exr"
         mi.Bitmap(mi.TensorXf([0.5] * 3000, shape=(25, 40, 3))).write(str(texture))
         _half(mesh, folder / "half.ply")
         _half(texture, folder / "half.exr")
@@ -251,7 +251,7 @@ type = "bdpt"
 
 
 def _sweep(folder: Path, preset: Path, keywords: dict):
-    command = [sys.executable, str(reference.ROOT / "scripts" / "sweep.py"), str(preset), "-o", str(folder)]
+    command = [sys.executable, str(repository.ROOT / "scripts" / "sweep.py"), str(preset), "-o", str(folder)]
     return subprocess.run(
         command, capture_output=True, text=True, env=child.environment(), check=False, **keywords
     )

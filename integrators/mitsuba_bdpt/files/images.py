@@ -1,4 +1,4 @@
-"""Image files: EXR with a PNG beside it."""
+"""Image files: EXR with a PNG beside it, layers of an EXR."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 
 from ..errors import CommandError
-from .whole import check_format, check_writable, replacing
+from .whole import MAGIC, check_format, check_writable, replacing
 
 PNG_SIDE = 1_000_000
 """Pixels in a row or column of a PNG, at most: libpng's limit."""
@@ -83,3 +84,46 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
     bitmap.write(stream, file_format)
     with replacing(path) as temporary:
         temporary.write_bytes(stream.raw_buffer())
+
+
+def check_output(path: Path, suffix: str) -> None:
+    """Refuse, before anything is rendered, an output of another ``suffix``, one that cannot be written, and
+    one that would overwrite an image of another format; its folder is made. With an EXR goes a PNG of its
+    name, as from the command ``render``."""
+    if suffix == ".exr":
+        prepare_output(path)
+        return
+    if path.suffix.lower() != suffix:
+        raise CommandError(f"output={str(path)!r} must end in {suffix}")
+    check_format(path, path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
+
+
+def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
+    """An EXR of layers {prefix: (height, width, 3)}, written by `replacing`."""
+    channels = {
+        f"{layer}{c}": np.ascontiguousarray(pixels[..., i]).astype(dtype)
+        for layer, pixels in layers.items()
+        for i, c in enumerate("RGB")
+    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
+
+
+def read_layers(path: Path, *layers: str):
+    """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_layers`, and its header; raises
+    ``ValueError`` for another file."""
+    with path.open("rb") as file:  # OpenEXR does not say what hinders it
+        start = file.read(4)
+    if start != MAGIC[".exr"]:
+        raise CommandError(f"{str(path)!r} is not an EXR")
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels, header = file.channels(), dict(file.header())
+        missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
+        if missing:
+            raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")
+        images = [np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1) for layer in layers]
+    return [image.astype(np.float64) for image in images], header

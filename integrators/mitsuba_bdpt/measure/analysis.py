@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..errors import CommandError
 from .metrics import (
     FEWEST_RUNS,
     BiasCheck,
@@ -41,7 +42,7 @@ LIGHT_TRACER = "ptracer"
 DECIDING = 64
 
 
-class Refused(ValueError):
+class Refused(CommandError):
     """A figure that the data cannot give; the text says why."""
 
 

@@ -1,20 +1,15 @@
 """Pictures of integrators side by side at equal time: images, magnified windows, error maps.
 
-    python scripts/equal_time.py veach_bidir --spp 25    # renders/equal_time_veach_bidir.png: path, bdpt
-    python scripts/equal_time.py veach_mis --spp 16 -i "bdpt heuristic=power" "bdpt heuristic=balance"
-    python scripts/equal_time.py my_room.xml --reference my_room_4096spp.exr
-
-The last integrator has ``--spp`` samples per pixel, the others as many as fit into its seconds. Errors are
-against the scene's reference in references/, at its size and the depth of the benchmark; for a file that is
-not in scenes/ against ``--reference``, at the file's own size and depth. Windows are where the errors differ
+The last integrator has the samples per pixel that are asked for, the others as many as fit into its seconds.
+Errors are against a reference of the project, at its size and depth, which is made first if there is none; or
+against an image that is given, at the scene file's own size and depth. Windows are where the errors differ
 most.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import re
+from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,13 +17,14 @@ import matplotlib
 import mitsuba as mi
 import numpy as np
 
-from ..cli.arguments import number
-from ..cli.mistakes import check_output
+from ..errors import CommandError
+from ..files.images import check_output, read_layers
 from ..files.loading import choose_sensor
 from ..files.whole import replacing
-from . import reference
+from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
-from .reference import RESOLUTION, benchmark_depth
+from .project import RESOLUTION, Project
+from .scenes import SceneFile, depth_of, integrator_of
 from .timing import timed
 
 matplotlib.use("Agg")
@@ -58,33 +54,22 @@ class Shot:
         return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.rel_mse:.2g} (trimmed)"
 
 
-def subject(path: Path, sampler: str | None, exr: Path | None):
-    """Scene, reference and ``max_depth`` of a scene's file, whose reference is in ``exr`` if given."""
-    own = {"sampler": sampler} if sampler else {}
-    if path.resolve().parent == reference.SCENES and exr is None:
-        depth = benchmark_depth(path.stem)
-        target = reference.load_reference(path.stem, RESOLUTION, depth).image
-        return reference.load_file(path, resolution=RESOLUTION, **own), target, depth
-    if exr is None:
-        raise ValueError(
-            f"scene={str(path)!r} is not in scenes/ and has no reference; give one with --reference "
-            f"FILE.exr, which python -m mitsuba_bdpt render {path} --spp 4096 -o FILE.exr makes"
-        )
-    (target,), _ = reference.read_exr(exr, "")
-    scene = reference.load_file(path, **own)
+def subject(project: Project, file: SceneFile, options: Namespace):
+    """Scene, image to take errors against, and ``max_depth``, as the command line ``options`` say."""
+    if options.reference is None:
+        seconds = options.reference_seconds
+        job = Job(project, file, options.resolution or RESOLUTION, None, options.spp, seconds)
+        target = obtained(job).image
+        return file.load(job.resolution, options.sampler), target, job.depth
+    (target,), _ = read_layers(options.reference, "")
+    scene = file.load(options.resolution, options.sampler)
     width, height = (int(n) for n in choose_sensor(scene, 0).film().crop_size())
     if target.shape[:2] != (height, width):
-        raise ValueError(
-            f"reference={str(exr)!r} has {target.shape[1]} x {target.shape[0]} pixels, the film of "
-            f"{str(path)!r} {width} x {height}; render it from this file"
+        raise CommandError(
+            f"reference={str(options.reference)!r} has {target.shape[1]} x {target.shape[0]} pixels, the "
+            f"film of {str(file.file)!r} {width} x {height}; render it from this file"
         )
     return scene, target, depth_of(scene.integrator())
-
-
-def depth_of(made) -> int:
-    """The ``max_depth`` of an integrator, which Mitsuba's own tell in their text alone; -1 without one."""
-    found = re.search(r"\bmax_depth = (\d+)", str(made))
-    return int(found[1]) if found and int(found[1]) < 2**31 else -1
 
 
 def seconds(scene, made, spp: int) -> float:
@@ -92,11 +77,12 @@ def seconds(scene, made, spp: int) -> float:
     return float(np.median([timed(scene, made, spp, seed)[1] for seed in range(TIMED + 1)][1:]))
 
 
-def shots(scene, target: np.ndarray, names: list[str], depth: int, spp: int) -> list[Shot]:
-    """All integrators; the last has ``spp`` samples per pixel, others as many as its seconds allow."""
-    made = [reference.integrator_of(name, depth) for name in names]
+def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int) -> list[Shot]:
+    """All integrators, parameters of plugins by what is written beneath; the last has ``spp`` samples per
+    pixel, others as many as its seconds allow."""
+    made = [integrator_of(parameters, depth) for parameters in ways.values()]
     limit, found = seconds(scene, made[-1], spp), []
-    for name, one in zip(names, made, strict=True):
+    for name, one in zip(ways, made, strict=True):
         count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))
         seconds(scene, one, count)  # Mitsuba compiles anew for each number of samples
         image, taken = timed(scene, one, count, seed=7)
@@ -153,29 +139,17 @@ def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
     plt.close(figure)
 
 
-def main(arguments=None) -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scene", help="a scene file, or a name in scenes/ that has a reference")
-    parser.add_argument("--spp", type=number(int, 1), default=64, help="of the last integrator")
-    text = "TYPE KEY=VALUE …, each in quotes; default: path bdpt"
-    parser.add_argument("-i", "--integrators", nargs="+", default=["path", "bdpt"], help=text)
-    text = "value of $sampler in the scene file, of the sensor; default: the file's"
-    parser.add_argument("--sampler", help=text)
-    text = "image to take errors against; default: the one in references/"
-    parser.add_argument("--reference", type=Path, metavar="EXR", help=text)
-    parser.add_argument("-o", "--output", type=Path, help="default: renders/equal_time_SCENE.png")
-    args = parser.parse_args(arguments)
+def run(options: Namespace) -> int:
+    """Draw what the command line ``options`` ask for."""
     mi.set_variant("llvm_ad_rgb")
-    path = reference.find_scene(args.scene)
-    file = args.output or reference.ROOT / "renders" / f"equal_time_{path.stem}.png"
-    check_output(file, ".png")
-    scene, target, depth = subject(path, args.sampler, args.reference)
-    found = shots(scene, target, args.integrators, depth, args.spp)
-    draw(found, target, f"{path.stem}, equal time", file)
-    print(file)
+    project = Project(options.project)
+    file = project.scene(options.scene)
+    output = options.output or project.renders / f"equal_time_{file.name}.png"
+    check_output(output, ".png")
+    scene, target, depth = subject(project, file, options)
+    found = shots(scene, target, dict(options.integrators), depth, options.spp)
+    draw(found, target, f"{file.name}, equal time", output)
+    print(output)
     for shot in found:
         print(shot.caption.replace("\n", ", "))
     return 0

@@ -1,15 +1,12 @@
 """Name the paths behind the worst values of a scene's renders.
 
-    python scripts/fireflies.py glass_caustics thin_lens
-    python scripts/fireflies.py window_room --seeds 96 --top 4
-
-renders each scene with the benchmark's parameters and takes the samples that are worst against the reference:
-those that by themselves are off by more than ``--level`` times the value of their pixel. It traces them again
+Renders each scene with default parameters and takes the samples that are worst against the reference:
+those that by themselves are off by more than ``level`` times the value of their pixel. It traces them again
 (`recording`), finds each path anew with Mitsuba's own calls (`reconstruct`), and prints one line for each
 kind of path:
 
 * error: the share of the squared error of all renders that these samples have; largest: how far one is off,
-  in values of its pixel; samples: how many of the samples examined (``--top`` of each render).
+  in values of its pixel; samples: how many of the samples examined (``top`` of each render).
 * path: from the lamp L to the eye E in P. Heckbert's letters, S for delta events, G for rough ones, D for
   diffuse ones, and the materials on the way; `¦` is where the strategy joins light and camera vertices.
 * other strategies: the densest other one, with its density over that of the strategy that made the path, by
@@ -21,17 +18,18 @@ kind of path:
 
 from __future__ import annotations
 
-import argparse
+from argparse import Namespace
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..cli.arguments import number
-from . import oracle, reconstruct, recording, reference
+from . import oracle, reconstruct, recording
+from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon
-from .reference import benchmark_depth
+from .project import Project
+from .scenes import SceneFile, integrator_of
 from .tables import table
 
 # Estimates and weights are the same up to this.
@@ -80,8 +78,9 @@ class Names:
         return " ".join(found[::-1])
 
     def vertices(self, path) -> str:
-        """The materials between lamp and eye."""
-        return ", ".join(self._shapes[number].bsdf().id() for number in path.shapes[-2:0:-1])
+        """The materials between lamp and eye, by class where they have no name."""
+        bsdfs = (self._shapes[number].bsdf() for number in path.shapes[-2:0:-1])
+        return ", ".join(bsdf.id() or bsdf.class_name() for bsdf in bsdfs)
 
 
 def fireflies(scene, integrator, target, spp: int, seed: int, level: float, top: int):
@@ -193,12 +192,12 @@ HEAD = [
 ]
 
 
-def lines(name: str, options) -> tuple[list, str]:
+def lines(project: Project, file: SceneFile, options: Namespace) -> tuple[list, str]:
     """The rows of a scene, those with most error first, and what its renders were like."""
-    depth = options.max_depth or benchmark_depth(name)
-    scene = reference.load_scene(name, resolution=options.resolution)
-    target = reference.load_reference(name, options.resolution, depth).image.astype(float)
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
+    name, seconds = file.name, options.reference_seconds
+    job = Job(project, file, options.resolution, options.max_depth, options.spp, seconds)
+    target, scene = obtained(job).image, file.load(options.resolution)
+    integrator = integrator_of({"type": "bdpt"}, job.depth)
     kinds, errors, examined = {}, [], 0
     for seed in range(1, options.seeds + 1):
         image, found = fireflies(scene, integrator, target, options.spp, seed, options.level, options.top)
@@ -215,27 +214,14 @@ def lines(name: str, options) -> tuple[list, str]:
     ], f"`{name}`: {pairs}, found anew {anew} of {examined}"
 
 
-def main(arguments=None) -> int:
-    """Print the table, and the errors of the renders, raw and trimmed."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", nargs="+", help="names in scenes/")
-    whole = number(int, 1)
-    parser.add_argument("--seeds", type=whole, default=5, help="renders of each scene")
-    parser.add_argument("--spp", type=whole, default=64)
-    text = "one for which there is a reference; default %(default)s"
-    parser.add_argument("--resolution", type=whole, default=reference.RESOLUTION, help=text)
-    parser.add_argument("--max-depth", type=whole, help="default: that of the benchmark")
-    text = "values of its pixel, see above; default %(default)s"
-    parser.add_argument("--level", type=number(float, 1e-9), default=0.5, help=text)
-    parser.add_argument("--top", type=whole, default=12, help="samples examined of each render")
-    parser.add_argument("--lines", type=whole, default=6, help="kinds of paths of each scene")
-    options = parser.parse_args(arguments)
+def run(options: Namespace) -> int:
+    """Print the table that the command line ``options`` ask for, and the errors of the renders, raw and
+    trimmed."""
     mi.set_variant("llvm_ad_rgb")
+    project = Project(options.project)
     rows, said = [], []
-    for name in options.scenes:
-        more, errors = lines(name, options)
+    for scene in [project.scene(name) for name in options.scenes]:
+        more, errors = lines(project, scene, options)
         rows, said = rows + more, [*said, errors]
     print(table(HEAD, rows))
     print("relMSE of the renders (trimmed): " + "; ".join(said))

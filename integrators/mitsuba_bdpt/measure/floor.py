@@ -1,7 +1,5 @@
 """Kernel time over its floor: the very rays of a pass, replayed by themselves.
 
-    python scripts/floor.py cornell_box uplight_room veach_mis
-
 The loops of a pass are run step by step, and every call that traces rays is kept: one per kind and bounce
 (and camera subpath of a light subpath), with the lanes' masks. Each is then replayed as a kernel of its own,
 closest hits with ``compute_surface_interaction``. The floor is the time of these kernels; the pass is
@@ -10,21 +8,19 @@ measured as it is, one kernel, with the same plan and seed. Both sides alternate
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import gc
-import statistics
 
 import drjit as dr
 import mitsuba as mi
 
-from ..cli.arguments import number
 from ..host.jit import evaluated_mode
 from ..image import sink
 from ..run import rendering, schedule
 from ..sampling import points
 from ..transport.kernel import trace
-from . import reference
+from .project import RESOLUTION
+from .scenes import SceneFile, integrator_of
 
 SPP = 16
 
@@ -68,10 +64,9 @@ def kernel_seconds(work) -> float:
 class Pass:
     """One pass of a scene at 128^2, as a render of 64 samples per pixel decides it."""
 
-    def __init__(self, name: str, parameters: dict):
-        self._scene = reference.load_scene(name, resolution=reference.RESOLUTION)
-        depth = reference.default_depth(name)
-        integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
+    def __init__(self, file: SceneFile, parameters: dict):
+        self._scene = file.load(RESOLUTION)
+        integrator = integrator_of({"type": "bdpt"} | parameters, file.max_depth)
         self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
         self._render.decide()
         self._batch = schedule.batches(self._render.prepared.camera, 0, SPP, integrator.settings)[0]
@@ -103,12 +98,12 @@ class Pass:
             dr.eval(si.p.x + si.p.y + si.p.z + si.n.x + si.sh_frame.n.x + si.uv.x + si.wi.x + si.t)
 
 
-def measure(name: str, rounds: int, parameters=None) -> list[float]:
+def measure(file: SceneFile, rounds: int, parameters=None) -> list[float]:
     """Kernel time over the floor, a value per round."""
     # Kernels cannot be recorded as a whole any more where loops were run step by step.
-    calls = Pass(name, parameters or {}).rays()
+    calls = Pass(file, parameters or {}).rays()
     gc.collect()
-    subject = Pass(name, parameters or {})
+    subject = Pass(file, parameters or {})
     subject.trace()
     subject.replay(calls)
     ratios = []
@@ -117,17 +112,3 @@ def measure(name: str, rounds: int, parameters=None) -> list[float]:
         floor = kernel_seconds(lambda: subject.replay(calls))
         ratios.append(whole / floor)
     return ratios
-
-
-def main(arguments=None) -> int:
-    """Print the ratio per scene."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("scene", nargs="+")
-    parser.add_argument("--rounds", type=number(int, 1), default=5)
-    options = parser.parse_args(arguments)
-    mi.set_variant("llvm_ad_rgb")
-    for name in options.scene:
-        ratios = measure(name, options.rounds)
-        middle = statistics.median(ratios)
-        print(f"{name}: {middle:.2f}x the floor ({min(ratios):.2f}-{max(ratios):.2f})", flush=True)
-    return 0

@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from ..errors import CommandError
+
 # Confidence of an interval that is not asked for another.
 CONFIDENCE = 0.95
 
@@ -76,19 +78,19 @@ def _floats(name, value, shape) -> np.ndarray:
     try:
         array = np.asarray(value)
     except ValueError as error:
-        raise ValueError(f"{name} holds arrays of unlike shapes; give one of shape {words}.") from error
+        raise CommandError(f"{name} holds arrays of unlike shapes; give one of shape {words}.") from error
     if not np.issubdtype(array.dtype, np.floating):
         raise TypeError(
             f"{name} has values of type {array.dtype}; give linear radiance as floats of shape {words}."
         )
     if array.ndim != len(shape) or array.shape[-1] != 3 or array.size == 0:
-        raise ValueError(
+        raise CommandError(
             f"{name} has shape {array.shape} and must have {words}; drop other channels with [..., :3]."
         )
     wrong = np.argwhere(~np.isfinite(array))
     if len(wrong):
         first = tuple(int(i) for i in wrong[0])
-        raise ValueError(
+        raise CommandError(
             f"{name} holds {len(wrong)} values that are NaN or infinite, the first {array[first]} at index "
             f"{first}; find what made them in the renderer: no measure is defined for such an image."
         )
@@ -103,7 +105,7 @@ def _pair(image, reference):
     """Both images, checked, as float64 of shape (height, width, 3)."""
     image, reference = _image("image", image), _image("reference", reference)
     if image.shape != reference.shape:
-        raise ValueError(
+        raise CommandError(
             f"image has shape {image.shape} and reference {reference.shape}; render both at the same size."
         )
     return image, reference
@@ -115,7 +117,9 @@ def _number(name, value, low=-math.inf, high=math.inf) -> float:
         raise TypeError(f"{name}={value!r} must be a number.")
     if not (math.isfinite(value) and low < value < high):
         bounds = f"above {low:g}" if high == math.inf else f"between {low:g} and {high:g}, ends excluded"
-        raise ValueError(f"{name}={value!r} must be finite" + (f" and {bounds}." if low > -math.inf else "."))
+        raise CommandError(
+            f"{name}={value!r} must be finite" + (f" and {bounds}." if low > -math.inf else ".")
+        )
     return float(value)
 
 
@@ -126,10 +130,10 @@ def _values(name, values, at_least, low=-math.inf) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name}={values!r} must be a row of numbers.") from error
     if array.ndim != 1 or len(array) < at_least:
-        raise ValueError(f"{name} has shape {array.shape}; give at least {at_least} numbers in one row.")
+        raise CommandError(f"{name} has shape {array.shape}; give at least {at_least} numbers in one row.")
     if not (np.isfinite(array) & (array > low)).all():
         bound = f" and above {low:g}" if low > -math.inf else ""
-        raise ValueError(f"{name}={array.tolist()} must be finite{bound}; leave out runs that failed.")
+        raise CommandError(f"{name}={array.tolist()} must be finite{bound}; leave out runs that failed.")
     return array
 
 
@@ -146,7 +150,7 @@ def rel_mse_epsilon(reference) -> float:
     """
     epsilon = 0.01 * float(_image("reference", reference).mean()) ** 2
     if not epsilon > 0:
-        raise ValueError("reference has mean 0, so nothing is relative to it; use mse.")
+        raise CommandError("reference has mean 0, so nothing is relative to it; use mse.")
     return epsilon
 
 
@@ -187,7 +191,7 @@ def _relative_errors(image, reference, trim):
     error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
     keep = len(error) - round(trim * len(error))
     if keep == 0:
-        raise ValueError(f"trim={trim} leaves none of {len(error)} values; choose a smaller share.")
+        raise CommandError(f"trim={trim} leaves none of {len(error)} values; choose a smaller share.")
     return error, np.argpartition(error, keep - 1)[:keep]
 
 
@@ -200,7 +204,7 @@ def mape(image, reference) -> float:
     image, reference = _pair(image, reference)
     epsilon = 0.01 * float(reference.mean())
     if not epsilon > 0:
-        raise ValueError(f"reference has mean {reference.mean():g}, so nothing is relative to it; use mse.")
+        raise CommandError(f"reference has mean {reference.mean():g}, so nothing is relative to it; use mse.")
     return float(np.mean(np.abs(image - reference) / (np.abs(reference) + epsilon)))
 
 
@@ -212,7 +216,7 @@ def energy_in_black(image, reference) -> float:
     """
     image, reference = _pair(image, reference)
     if image.min() < 0:
-        raise ValueError(f"image holds negative values down to {image.min():g}; energies must not cancel.")
+        raise CommandError(f"image holds negative values down to {image.min():g}; energies must not cancel.")
     total = image.sum()
     black = (reference == 0).all(axis=-1)
     return float(image[black].sum() / total) if total > 0 else 0.0
@@ -276,17 +280,17 @@ def hdr_flip(image, reference):
     try:
         import flip_evaluator
     except ImportError as error:
-        raise ImportError("hdr_flip needs flip-evaluator: pip install 'mitsuba-bdpt[measure]'.") from error
+        raise CommandError("hdr_flip needs flip-evaluator: pip install 'mitsuba-bdpt[measure]'.") from error
     pair = _pair(image, reference)
     for name, x in zip(("image", "reference"), pair, strict=True):
         if x.min() < 0 or x.max() > np.finfo(np.float32).max:
-            raise ValueError(
+            raise CommandError(
                 f"{name} holds values from {x.min():g} to {x.max():g}; HDR-FLIP needs 0 to 3e38."
             )
     image, reference = (x.astype(np.float32) for x in pair)
     brightest = float((reference @ np.array([0.2126, 0.7152, 0.0722], np.float32)).max())
     if brightest < 2 * FLIP_DARKEST:
-        raise ValueError(
+        raise CommandError(
             f"reference has luminances up to {brightest:g} only, and HDR-FLIP cannot expose less than "
             f"{2 * FLIP_DARKEST:.1g}; scale both images by the same factor, or use mse if it is black."
         )
@@ -300,7 +304,7 @@ def tile_means(image, tiles: int) -> np.ndarray:
     image = np.asarray(image, dtype=np.float64)
     h, w, c = image.shape
     if not isinstance(tiles, Integral) or tiles < 1 or h % tiles or w % tiles:
-        raise ValueError(f"tiles={tiles!r} must be an integer that divides height {h} and width {w}.")
+        raise CommandError(f"tiles={tiles!r} must be an integer that divides height {h} and width {w}.")
     parts = image.reshape(tiles, h // tiles, tiles, w // tiles, c)
     return parts.mean(axis=(1, 3)).reshape(tiles * tiles, c)
 
@@ -426,7 +430,7 @@ class Means:
         """From ``columns`` (renders, 3 tiles^2 + 3), renders with seeds of their own."""
         columns = np.asarray(columns, dtype=np.float64)
         if len(columns) < FEWEST_RUNS:
-            raise ValueError(
+            raise CommandError(
                 f"{name} has {len(columns)} renders, too few for the test's level; give {FEWEST_RUNS} or "
                 "more."
             )
@@ -462,7 +466,7 @@ def _means_of_reference(reference, standard_error, tiles):
     reference = _image("references", reference)
     standard_error = _image("standard_error", standard_error)
     if standard_error.shape != reference.shape or standard_error.min() < 0:
-        raise ValueError(
+        raise CommandError(
             f"standard_error has shape {standard_error.shape} and values from {standard_error.min():g}; it "
             f"must have the reference's shape {reference.shape} and no negative values."
         )
@@ -489,7 +493,7 @@ def missing_energy(image: Sample, reference: Sample) -> Estimate:
     """
     x, r = float(image.mean[0]), float(reference.mean[0])
     if not r > 0:
-        raise ValueError(f"references have mean {r:g}; no share of it can be missing.")
+        raise CommandError(f"references have mean {r:g}; no share of it can be missing.")
     parts = float(image.error[0] / r) ** 2, float(x * reference.error[0] / r**2) ** 2
     freedom = satterthwaite(parts[0], image.freedom, parts[1], reference.freedom)
     return _student(1 - x / r, math.sqrt(sum(parts)), freedom, CONFIDENCE)
@@ -513,14 +517,16 @@ def bias_check(images, references, tiles=TILES, significance=SIGNIFICANCE, stand
     ours, shape = _means_of_runs("images", images, tiles)
     if np.ndim(references) == 3:
         if standard_error is None:
-            raise ValueError("standard_error=None: with one reference, give it as an image of its shape.")
+            raise CommandError("standard_error=None: with one reference, give it as an image of its shape.")
         theirs, their_shape = _means_of_reference(references, standard_error, tiles)
     else:
         if standard_error is not None:
-            raise ValueError("standard_error must be None with several references: their spread gives it.")
+            raise CommandError("standard_error must be None with several references: their spread gives it.")
         theirs, their_shape = _means_of_runs("references", references, tiles)
     if shape != their_shape:
-        raise ValueError(f"images have shape {shape} and references {their_shape}; render both at one size.")
+        raise CommandError(
+            f"images have shape {shape} and references {their_shape}; render both at one size."
+        )
     return compare_means(ours, theirs, significance)
 
 
@@ -528,7 +534,7 @@ def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> Bias
     """`bias_check` of what was kept of the renders on both sides."""
     significance = _number("significance", significance, 0, 1)
     if ours.tiles != theirs.tiles:
-        raise ValueError(
+        raise CommandError(
             f"ours has {ours.tiles} tiles along an edge and theirs {theirs.tiles}; take the same."
         )
     tiles = ours.tiles
@@ -598,12 +604,12 @@ def slope(samples, errors, confidence=CONFIDENCE, seed=0) -> Estimate:
     x = np.log(_values("samples", samples, 2, 0))
     errors = list(errors)
     if len(errors) != len(x):
-        raise ValueError(f"errors has {len(errors)} rows for {len(x)} samples; give one row for each.")
+        raise CommandError(f"errors has {len(errors)} rows for {len(x)} samples; give one row for each.")
     y = [np.log(_values(f"errors[{i}]", row, 2, 0)) for i, row in enumerate(errors)]
     runs = np.array([len(row) for row in y])
     offset = x - np.average(x, weights=runs)
     if np.ptp(x) == 0:
-        raise ValueError("samples are all the same; a slope needs at least two different counts.")
+        raise CommandError("samples are all the same; a slope needs at least two different counts.")
     weight = runs * offset / np.sum(runs * offset**2)
     rng = np.random.default_rng(seed)
     drawn = np.empty((RESAMPLES, len(y)))
@@ -652,7 +658,9 @@ def reference_refusal(own_error, measured_error) -> str:
     """The sentence that says why a figure is refused and how many more samples the reference needs."""
     share = _reference_share(own_error, measured_error)
     if share <= REFERENCE_SHARE:
-        raise ValueError(f"own_error={own_error!r} is good enough for {measured_error!r}; nothing to refuse.")
+        raise CommandError(
+            f"own_error={own_error!r} is good enough for {measured_error!r}; nothing to refuse."
+        )
     times = math.ceil(round(10 * share / REFERENCE_SHARE, 6)) / 10
     return (
         f"The reference carries {100 * share:.3g} % of the error measured with it ({own_error:.2e} of "

@@ -1,29 +1,29 @@
 """A sweep as one HTML file that needs neither network nor server.
 
-    python scripts/page.py results/small                    # writes results/small/page.html
-
-It says for each scene how the first integrator does beside `path`, and why, and shows images:
-those of the first seed at the deciding budget, in half precision, under a divider with exposure control, and
-error maps against the reference. Then come all renders as a table, and plots. scripts/page.html is its frame.
+It says for each scene how the first integrator does beside `path`, and why, and shows images: those of the
+first seed at the deciding budget, in half precision, under a divider with exposure control, and error maps
+against the reference. Then come all renders as a table, and plots. page.html is its frame.
 """
 
 from __future__ import annotations
 
-import argparse
 import base64
 import html
 import json
 import math
 import tempfile
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 
-from ..cli.mistakes import check_output
-from ..files.whole import replacing
+from ..files.images import check_output, read_layers
+from ..files.texts import write_text
 from ..planning.explain import subpaths
-from . import figures, reference, report
+from . import figures, report
 from .analysis import NOTHING, RIVALS, Biased, Refused, Results
+from .project import Project
+from .reference import HALF_MAX
 
 FRAME = Path(__file__).with_suffix(".html")
 
@@ -108,7 +108,7 @@ def answers(results: Results) -> str:
 
 def encoded(image: np.ndarray) -> str:
     """An image as base64 of half precision, as the page reads it."""
-    half = np.minimum(image, reference.HALF_MAX).astype("<f2")
+    half = np.minimum(image, HALF_MAX).astype("<f2")
     return base64.b64encode(half.tobytes()).decode()
 
 
@@ -121,7 +121,7 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
         file = folder / "images" / scene / f"{rows[0]['key']}.exr" if rows else None
         if file is None or not file.exists():
             continue
-        (image,), _ = reference.read_exr(file, "")
+        (image,), _ = read_layers(file, "")
         images[method] = encoded(image)
         row = rows[0]
         captions[method] = (
@@ -201,18 +201,13 @@ def page(folder: Path, results: Results, made: dict) -> str:
     return text
 
 
-def main() -> int:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path, help="a folder that scripts/sweep.py has filled")
-    parser.add_argument("-o", "--output", type=Path, help="default: FOLDER/page.html")
-    args = parser.parse_args()
-    output = args.output or args.folder / "page.html"
+def run(options: Namespace) -> int:
+    """Write the page that the command line ``options`` ask for."""
+    project = Project(options.project)
+    folder = project.results(options.folder)
+    output = options.output or folder / "page.html"
     check_output(output, ".html")
-    text = page(args.folder, *report.load(args.folder))
-    with replacing(output) as temporary:
-        temporary.write_text(text)
+    text = page(folder, *report.load(project, folder))
+    write_text(output, text)
     print(f"{output}: {len(text) / 2**20:.1f} MiB")
     return 0

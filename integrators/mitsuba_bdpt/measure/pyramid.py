@@ -1,8 +1,5 @@
 """The technique pyramid of a scene: what each strategy (s, t) makes of it.
 
-    python scripts/strategies.py veach_bidir -o renders/pyramid
-    python scripts/strategies.py scenes/pool.xml --max-depth 4 --spp 256 -o renders/pool
-
 A row for each path length of k = 2, 3, ... edges with the k + 2 ways (s, t) to make such paths, s light
 vertices and t camera vertices, brightened by 2^(k-1); strategies that contribute nothing are left out.
 
@@ -13,23 +10,22 @@ the image, and OUTPUT_unweighted.png, in which each panel is an estimate by itse
 
 from __future__ import annotations
 
-import argparse
 import re
+from argparse import Namespace
 from pathlib import Path
 
 import matplotlib
+import mitsuba as mi
 import numpy as np
+
+from ..errors import CommandError
+from ..files.images import check_output, write_images
+from .metrics import tone_map
+from .project import Project
+from .scenes import SceneFile, integrator_of
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
-import mitsuba as mi  # noqa: E402
-
-from mitsuba_bdpt.cli.arguments import number  # noqa: E402
-from mitsuba_bdpt.files.images import write_images  # noqa: E402
-
-from ..cli.mistakes import check_output  # noqa: E402
-from . import reference
-from .metrics import tone_map  # noqa: E402
 
 KINDS = ("weighted", "unweighted")
 
@@ -48,18 +44,11 @@ def technique_images(image, names: list, kind: str) -> dict:
     return found
 
 
-def render(path: Path, options):
+def render(file: SceneFile, options: Namespace):
     """The film after a render with technique images, and these, weighted and unweighted."""
-    values = {"resolution": options.resolution} if options.resolution else {}
-    scene = reference.load_file(path, **values)
-    integrator = mi.load_dict(
-        {
-            "type": "bdpt",
-            "max_depth": options.max_depth,
-            "strategy_images": True,
-            "heuristic": options.heuristic,
-        }
-    )
+    scene = file.load(options.resolution)
+    parameters = {"type": "bdpt", "strategy_images": True, "heuristic": options.heuristic}
+    integrator = integrator_of(parameters, options.max_depth)
     image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
     names = integrator.aov_names()
     return scene.sensors()[0].film(), {kind: technique_images(image, names, kind) for kind in KINDS}
@@ -74,7 +63,9 @@ def draw(found: dict, path: Path, exposure: float):
     """The pyramid as a picture: rows of path lengths, s rising to the right; raises ``ValueError`` if no
     strategy contributes."""
     if not found:
-        raise ValueError(f"nothing to draw in {path.name}: no path of {SHORTEST} edges or more brings light")
+        raise CommandError(
+            f"nothing to draw in {path.name}: no path of {SHORTEST} edges or more brings light"
+        )
     lengths = sorted({k for k, _, _ in found})
     rows = [[key for key in found if key[0] == k] for k in lengths]
     columns = max(len(row) for row in rows)
@@ -99,33 +90,21 @@ def draw(found: dict, path: Path, exposure: float):
     plt.close(figure)
 
 
-def main(arguments=None) -> int:
-    """Render, write, say what was written."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("scene", help="a scene file, or a name in scenes/")
-    parser.add_argument("-o", "--output", type=Path, help="default: renders/pyramid_SCENE")
-    whole = number(int, 1)
-    parser.add_argument("--max-depth", type=whole, default=5, help="longest path in edges; default 5")
-    parser.add_argument("--spp", type=whole, default=64)
-    parser.add_argument("--seed", type=number(int, 0, 2**32 - 1), default=0)
-    parser.add_argument("--resolution", type=whole, help="value of $resolution in the scene file")
-    parser.add_argument("--heuristic", default="balance")
-    stops = number(float, -100, 100)
-    parser.add_argument("--exposure", type=stops, default=0.0, help="stops, of the pictures")
-    options = parser.parse_args(arguments)
+def run(options: Namespace) -> int:
+    """Render, write, say what was written, as the command line ``options`` say."""
     if options.max_depth < SHORTEST:
-        raise ValueError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
+        raise CommandError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     mi.set_variant("llvm_ad_rgb")
-    path = reference.find_scene(options.scene)
-    default = reference.ROOT / "renders" / f"pyramid_{path.stem}"
-    output = options.output.with_suffix("") if options.output else default
+    project = Project(options.project)
+    file = project.scene(options.scene)
+    output = options.output.with_suffix("") if options.output else project.renders / f"pyramid_{file.name}"
     image = output.with_name(f"{output.name}.exr")
     pictures = {kind: output.with_name(f"{output.name}_{kind}.png") for kind in KINDS}
-    for file in (image, *pictures.values()):
-        check_output(file, file.suffix)
-    film, images = render(path, options)
+    for path in (image, *pictures.values()):
+        check_output(path, path.suffix)
+    film, images = render(file, options)
     write_images(film, image, {"heuristic": options.heuristic}, options.exposure)
-    for kind, file in pictures.items():
-        draw(panels(images[kind]), file, options.exposure)
-        print(file)
+    for kind, path in pictures.items():
+        draw(panels(images[kind]), path, options.exposure)
+        print(path)
     return 0

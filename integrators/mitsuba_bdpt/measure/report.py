@@ -1,27 +1,25 @@
 """Tables and plots of a sweep.
 
-    python scripts/report.py results/small                             # a page and plots of any sweep
-    python scripts/report.py docs/benchmark --readme README.md         # the project's own
-
-reads rows.parquet and probes.json in the folder, and writes the plots and README.md with all tables beside
-them. Goals and explanations of what is not as one expects are read from goals.toml and notes.toml, if there
-are any. ``--readme`` fills the parts of a Markdown file between the lines `<!-- report: NAME -->` and
-`<!-- end -->`, NAME being ``goals``, ``efficiency`` or ``gallery`` (`make gallery` renders its images).
+From rows.parquet and probes.json in a folder come the plots and README.md with all tables beside them. Goals
+and explanations of what is not as one expects are read from goals.toml and notes.toml, if there are any. The
+parts of another Markdown file between the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too,
+NAME being ``goals``, ``efficiency`` or ``gallery`` (of images in docs/images/gallery).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
+from argparse import Namespace
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet
 
-from ..files.whole import replacing
-from . import figures, reference
+from ..errors import CommandError
+from ..files.texts import read_toml, write_text
+from . import figures
 from .analysis import (
     ALONE,
     IMPOSSIBLE,
@@ -41,33 +39,41 @@ from .analysis import (
     summary,
 )
 from .metrics import rel_mse_epsilon
+from .project import Project
+from .reference import read_reference, reference_path
+from .scenes import digest
 from .tables import ranged, ratio, said, table
 
 
-def load(folder: Path) -> tuple[Results, dict]:
+def load(project: Project, folder: Path) -> tuple[Results, dict]:
     """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if no sweep has
-    filled it, and if the errors were taken against other references."""
+    filled it, and if the errors were taken against other references than those of the ``project``."""
     try:
         rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
-    except (FileNotFoundError, pyarrow.ArrowInvalid) as error:
-        raise ValueError(
-            f"{folder}: rows.parquet is missing or not whole; run scripts/sweep.py -o {folder}"
+    except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
+        raise CommandError(
+            f"{folder}: rows.parquet is missing or not whole; run mitsuba-bdpt sweep PRESET -o {folder}"
         ) from error
     made, digests = {}, {}
     for row in rows:
-        key = row["scene"], row["resolution"], row["max_depth"]
-        if row["scene"] not in made:
-            made[row["scene"]] = reference.load_reference(*key)
-            digests[row["scene"]] = reference.digest(reference.reference_path(*key))
-        if row["reference_sha256"] != digests[row["scene"]]:
-            raise ValueError(
-                f"{folder}: the errors in {row['scene']} were taken against another reference; run "
-                "scripts/sweep.py again, which takes them anew"
+        scene = row["scene"]
+        if scene not in made:
+            path = reference_path(project, scene, row["resolution"], row["max_depth"])
+            if not path.is_file():
+                raise CommandError(
+                    f"{folder}: the reference of {scene} is not in {str(project.references)!r}; name the "
+                    "folder of the sweep's project by --project, or run the sweep again, which makes it"
+                )
+            made[scene], digests[scene] = read_reference(path), digest(path)
+        if row["reference_sha256"] != digests[scene]:
+            raise CommandError(
+                f"{folder}: the errors in {scene} were taken against another reference; run "
+                "mitsuba-bdpt sweep again, which takes them anew"
             )
     if without := [scene for scene, kept in made.items() if kept.means is None]:
-        raise ValueError(
+        raise CommandError(
             f"{folder}: the reference of {without[0]} has too few renders for a bias check; go on with "
-            "scripts/reference.py"
+            "mitsuba-bdpt reference"
         )
     file = folder / "probes.json"
     measured = json.loads(file.read_text()) if file.exists() else {}
@@ -434,14 +440,8 @@ def replace_part(text: str, name: str, part: str) -> str:
     """``text`` with what is between the markers of ``name`` replaced; ``ValueError`` without them."""
     pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
     if len(pattern.findall(text)) != 1:
-        raise ValueError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
+        raise CommandError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
     return pattern.sub(lambda m: m[1] + "\n" + part + "\n" + m[2], text)
-
-
-def write_text(path: Path, text: str):
-    """Written by `replacing`."""
-    with replacing(path) as temporary:
-        temporary.write_text(text)
 
 
 def machine(results: Results) -> str:
@@ -452,11 +452,11 @@ def machine(results: Results) -> str:
         versions, scene = json.loads(row["versions"]), row["scene"]
         source = versions.pop("source")
         if source_of.setdefault(scene, source) != source:
-            raise ValueError(f"the rows of {scene} are by several sources of the plugin; render them anew")
+            raise CommandError(f"the rows of {scene} are by several sources of the plugin; render them anew")
         scenes.setdefault(source, set()).add(scene)
         found.add((row["machine"], json.dumps(versions)))
     if len(found) > 1:
-        raise ValueError(f"the rows are from several machines or versions: {sorted(found)}")
+        raise CommandError(f"the rows are from several machines or versions: {sorted(found)}")
     ((where, versions),) = found
     text = where + "; " + ", ".join(f"{name} {version}" for name, version in json.loads(versions).items())
     main, *others = sorted(scenes, key=lambda source: -len(scenes[source]))
@@ -468,7 +468,7 @@ def _introduction(results: Results) -> str:
     """What the figures are, and where they were measured."""
     return f"""# Benchmark
 
-Made by `python scripts/report.py` from the data beside it. Machine and versions: {machine(results)}.
+Made by `mitsuba-bdpt report` from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
@@ -484,7 +484,7 @@ holds the median in 90 % of cases, not 95 %).
 def page(results: Results, made: dict, goals: list, notes: dict) -> str:
     """The page of all tables, as Markdown."""
     if unknown := sorted(set(notes) - set(results.scenes)):
-        raise ValueError(f"notes.toml: {unknown[0]!r} is not among the scenes")
+        raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
     parts = [_introduction(results)]
     if goals:
         parts.append(f"## Goals\n\n{goals_table(results, goals)}\n{tried_text(goals)}")
@@ -497,8 +497,8 @@ def page(results: Results, made: dict, goals: list, notes: dict) -> str:
 By budget, over the stronger `path` that passes the bias check:
 
 {budgets_table(results)}
-How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel;
-[which paths they are](../fireflies.md):
+How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel
+(`mitsuba-bdpt fireflies SCENE` names their paths):
 
 {gaps_table(results)}"""
     )
@@ -516,7 +516,7 @@ Slope: exponent of raw relMSE over samples, −1 for independent samples, with i
 decisions": budgets differ in what is skipped, since a short render has no pilot). Bias
 check: Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy,
 and what the reference was made by: where that is `bdpt`, with nothing skipped and other counts, what both
-have in common is tested elsewhere (tests/).
+have in common is left to the package's own tests.
 
 {checks_table(results, made, notes)}
 {notes_text(notes)}
@@ -531,29 +531,27 @@ have in common is tested elsewhere (tests/).
     return "\n".join(parts)
 
 
-def main():
-    """Run the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--readme", type=Path, help="a Markdown file whose parts are filled")
-    args = parser.parse_args()
-    results, made = load(args.folder)
-    files = {name: args.folder / f"{name}.toml" for name in ("goals", "notes")}
-    kept = {name: reference.read_toml(f) if f.exists() else {} for name, f in files.items()}
+def run(options: Namespace) -> int:
+    """Write the report that the command line ``options`` ask for."""
+    project = Project(options.project)
+    folder = project.results(options.folder)
+    results, made = load(project, folder)
+    files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
+    kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
     goals, notes = kept["goals"].get("goal", []), kept["notes"]
-    write_text(args.folder / "README.md", page(results, made, goals, notes))
-    figures.efficiencies(results, RIVALS, args.folder / "efficiency.png")
-    figures.convergence(results, "seconds", args.folder / "seconds.png")
-    figures.convergence(results, "spp", args.folder / "samples.png")
-    figures.rays(results, args.folder / "rays.png")
-    if args.readme:
-        readme = args.readme.read_text()
+    write_text(folder / "README.md", page(results, made, goals, notes))
+    figures.efficiencies(results, RIVALS, folder / "efficiency.png")
+    figures.convergence(results, "seconds", folder / "seconds.png")
+    figures.convergence(results, "spp", folder / "samples.png")
+    figures.rays(results, folder / "rays.png")
+    if options.readme:
+        readme = options.readme.read_text()
         for name, part in (
             ("goals", goals_table(results, goals)),
             ("efficiency", efficiency_table(results)),
             ("gallery", gallery(results)),
         ):
             readme = replace_part(readme, name, part)
-        write_text(args.readme, readme)
+        write_text(options.readme, readme)
+    print(folder / "README.md")
+    return 0
