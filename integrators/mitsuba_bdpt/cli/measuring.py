@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import CommandError
-from .mistakes import answered
+from . import mistakes
 from .values import number, property_
 
 NEEDED = ("flip_evaluator", "matplotlib", "pyarrow", "scipy")
@@ -30,7 +30,7 @@ WHOLE = number(int, 1)
 def run(options: Namespace) -> int:
     """Run a subcommand and return its exit status."""
     try:
-        return answered(lambda: _run(options))
+        return mistakes.answered(lambda: _run(options))
     except KeyboardInterrupt:
         print("interrupted; what was finished is kept", file=sys.stderr)
         return INTERRUPTED

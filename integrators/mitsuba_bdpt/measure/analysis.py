@@ -206,6 +206,14 @@ class Results:
         return list(dict.fromkeys([self.rows[0]["first"], *(row["method"] for row in self.rows)]))
 
     @cached_property
+    def rivals(self) -> list[str]:
+        """What the first integrator is compared with at equal time: `path`, then others that no figure of the
+        project's own looks for."""
+        known = {*RIVALS, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, LIGHT_TRACER}
+        others = self.methods[1:]
+        return [name for name in RIVALS if name in others] + [name for name in others if name not in known]
+
+    @cached_property
     def _of(self) -> dict:
         """Rows by scene and integrator."""
         found = {}
@@ -271,7 +279,7 @@ class Results:
         """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
         that were rendered and pass the bias check; raises `Biased` if none does."""
         found, biased = [], {}
-        rivals = [rival for rival in RIVALS if self.of(scene, rival)]
+        rivals = [rival for rival in RIVALS if rival != self.methods[0] and self.of(scene, rival)]
         if not rivals:
             raise Refused(f"{RIVALS[0]} was not rendered")
         for rival in rivals:

@@ -161,7 +161,9 @@ def check_size(job: Job) -> None:
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
-    fitting = [n for n in range(TILES, 4 * job.resolution, TILES) if round(n * height / width) % TILES == 0]
+    own_width, own_height = job.scene.size()
+    widths = range(TILES, 4 * job.resolution, TILES)
+    fitting = [n for n in widths if (round(n * own_height / own_width) or 1) % TILES == 0]
     nearest = sorted(fitting, key=lambda n: abs(n - job.resolution))[:1]
     advice = f"; take resolution={nearest[0]}" if nearest else "; give the film another shape"
     raise CommandError(

@@ -21,7 +21,7 @@ from ..files.images import check_output, read_layers
 from ..files.texts import write_text
 from ..planning.explain import subpaths
 from . import figures, report
-from .analysis import NOTHING, RIVALS, Biased, Refused, Results
+from .analysis import NOTHING, Biased, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
 
@@ -73,6 +73,8 @@ def why(results: Results, scene: str) -> str:
         return ""
     row = rows[0]
     statistics = json.loads(row["statistics"] or "{}")
+    if not statistics:  # of another integrator than `bdpt`
+        return ""
     decided = (statistics.get("decisions") or [None])[-1]
     if decided is None:
         said = "No pilot: the render was too short for one, or there was nothing to choose."
@@ -161,11 +163,13 @@ def plots(results: Results) -> str:
     """The figures, in the page."""
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / f"{name}.png" for name in PLOTS}
-        figures.efficiencies(results, RIVALS, files["efficiency"])
+        if results.rivals:
+            figures.efficiencies(results, results.rivals, files["efficiency"])
         figures.convergence(results, "seconds", files["seconds"])
         figures.convergence(results, "spp", files["samples"])
         figures.rays(results, files["rays"])
-        shown = {name: base64.b64encode(file.read_bytes()).decode() for name, file in files.items()}
+        made = {name: file for name, file in files.items() if file.exists()}
+        shown = {name: base64.b64encode(file.read_bytes()).decode() for name, file in made.items()}
     return "\n".join(
         f'<p><img class="plot" alt="{PLOTS[name]}" src="data:image/png;base64,{data}"></p>'
         for name, data in shown.items()

@@ -82,12 +82,13 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
 
 def efficiency_table(results: Results) -> str:
     """Per scene, against each rival: trimmed and raw; missing energy where the rival fails the bias check."""
-    head = ["scene", *(f"over {rival}, {kind}" for rival in RIVALS for kind in ("trimmed", "raw"))]
-    head += [f"over {NONE}, trimmed"]
+    head = ["scene", *(f"over {rival}, {kind}" for rival in results.rivals for kind in ("trimmed", "raw"))]
+    with_all = NONE in results.methods[1:]
+    head += [f"over {NONE}, trimmed"] * with_all
     lines = []
     for scene in results.scenes:
         line = [f"`{scene}`"]
-        for rival in RIVALS:
+        for rival in results.rivals:
             try:
                 results.fair_efficiency(scene, rival)
             except Biased as why:
@@ -99,7 +100,7 @@ def efficiency_table(results: Results) -> str:
                 said(lambda s=scene, r=rival, e=error: results.fair_efficiency(s, r, e))
                 for error in ("rel_mse_trimmed", "rel_mse")
             ]
-        lines.append([*line, said(lambda s=scene: results.efficiency(s, NONE))])
+        lines.append(line + [said(lambda s=scene: results.efficiency(s, NONE))] * with_all)
     return table(head, lines)
 
 
@@ -196,7 +197,7 @@ def _pilot_share(row) -> float:
 
 def _rays_per_sample(rows) -> str:
     """Of the first render: closest hits, camera and light; shadow rays of s = 1, t = 1, inner connections."""
-    if not rows:
+    if not rows or rows[0].get("rays_camera") is None:
         return "–"
     samples = rows[0]["spp"] * rows[0]["width"] * rows[0]["height"]
     kinds = (("camera", "light"), ("shadow_s1", "shadow_t1", "shadow_inner"))
@@ -492,7 +493,7 @@ def page(results: Results, made: dict, goals: list, notes: dict) -> str:
         f"""## Efficiency
 
 {efficiency_table(results)}
-![Efficiency per scene](efficiency.png)
+{"![Efficiency per scene](efficiency.png)" if results.rivals else ""}
 
 By budget, over the stronger `path` that passes the bias check:
 
@@ -540,7 +541,8 @@ def run(options: Namespace) -> int:
     kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
     goals, notes = kept["goals"].get("goal", []), kept["notes"]
     write_text(folder / "README.md", page(results, made, goals, notes))
-    figures.efficiencies(results, RIVALS, folder / "efficiency.png")
+    if results.rivals:
+        figures.efficiencies(results, results.rivals, folder / "efficiency.png")
     figures.convergence(results, "seconds", folder / "seconds.png")
     figures.convergence(results, "spp", folder / "samples.png")
     figures.rays(results, folder / "rays.png")

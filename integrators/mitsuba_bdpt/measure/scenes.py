@@ -119,8 +119,9 @@ def _replace_sampler(nodes, sensor, kind: str) -> None:
                 return
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Sampler, properties
+    # Before the list grows: what Python holds of its entries is then no longer there.
+    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(nodes))
     nodes.append(node)
-    sensor.props["sampler"] = mi.Properties.ResolvedReference(len(nodes) - 1)
 
 
 @contextmanager
