@@ -172,8 +172,8 @@ def test_a_width_that_fits_is_named(here):
 @pytest.mark.parametrize("sampler", ["", STRATIFIED])
 def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
     """Expected: without parameters in the file the film and the sampler are as asked for, the sampler with
-    the file's sample count; the picture is that of the file's own film, half as wide: pixels agree with the means
-    of 2 x 2 ones (box filters and the same light: to the noise of 1024 samples)."""
+    the file's sample count; the picture is that of the file's own film, half as wide: pixels agree with
+    means of 2 x 2 ones (box filters and the same light: to the noise of 1024 samples)."""
     file = here / "elsewhere" / "room.xml"
     text = ROOM.format(height=32, sampler=sampler)
     file.write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
