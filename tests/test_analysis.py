@@ -13,8 +13,8 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.measure import analysis, reference, report
+from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Biased, Refused, Results
-from mitsuba_bdpt.measure.metrics import Means
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference

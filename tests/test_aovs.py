@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.image.features import FeatureLayers
-from mitsuba_bdpt.measure.metrics import sidak
+from mitsuba_bdpt.measure.agreement import sidak
 from welch import LEVEL, Comparisons, assert_agree, compare_images
 
 T = mi.ScalarTransform4f

@@ -17,7 +17,7 @@ import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.files.images import read_layers
 from mitsuba_bdpt.files.texts import write_json
-from mitsuba_bdpt.measure import analysis, cells, making, metrics, probes, reference, scenes, sweep
+from mitsuba_bdpt.measure import agreement, analysis, cells, making, metrics, probes, reference, scenes, sweep
 from mitsuba_bdpt.measure import bench as bench_module
 from mitsuba_bdpt.measure import halves as halves_module
 from mitsuba_bdpt.measure.making import Job
@@ -119,7 +119,7 @@ def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
     image = np.array(mi.render(scene, integrator=ours, spp=4, seed=0))[..., :3]
     assert 0 < made.error <= 0.009 * metrics.rel_mse(image, made.image)
     assert kept.means.columns.freedom >= 7
-    np.testing.assert_allclose(kept.means.columns.mean, metrics.tile_columns(kept.image), rtol=2e-3)
+    np.testing.assert_allclose(kept.means.columns.mean, agreement.tile_columns(kept.image), rtol=2e-3)
     np.testing.assert_allclose(kept.means.whole.error, made.means.whole.error, rtol=1e-6)
     assert kept.provenance["integrator"] == {"type": "path", "max_depth": 2}
     assert kept.provenance["spp"] % 512 == 0 and kept.provenance["versions"]["mitsuba"].startswith("3.9")
@@ -177,7 +177,7 @@ def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
     """
     rng = np.random.default_rng(3)
     halves, window = halves_module.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
-    for _ in range(metrics.FEWEST_RUNS):
+    for _ in range(agreement.FEWEST_RUNS):
         halves.add(rng.uniform(1, 2, (2, 16, 16, 3)))
     halves.add(rng.uniform(1, 2, (2, 4, 4, 3)), window, 4)
     spp = {
@@ -192,7 +192,7 @@ def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
     again.go_on_from(stored, [window])
     np.testing.assert_allclose(again.counts, halves.counts)
     assert again.rounds >= halves.rounds and "x" in again.sources
-    more = rng.uniform(1, 2, (metrics.FEWEST_RUNS, 2, 16, 16, 3))
+    more = rng.uniform(1, 2, (agreement.FEWEST_RUNS, 2, 16, 16, 3))
     for images in more:
         halves.add(images)
         again.add(images)

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import repository
-from mitsuba_bdpt.measure.metrics import Sample
+from mitsuba_bdpt.measure.agreement import Sample
 
 import mitsuba as mi  # isort: skip
 

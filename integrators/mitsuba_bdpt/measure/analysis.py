@@ -13,14 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import CommandError
-from .metrics import (
-    FEWEST_RUNS,
-    BiasCheck,
-    Estimate,
-    Means,
+from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means
+from .checks import Estimate
+from .efficiency import (
     Measurement,
     bootstrap_median,
-    compare_means,
     equal_time_speedup,
     reference_good_enough,
     reference_refusal,

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.whole import replacing
-from .metrics import FEWEST_RUNS, Means, tile_columns
+from .agreement import FEWEST_RUNS, Means, tile_columns
 from .reference import Reference, kept_of, means_of, source_digest
 
 PASS_SPP = 256

@@ -29,8 +29,10 @@ from ..errors import CommandError
 from ..files.texts import read_toml
 from ..host.versions import versions
 from ..run.rendering import raise_interrupt
+from .agreement import FEWEST_RUNS, TILES, Means
+from .efficiency import REFERENCE_SHARE
 from .halves import PASS_SPP, Halves
-from .metrics import FEWEST_RUNS, REFERENCE_SHARE, TILES, TRIM, Means, rel_mse
+from .metrics import TRIM, rel_mse
 from .project import Project
 from .reference import Reference, load_reference, reference_path, write
 from .scenes import SceneFile, integrator_of

@@ -41,7 +41,7 @@ from pathlib import Path
 from ..errors import CommandError
 from ..files.texts import read_toml
 from . import probes
-from .metrics import TILES
+from .agreement import TILES
 from .project import Project, depth_in
 from .scenes import SceneFile
 

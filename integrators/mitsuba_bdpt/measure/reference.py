@@ -15,7 +15,8 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.images import read_layers, write_layers
-from .metrics import Means, Sample, reference_rel_mse, rel_mse
+from .agreement import Means, Sample
+from .metrics import reference_rel_mse, rel_mse
 from .project import Project
 from .scenes import SceneFile, digest
 

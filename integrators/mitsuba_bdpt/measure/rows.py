@@ -14,7 +14,7 @@ import pyarrow.parquet
 from ..files.images import read_layers, write_layers
 from ..files.texts import write_json
 from ..files.whole import replacing
-from . import analysis, metrics
+from . import agreement, analysis, metrics
 from .cells import FIRST_SEED, Cell, Cells
 from .preset import Preset
 from .project import Project
@@ -57,7 +57,7 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
         "width": image.shape[1],
         "height": image.shape[0],
         "mean": float(image.mean()),
-        "tile_means": [float(f"{x:.7g}") for x in metrics.tile_columns(image)],
+        "tile_means": [float(f"{x:.7g}") for x in agreement.tile_columns(image)],
         "mse": metrics.mse(image, ref.image),
         "rel_mse": raw,
         "rel_mse_trimmed": trimmed,
