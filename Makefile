@@ -19,7 +19,7 @@ test: $(INSTALLED)
 slow: $(INSTALLED)
 	$(VENV)/bin/python -m pytest -m slow
 
-# The images of the README.
+# The images of the README and of docs/reports/figures.md.
 gallery: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml -o renders/lamp_behind_glass.exr
 	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
@@ -30,7 +30,7 @@ gallery: $(INSTALLED)
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
 
-# The pictures of docs/pictures.md.
+# The pictures of docs/reports/pictures.md.
 pictures: $(INSTALLED)
 	mkdir -p docs/images
 	$(VENV)/bin/python scripts/equal_time.py veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
@@ -63,7 +63,7 @@ sweep: $(INSTALLED)
 	$(VENV)/bin/python scripts/report.py results/small
 	$(VENV)/bin/python scripts/page.py results/small
 
-# What was tried to break it, under twenty minutes on two cores: docs/stress.md.
+# What was tried to break it, under twenty minutes on two cores: docs/reports/stress.md.
 stress: $(INSTALLED)
 	$(VENV)/bin/python scripts/stress.py
 
@@ -71,7 +71,7 @@ stress: $(INSTALLED)
 mutants: $(INSTALLED)
 	$(VENV)/bin/python scripts/mutants.py
 
-# Hours of renders that look for values that are not finite; can be interrupted, and adds to docs/endurance.json.
+# Hours of renders that look for values that are not finite; can be interrupted, and adds to docs/reports/endurance.json.
 endurance: $(INSTALLED)
 	$(VENV)/bin/python scripts/endurance.py
 
@@ -81,11 +81,11 @@ references: $(INSTALLED)
 	$(VENV)/bin/python scripts/reference.py glass_caustics --spp 256 --seconds 7200
 	$(VENV)/bin/python scripts/reference.py cornell_box --spp 256 --seconds 3600
 
-# The tables and plots of the README, about an hour, best on a quiet machine; goes on where it was stopped.
+# The tables and plots of docs/reports, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
 	-$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
-	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/benchmark
-	$(VENV)/bin/python scripts/report.py docs/benchmark --readme README.md
+	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/reports/benchmark
+	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
 
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .

@@ -24,7 +24,10 @@ import drjit as dr
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.measure import metrics
 from mitsuba_bdpt.measure.timing import timed
-from mitsuba_bdpt.planning import choice, moments, pilot
+from mitsuba_bdpt.planning import moments, pilot
+from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Weighting
+from mitsuba_bdpt.planning.costs import cost
+from mitsuba_bdpt.planning.decision import Decision
 from mitsuba_bdpt.run import rendering
 from repository import RESOLUTION, benchmark_depth, load_reference, load_scene
 
@@ -44,11 +47,11 @@ SELECTION = (
 )
 
 
-def candidate(share: float, connections: str, splat: float) -> choice.Candidate:
+def candidate(share: float, connections: str, splat: float) -> Configuration:
     """An entry of `SELECTION` as one of the pilot's."""
     inner = float(connections != "none")
-    weighting = pilot.Weighting(1, 1, splat * share, inner)
-    return choice.Candidate(pilot.WEIGHTINGS.index(weighting), round(1 / share) if share else 1, connections)
+    weighting = Weighting(1, 1, splat * share, inner)
+    return Configuration.weighted(weighting, round(1 / share) if share else 1, connections)
 
 
 def predicted(scene, settings) -> moments.Moments:
@@ -62,7 +65,7 @@ def predicted(scene, settings) -> moments.Moments:
     return found
 
 
-def rendered(scene, depth: int, made: choice.Decision, expected) -> tuple[float, float]:
+def rendered(scene, depth: int, made: Decision, expected) -> tuple[float, float]:
     """Median of relMSE times samples, and of seconds per render, over `ROUNDS` renders after a first one."""
     decisions = json.dumps([made.record()])
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": decisions})
@@ -85,9 +88,12 @@ def lines(name: str, depth: int) -> list:
         share, connections, splat = entry
         way = candidate(*entry)
         draw = moments.draw if connections == "one" else 0
-        base, light = moments.variance(draw, stratified=True)[:, :, way.weighting].mean(axis=0)
+        base, light = moments.variance(draw, stratified=True)[:, :, WEIGHTINGS.index(way.weighting)].mean(
+            axis=0
+        )
         light *= way.camera_paths_per_light_path
-        made = way.decided(0, choice.cost(way, moments.rays), base + light, moments.mean)
+        each = cost(way, moments.rays)
+        made = Decision.of(way, first_pass=0, cost=each, variance=base + light, mean=moments.mean)
         error, seconds = rendered(scene, depth, made, expected)
         alone = alone or seconds
         name_of_share = f"1/{way.camera_paths_per_light_path}" if share else "0"
@@ -98,7 +104,7 @@ def lines(name: str, depth: int) -> list:
                 f"{base:.3g} + {light:.3g}",
                 f"{error:.3g}",
                 f"{(base + light) / error:.2f}",
-                f"{choice.cost(way, moments.rays):.2f}",
+                f"{each:.2f}",
                 f"{seconds / alone:.2f}",
             ]
         )

@@ -1,15 +1,15 @@
 """What the default's choice of strategies is worth: its time to an error over that of the best fixed choice.
 
     python scripts/choices.py small_casters/point_cube cornell_box
-    python scripts/choices.py --all -o docs/choices.json            # every scene; can be interrupted
-    python scripts/choices.py --all -o docs/choices.json --again    # after a change of the choice
+    python scripts/choices.py --all -o docs/reports/choices.json            # every scene; can be interrupted
+    python scripts/choices.py --all -o docs/reports/choices.json --again    # after a change of the choice
 
 For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
 inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
 ``decisions``); those which one render of a seed of its own shows to be among the best, or which are chosen,
 with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, which neighbours on
 the machine disturb less than seconds; the default's without the pilot, which later renders of a scene
-remember (docs/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
+remember (docs/method/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
 The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
 fixed choices, with the interval that nine in ten resamplings of the seeds (the same for both sides) lie in,
 and the same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its
@@ -35,7 +35,10 @@ from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.measure.tables import table
-from mitsuba_bdpt.planning import choice, pilot
+from mitsuba_bdpt.planning import pilot
+from mitsuba_bdpt.planning.candidates import candidates
+from mitsuba_bdpt.planning.configuration import Configuration
+from mitsuba_bdpt.planning.decision import Decision
 from mitsuba_bdpt.run import rendering
 
 import mitsuba as mi  # isort: skip
@@ -81,9 +84,9 @@ def product(rows, seeds=slice(None)) -> np.ndarray:
     return rows[:, 0].min() * rows[seeds, 1:].mean(axis=0)
 
 
-def by_hand(scene, depth: int, way: choice.Candidate, mean: float):
+def by_hand(scene, depth: int, way: Configuration, mean: float):
     """An integrator that does what the candidate ``way`` says; ``mean`` of the image."""
-    made = json.dumps([way.decided(0, 1.0, 1.0, mean).record()])
+    made = json.dumps([Decision.of(way, first_pass=0, cost=1.0, variance=1.0, mean=mean).record()])
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})
     integrator.render(scene, spp=1)  # compiles
     return integrator
@@ -94,7 +97,7 @@ def piloted(scene, settings) -> Counter:
     tables = []
     for seed in range(PILOT_SEEDS):
         render = rendering.Render(scene, scene.sensors()[0], settings, 0, SPP)
-        render.pilot_seed = seed
+        render.planner.pilot_seed = seed
         tables.append(render.decide())
     return Counter(table[0].candidate for table in tables if table)
 
@@ -105,7 +108,7 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.prepared, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    ways = choice.candidates(render.prepared, render.plan, settings)
+    ways = candidates(render.prepared, render.plan, settings)
     ways += [replace(way, connections="all") for way in ways if way.connections == "one"]
     ways = {named(way): way for way in ways}
     if known:
@@ -129,13 +132,11 @@ def as_fast(known: dict, found: dict) -> dict:
     return {name: np.array(rows) * [np.median(speeds), 1, 1] for name, rows in known.items()}
 
 
-def named(way: choice.Candidate) -> str:
+def named(way: Configuration) -> str:
     """In words: light subpaths per camera subpath, connections, coefficients of t <= 1 and s = 1."""
-    weighting = pilot.WEIGHTINGS[way.weighting]
     if not way.light_paths:
-        return f"0, {way.direct:g}"
-    served = way.camera_paths_per_light_path
-    return f"1/{served} {way.connections} {weighting.light * served:g}"
+        return f"0, {way.kappa_direct:g}"
+    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}"
 
 
 def measure(name: str, known: dict) -> dict:

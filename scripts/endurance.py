@@ -1,14 +1,15 @@
 """Render all scenes of scenes/ for hours, and look for values that are not finite.
 
-    python scripts/endurance.py --seconds 3600     # adds an hour to docs/endurance.json
+    python scripts/endurance.py --seconds 3600     # adds an hour to docs/reports/endurance.json
     python scripts/endurance.py                    # until the scenes have 1e10 camera samples together
     python scripts/endurance.py --show             # the record, as a table
 
 The scene that had the least time comes next, with another seed, another size and another heuristic each
 time, and skip=auto and skip=none in turn. Every render is added to the record at once; Ctrl-C ends the one
 that runs after its pass, a second Ctrl-C at once, and then it is not in the record. A scene of which several
-renders have failed is left out until the plugin's source is another. A run that adds to docs/endurance.json
-ends by writing the table between the lines `<!-- report: endurance -->` and `<!-- end -->` of docs/stress.md.
+renders have failed is left out until the plugin's source is another. A run that adds to the record of the
+project ends by writing the table between the lines `<!-- report: endurance -->` and `<!-- end -->` of
+docs/reports/endurance.md.
 
 Exit status 130 if the run was interrupted; else 1 if the record has a value that is not finite or a render
 that failed, of whatever version; 2 for a mistake, 0 if all is well.
@@ -42,8 +43,8 @@ from mitsuba_bdpt.settings import HEURISTICS
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
-RECORD = repository.ROOT / "docs" / "endurance.json"
-PAGE = repository.ROOT / "docs" / "stress.md"
+RECORD = repository.ROOT / "docs" / "reports" / "endurance.json"
+PAGE = repository.ROOT / "docs" / "reports" / "endurance.md"
 
 # Camera samples of all scenes together.
 TARGET = 10**10
@@ -308,7 +309,7 @@ def main(arguments=None) -> int:
     text_ = "camera samples of one render; default: %(default)s"
     whole = number(int, 1)
     parser.add_argument("--render-samples", type=whole, default=RENDER_SAMPLES, metavar="N", help=text_)
-    parser.add_argument("--record", type=Path, default=RECORD, help="default: docs/endurance.json")
+    parser.add_argument("--record", type=Path, default=RECORD, help="default: docs/reports/endurance.json")
     parser.add_argument("--show", action="store_true", help="print the record only")
     args = parser.parse_args(arguments)
     if unknown := set(args.scenes) - set(known):

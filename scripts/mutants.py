@@ -71,10 +71,17 @@ MUTANTS = (
     ),
     Mutant(
         "pilots of an edited scene",
-        "run/rendering.py",
-        "key = self._scene_state(), self.settings",
-        "key = self.settings",
+        "planning/findings.py",
+        "key = self._scene_state(), key",
+        "pass",
         ("tests/test_edits.py::test_edits_are_seen",),
+    ),
+    Mutant(
+        "edits during a render are not seen",
+        "run/rendering.py",
+        "                    self.findings.expire()\n",
+        "",
+        ("tests/test_edits.py::test_edits_during_a_render_are_seen",),
     ),
     Mutant(
         "splats on hidden emitters",
@@ -132,8 +139,8 @@ MUTANTS = (
     Mutant(
         "numbers of the light subpath for the camera's",
         "transport/kernel.py",
-        'points.stream("camera", place.index(slot), slot)',
-        'points.stream("light", place.index(slot), slot)',
+        'points.stream("camera", lane.place.index(slot), slot)',
+        'points.stream("light", lane.place.index(slot), slot)',
         ("tests/test_plausible_bugs.py::test_subpaths_draw_from_their_own_streams",),
     ),
     Mutant(
@@ -240,14 +247,14 @@ MUTANTS = (
     Mutant(
         "connections: roulette is not divided by",
         "transport/techniques.py",
-        "    c.value, c.active = value / survival, active",
-        "    c.value, c.active = value, active",
+        "replace(c, value=value / survival, active=active, counted=counted)",
+        "replace(c, value=value, active=active, counted=counted)",
         ("tests/test_known_answers.py::test_partial_sums_with_drawn_connections_and_roulette[default-3]",),
     ),
     Mutant(
         "emission: start of a light subpath lacks its density",
         "transport/kernel.py",
-        "partial = mis.Partial(h.start(inverse), h.present(hit))",
+        "partial = mis.Partial(h.start(inverse_pdf), h.present(hit))",
         "partial = mis.Partial(h.start(dr.rcp(e.pdf_second)), h.present(hit))",
         ("tests/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-n1c1]",),
     ),

@@ -1,12 +1,13 @@
-"""Hooks of mkdocs.yml: the pages that are not files of docs/.
+"""Hooks of mkdocs.yml: the pages that are not Markdown files of docs/.
 
-The README is the first page, the tutorial's cells become a page, and each module of the package has a page of
-its docstrings. Links to the source of a module lead to that page, and those to tests, which the site does not
-have, become plain text.
+The README is the first page, CONTRIBUTING.md and CHANGELOG.md are pages too, and so are the tutorial's cells.
+A comment `<!-- api: CLASS MEMBER ... -->` is replaced by the docstrings of that class of the package, read
+without importing it. Links to files that the site does not have (source, tests, scenes) become plain text.
 """
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -15,17 +16,28 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
+# Files at the top of the repository that are pages of the site.
+TOP = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
 
-def readme() -> str:
-    """The first page: links from the top of the repository become links from docs/."""
-    text = (ROOT / "README.md").read_text()
-    text = re.sub(r"\]\(docs/", "](", text)
-    return re.sub(r"\]\((?=(integrators|scripts|scenes|references|tests)\b)", "](../", text)
+# A link to what the site does not have, up from docs/ or at the top of the repository.
+ELSEWHERE = r"(?:(?:\.\./)+|(?=LICENSE|CITATION))"
+FOLDERS = r"(?:integrators|tests|scripts|scenes|references|presets|LICENSE|CITATION|Makefile|pyproject)"
+OUTSIDE = re.compile(rf"(?<!!)\[([^\]]*)\]\({ELSEWHERE}{FOLDERS}\b[^)]*\)")
+
+API = re.compile(r"<!-- api: (\w+)((?: \w+)*) -->")
+
+
+def top(name: str) -> str:
+    """Return a file of the top of the repository as a page: its links lead from docs/."""
+    text = re.sub(r"\]\(docs/", "](", (ROOT / name).read_text())
+    for file, page in TOP.items():
+        text = text.replace(f"]({file})", f"]({page})")
+    return re.sub(rf"\]\((?={FOLDERS}\b)", "](../", text)
 
 
 def tutorial() -> str:
-    """The cells of docs/tutorial.py: prose and code in turn."""
-    cells = re.split(r"^# %%", (ROOT / "docs" / "tutorial.py").read_text(), flags=re.MULTILINE)[1:]
+    """Return the cells of docs/user/tutorial.py, prose and code in turn."""
+    cells = re.split(r"^# %%", (ROOT / "docs/user/tutorial.py").read_text(), flags=re.MULTILINE)[1:]
     parts = []
     for cell in cells:
         kind, _, body = cell.partition("\n")
@@ -36,43 +48,61 @@ def tutorial() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def module(path: Path) -> str:
-    """The page of a module."""
-    name = ".".join(["mitsuba_bdpt", *path.relative_to(PACKAGE).with_suffix("").parts])
-    return f"# {path.stem}\n\n::: {name.removesuffix('.__init__')}\n"
+def found_class(name: str) -> ast.ClassDef:
+    """Return the class of that name, wherever the package defines it; ``ValueError`` if it does not."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and node.name == name:
+                return node
+    raise ValueError(f"the package has no class {name}, of which a page of docs/ shows the docstrings")
+
+
+def signature(method: ast.FunctionDef) -> str:
+    """Return the call of a method as code, or the name of a property, with the type of the result."""
+    result = f" -> {ast.unparse(method.returns)}" if method.returns else ""
+    if any(isinstance(d, ast.Name) and d.id == "property" for d in method.decorator_list):
+        return method.name + result
+    arguments = re.sub(r"^(self|cls)(, )?", "", ast.unparse(method.args))
+    return f"{method.name}({arguments}){result}"
+
+
+def described(match: re.Match) -> str:
+    """Return the docstrings of a class, or of those of its members that an `API` comment names."""
+    node, members = found_class(match[1]), match[2].split()
+    methods = {n.name: n for n in node.body if isinstance(n, ast.FunctionDef)}
+    if missing := [name for name in members if name not in methods]:
+        raise ValueError(f"{node.name} has no method {missing[0]}, whose docstring a page of docs/ shows")
+    if not members:
+        members = [name for name in methods if not name.startswith("_")]
+    fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and ast.get_docstring(node)]
+    parts = []
+    if fields:
+        parts += [ast.get_docstring(node), "\n".join(f"* `{ast.unparse(n)}`" for n in fields)]
+    for name in members:
+        text = ast.get_docstring(methods[name])
+        if text is None:
+            raise ValueError(f"{node.name}.{name} has no docstring, which a page of docs/ shows")
+        parts.append(f"### {name}\n\n```python\n{signature(methods[name])}\n```\n\n{text}")
+    return "\n\n".join(parts)
 
 
 def on_files(files, config):
     """Add the pages."""
-    pages = {"index.md": readme(), "tutorial.md": tutorial()}
-    paths = [
-        path
-        for path in sorted(PACKAGE.rglob("*.py"))
-        if path.stem == "__init__" or not path.stem.startswith("_")
-    ]
-    paths = [path for path in paths if path.stem != "__init__" or path.parent == PACKAGE]
-    pages |= {
-        f"api/{path.relative_to(PACKAGE).with_suffix('')}.md".replace("__init__", "init"): module(path)
-        for path in paths
-    }
+    pages = {page: top(name) for name, page in TOP.items()} | {"user/tutorial.md": tutorial()}
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))
     return files
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Lead links to source files to the pages of their docstrings, and those to the tutorial to its page."""
-    markdown = markdown.replace("](tutorial.py)", "](tutorial.md)")
+    """Insert docstrings, lead links to the tutorial to its page, and take off those that lead nowhere."""
+    markdown = API.sub(described, markdown)
+    markdown = re.sub(r"\]\(((?:[\w./]*/)?)tutorial\.py\)", r"](\1tutorial.md)", markdown)
+    markdown = re.sub(r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md\)", _top_page(page), markdown)
+    return OUTSIDE.sub(r"\1", markdown)
+
+
+def _top_page(page):
+    """Return the replacement of a link to a file at the top of the repository, as seen from a ``page``."""
     up = "../" * page.file.src_uri.count("/")
-
-    def replaced(match):
-        text, target = match[1], match[2]
-        if found := re.fullmatch(r"(?:\.\./)+integrators/mitsuba_bdpt/([\w/]+)\.py", target):
-            return f"[{text}]({up}api/{found[1]}.md)"
-        return text
-
-    return re.sub(
-        r"(?<!!)\[([^\]]*)\]\(((?:\.\./)+(?:integrators|tests|scripts|scenes|references)[^)]*)\)",
-        replaced,
-        markdown,
-    )
+    return lambda match: f"]({up}{TOP[match[1] + '.md']})"

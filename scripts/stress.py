@@ -1,12 +1,14 @@
 """Try to break the renderer, and write what happened into a table.
 
-    python scripts/stress.py             # all cases, under twenty minutes; writes docs/stress.json, .md
+    python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress*
     python scripts/stress.py NAME ...    # some of them, printed
     python scripts/stress.py --list      # names of all
 
-Each case runs in a process of its own, so that a crash or a hang is an outcome too. The table is written
-between the lines `<!-- report: stress -->` and `<!-- end -->` of docs/stress.md. Exit status 1 if a case did
-not go as expected; one that can't be tried here (as this user, on this system) says so.
+Each case runs in a process of its own, so that a crash or a hang is an outcome too. Written are the record,
+docs/reports/stress.json; the tables of all cases, docs/reports/stress_cases.md; and between the lines
+`<!-- report: stress -->` and `<!-- end -->` of docs/reports/stress.md how many cases went as expected, and
+those that did not. Exit status 1 if one did not; one that can't be tried here (as this user, on this system)
+says so.
 """
 
 from __future__ import annotations
@@ -29,8 +31,9 @@ from stress_cases.case import Case, Outcome
 
 import mitsuba as mi  # isort: skip
 
-RECORD = repository.ROOT / "docs" / "stress.json"
-PAGE = repository.ROOT / "docs" / "stress.md"
+RECORD = repository.ROOT / "docs" / "reports" / "stress.json"
+PAGE = repository.ROOT / "docs" / "reports" / "stress.md"
+TABLES = PAGE.with_name("stress_cases.md")
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.
@@ -76,27 +79,42 @@ def made_with(record: list[dict]) -> str:
 
 
 def page(record: list[dict]) -> str:
-    """The tables of all sections, as Markdown."""
-    texts = [made_with(record)]
+    """The tables of all sections, as Markdown; an expectation that several cases share stands once."""
+    texts = ["# Stress: all cases", f"Written by `python scripts/stress.py`. {made_with(record)}"]
     for section in dict.fromkeys(row["section"] for row in record):
-        rows = [
-            [
-                row["tried"],
-                row["expected"],
-                MARKS[row["ok"]] + row["happened"],
-                f"`{row['name']}`",
-            ]
-            for row in record
-            if row["section"] == section
-        ]
-        texts.append(f"### {section}\n\n" + table(["tried", "expected", "what happened", "case"], rows))
+        rows, first = [], {}
+        for row in record:
+            if row["section"] == section:
+                name = first.setdefault(row["expected"], row["name"])
+                expected = row["expected"] if name == row["name"] else f"as of `{name}`"
+                rows.append([f"`{row['name']}`", row["tried"], expected, happened(row)])
+        texts.append(f"## {section}\n\n" + table(["case", "tried", "expected", "what happened"], rows))
     return "\n\n".join(texts)
 
 
+def happened(row: dict) -> str:
+    """What happened, marked if it was not what is expected."""
+    return MARKS[row["ok"]] + row["happened"]
+
+
+def summary(record: list[dict]) -> str:
+    """How many cases of each section went as expected, and those that did not, as Markdown."""
+    counts = Counter((row["section"], row["ok"]) for row in record)
+    rows = []
+    for section in dict.fromkeys(row["section"] for row in record):
+        found = [counts[section, ok] for ok in (True, False, None)]
+        rows.append([section, *map(str, (sum(found), *found))])
+    rows.append(["all", *(str(sum(int(row[i]) for row in rows)) for i in range(1, 5))])
+    text = table(["section", "cases", "as expected", "not as expected", "not tried here"], rows)
+    others = [f"* `{row['name']}`: {happened(row)}" for row in record if row["ok"] is not True]
+    return "\n".join([made_with(record) + "\n", text, *(line + "\n" for line in others)])
+
+
 def write(record: list[dict]) -> None:
-    """The record as data, and as tables in the page."""
+    """The record as data, as tables, and as counts in the page."""
     write_text(RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
-    write_text(PAGE, replace_part(PAGE.read_text(), "stress", page(record)))
+    write_text(TABLES, page(record))
+    write_text(PAGE, replace_part(PAGE.read_text(), "stress", summary(record)))
 
 
 def tried(case: Case) -> dict:

@@ -356,7 +356,7 @@ def test_names_are_those_of_the_preset():
 
 def test_the_goals_of_the_project_can_be_measured(results):
     """Expected: every row of goals.toml names a figure that exists, and gives a text for any data."""
-    goals = tomllib.loads((ROOT / "docs" / "benchmark" / "goals.toml").read_text())["goal"]
+    goals = tomllib.loads((ROOT / "docs" / "reports" / "benchmark" / "goals.toml").read_text())["goal"]
     assert report.goals_table(results, goals).count("\n") == len(goals) + 2
 
 

@@ -16,7 +16,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.workers import results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
@@ -63,7 +63,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
     scene = mi.load_file(str(SCENE), resolution=32)
     options = Namespace(
         **{"scene": SCENE, "defines": [("resolution", "32")], "properties": [], "variant": mi.variant()},
-        **{"integrator": None, "sensor": 0, "time": None, "until_error": None, "seed": 0},
+        **{"integrator": None, "sensor": 0, "time": None, "target_error": None, "seed": 0},
     )
     job = cluster._job(scene, scene.integrator(), options, 256)
     assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]
@@ -78,8 +78,10 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
     values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the
     pilot that the client asked; with decisions by hand there are none."""
-    lost = rendering.Render.lost_by_pilot
-    monkeypatch.setattr(rendering.Render, "lost_by_pilot", lambda self: lost(self) + 7 * (self._pilots > 0))
+    lost = Planner.lost_by_pilots
+    monkeypatch.setattr(
+        Planner, "lost_by_pilots", lambda self: lost(self) + 7 * (self.decided.pilots.asked > 0)
+    )
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
     statistics = image(tmp_path / "a.exr")[1]
     seconds = statistics["seconds"]

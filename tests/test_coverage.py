@@ -444,7 +444,7 @@ def test_lens_sees_a_point():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", compare_ptracer.CASES, ids=lambda case: case.name.split(":")[0])
 def test_what_the_light_tracer_of_mitsuba_gets_wrong(case):
-    """Rationale: docs/coverage.md says where `ptracer` is wrong, in numbers.
+    """Rationale: docs/user/coverage.md says where `ptracer` is wrong, in numbers.
 
     Expected: `bdpt` is within 2 % of the right number, `ptracer` is not (where the number is an error:
     0.05).
@@ -457,22 +457,22 @@ def test_what_the_light_tracer_of_mitsuba_gets_wrong(case):
 # -- the page ---------------------------------------------------------------------------------
 
 
-PAGE = ROOT / "docs" / "coverage.md"
+PAGE = ROOT / "docs" / "user" / "coverage.md"
 
 
 def test_the_page_names_tests_that_exist():
-    """Expected: every link of docs/coverage.md to a test leads to a file of tests/ that has the test of
+    """Expected: every link of docs/user/coverage.md to a test leads to a file of tests/ that has the test of
     that name.
     """
-    links = re.findall(r"\]\(\.\./tests/(\w+\.py) \"(\w+)\"\)", PAGE.read_text())
+    links = re.findall(r"\]\(\.\./\.\./tests/(\w+\.py) \"(\w+)\"\)", PAGE.read_text())
     assert len(links) > 50
     for file, name in sorted(set(links)):
         assert f"\ndef {name}(" in (ROOT / "tests" / file).read_text(), f"{file} has no {name}"
 
 
 def test_the_page_says_who_takes_part():
-    """Expected: docs/coverage.md has a row for every kind of emitter and sensor, with a dash exactly where
-    the table of `scene_parts`, which the tests above rely on, says that it has no part.
+    """Expected: docs/user/coverage.md has a row for every kind of emitter and sensor, with a dash exactly
+    where the table of `scene_parts`, which the tests above rely on, says that it has no part.
     """
     rows = re.findall(r"^\| `([\w ]+)` \| (.+) \|.*\|$", PAGE.read_text(), re.MULTILINE)
     found = {name: [cell.startswith("[–]") for cell in cells.split(" | ")] for name, cells in rows}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.edits import State, _checksum
-from mitsuba_bdpt.planning import choice, pilot
+from mitsuba_bdpt.planning import budget, lost_light, pilot
 
-SPP = choice.LEAST_SAMPLES // 32**2
+SPP = budget.LEAST_SAMPLES // 32**2
 
 
 def cornell(**changes):
@@ -200,3 +200,58 @@ def test_scenes_that_are_gone_are_forgotten():
     integrator.render(scene, spp=SPP)
     assert len(notices._scenes) <= before
     assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}
+
+
+def behind_glass(**shapes):
+    """A lamp over a pane of glass, seen through it: light that no strategy finds."""
+    pane = {"type": "cube", "bsdf": {"type": "dielectric"}}
+    pane["to_world"] = mi.ScalarTransform4f().translate([0, 0.2, 0]).scale([0.9, 0.05, 0.9])
+    return cornell(lamp={"type": "point", "position": [0, 0.8, 0], "intensity": 1.0}, pane=pane, **shapes)
+
+
+def test_parameters_are_read_once(monkeypatch):
+    """Rationale: it takes up to 8 ms; pilot and look for lost light both need them. Expected: once
+    in a render, twice where ``on_pass`` was called, which may edit them."""
+    read, original = [], State.of
+
+    def of(owners):
+        read.append(owners)
+        return original(owners)
+
+    monkeypatch.setattr(State, "of", of)
+    integrator = bdpt()
+    integrator.render(behind_glass(), spp=SPP)
+    assert integrator.statistics["pilots"]["asked"] == 1 == len(read)
+    integrator.on_pass = lambda report: None
+    integrator.render(behind_glass(), spp=SPP)
+    assert len(read) == 3
+
+
+def test_edits_during_a_render_are_seen(monkeypatch):
+    """Rationale: what is found of a scene that ``on_pass`` has edited is not of the one that the pilot saw.
+    Expected: it is looked for anew when that one is rendered again."""
+    looks = []
+
+    def look(prepared, plan, max_depth):
+        looks.append(max_depth)
+        return {}
+
+    monkeypatch.setattr(lost_light, "lost_radiance", look)
+    texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
+    painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    scene, integrator = behind_glass(painted=painted), bdpt()
+    parameters = mi.traverse(scene)
+    (key,) = (key for key in parameters.keys() if key.endswith("painted.bsdf.reflectance.data"))
+
+    def paint(value):
+        parameters[key] = dr.full(mi.TensorXf, value, (16, 16, 3))
+        parameters.update()
+
+    paint(0.5)
+    integrator.on_pass = lambda report: paint(0.1)
+    integrator.render(scene, spp=SPP)
+    integrator.on_pass = None
+    paint(0.5)
+    integrator.render(scene, spp=SPP)
+    integrator.render(scene, spp=SPP)
+    assert len(looks) == 2

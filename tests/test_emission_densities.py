@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-from mitsuba_bdpt.emitters import infinity
+from mitsuba_bdpt.emitters import disks as emitter_disks
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.sensors import kinds as sensors
@@ -214,7 +214,8 @@ def test_spheres_that_to_world_turns(inwards, radiance):
     meter = {"type": "irradiancemeter", "film": film}
     scene = mi.load_dict({"type": "scene", "lamp": ball | {"emitter": lamp, "sensor": meter}})
     emitters = Emitters(scene)
-    assert emitters._inward_spheres == (inwards and radiance == "uniform")  # one with a texture samples that
+    (area,) = emitters.groups
+    assert area.any_inner == (inwards and radiance == "uniform")  # one with a texture samples that
     u = [mi.Float(v) for v in numbers(4)]
     like = dr.zeros(mi.Interaction3f)
     e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
@@ -325,7 +326,7 @@ def test_aimed_emission(name):
     assert np.isfinite(column(e.weight)).all()
     everything, block = emitters.disks.scene, emitters.disks.details
     assert block.radius[0] < 0.1 * everything.radius[0]
-    for sphere, least in ((everything, 1), (block, infinity.AIMED)):
+    for sphere, least in ((everything, 1), (block, emitter_disks.AIMED)):
         radius = float(sphere.radius[0])
         offset = column(e.si.p) - np.array(sphere.center, dtype=float).reshape(3, 1)
         d = column(e.d)
@@ -345,7 +346,7 @@ def test_details():
 
     def found(*small, at=0.0):
         whole = box([at - 10] * 3, [at + 10] * 3)
-        sphere = infinity.details([whole, *small], whole)
+        sphere = emitter_disks.details([whole, *small], whole)
         return None if sphere is None else (list(sphere.center), sphere.radius)
 
     center, radius = found(box([1, 1, 1], [2, 2, 2]), box([2, 2, 2], [3, 3, 3]))
@@ -366,7 +367,7 @@ def test_aimed_points_know_that_they_are(scale):
     Expected: no start that was aimed has less than that part, and none has none.
     """
     transform = mi.ScalarTransform4f()
-    disks = infinity.Disks(
+    disks = emitter_disks.Disks(
         mi.load_dict(
             {
                 "type": "scene",
@@ -378,8 +379,8 @@ def test_aimed_points_know_that_they_are(scale):
     u = [mi.Float(v) for v in numbers(4)]
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[2], u[3]))
     _, density = disks.start(d, mi.Point2f(u[0], u[1]))
-    density, aimed = column(density), column(u[0]) < infinity.AIMED
-    part = infinity.AIMED / (np.pi * float(disks.details.radius[0]) ** 2)
+    density, aimed = column(density), column(u[0]) < emitter_disks.AIMED
+    part = emitter_disks.AIMED / (np.pi * float(disks.details.radius[0]) ** 2)
     assert density.min() > 0 and density[aimed].min() >= part * (1 - 1e-6)
 
 
@@ -394,7 +395,7 @@ def test_a_vertex_that_is_not_finite():
     params["faces"] = [0, 1, 2, 1, 2, 3]
     params.update()
     scene = mi.load_dict({"type": "scene", "mesh": mesh, "sky": {"type": "constant"}})
-    sphere = infinity.Disks(scene).scene
+    sphere = emitter_disks.Disks(scene).scene
     np.testing.assert_allclose(np.array(sphere.center).ravel(), [1, 1, 0], atol=1e-6)
     assert float(sphere.radius[0]) == pytest.approx(np.sqrt(2), rel=1e-3)
 

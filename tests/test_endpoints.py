@@ -9,7 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.emitters.kinds import GROUPS, group_of
 from mitsuba_bdpt.geometry.rounding import ShapeErrors
+from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.transport.kernel import Shared
 from scene_parts import (
@@ -113,6 +115,40 @@ def emission(name, count, **others):
     like = like_of_rgb()
     e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
     return scene, emitters, e, rng
+
+
+@pytest.mark.parametrize("name", EMITTERS)
+def test_groups_that_a_scene_has_not_are_not_asked(name, monkeypatch):
+    """Rationale: a scene without a kind of emitter is to record the same kernels as if there were none.
+    Expected: whatever is asked about an emitter, only its own group answers: the others raise.
+    """
+    register_plugins()
+    scene = mi.load_dict(room() | {"lamp": EMITTERS[name]()})
+    own = group_of(scene.emitters()[0])
+
+    def refuse(*_):
+        raise AssertionError("a group of another kind was asked")
+
+    for group in GROUPS:
+        if group is not own:
+            for method in [name for name, made in vars(group).items() if callable(made)]:
+                monkeypatch.setattr(group, method, refuse)
+    emitters = Emitters(scene)
+    assert [type(group) for group in emitters.groups] == [own]
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    with evaluated_mode(emitters.evaluated):
+        if emitters.traced:
+            u = mi.Point2f(0.3, 0.6)
+            e = emitters.sample_emission(u, u, like_of_rgb(), mi.Bool(True))
+            emitters.connection_density(e, si, mi.Bool(True))
+        if emitters.connectible_to_sensor:
+            emitters.direction_density(e, si.p, e.d, mi.Bool(True))
+            emitters.radiance_towards(e, e.d, mi.Bool(True))
+        if emitters.direct:
+            emitters.sample_direct(si, mi.Point2f(0.3, 0.6), mi.Bool(True))
+        if emitters.hittable:
+            ray = mi.Ray3f(mi.Point3f(0, 0.2, 1.5), mi.Vector3f(0.2, 0.9, 0.3))
+            emitters.hit_densities(scene.ray_intersect(ray), ray.o, mi.Bool(True))
 
 
 POWER = {  # emitted flux of the first channel

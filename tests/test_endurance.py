@@ -190,7 +190,7 @@ def test_what_pilots_lose_is_judged():
 def test_a_run_ends_with_its_table_on_the_page(tmp_path, monkeypatch):
     """Expected: a run that adds to the project's record writes its table, with the sum in words, between the
     markers of the page, and nothing else of it; one with another record leaves the page as it is."""
-    page, marker = tmp_path / "stress.md", "<!-- report: endurance -->\n"
+    page, marker = tmp_path / "endurance.md", "<!-- report: endurance -->\n"
     shutil.copy(endurance.PAGE, page)
     assert page.read_text().count(marker) == 1
     monkeypatch.setattr(endurance, "PAGE", page)

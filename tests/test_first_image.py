@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.planning import choice
+from mitsuba_bdpt.planning import budget
 from mitsuba_bdpt.transport import bsdf
 from room import KINDS, room
 
@@ -80,7 +80,7 @@ def test_pilots_of_rooms():
     few, many = (mi.load_dict(room(n, 128)) for n in (bsdf.MANY - 2, bsdf.MANY))  # the lamp has one more
     assert len(integrator.decide(few, spp=8)) == 1
     assert integrator.decide(many, spp=255) == []
-    assert str(choice.LEAST_OF_MANY) in integrator.statistics["no_pilot"]
+    assert str(budget.LEAST_OF_MANY) in integrator.statistics["no_pilot"]
     assert len(integrator.decide(many, spp=256)) == 1
 
 

@@ -1,4 +1,4 @@
-"""``render`` with --checkpoint, --resume and --until-error."""
+"""``render`` with --checkpoint, --resume and --target-error."""
 
 import json
 import signal
@@ -13,7 +13,8 @@ import pytest
 from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.named import named_files
-from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.image.accumulator import Accumulator
+from mitsuba_bdpt.run import work
 from mitsuba_bdpt.run.snapshot import read
 
 SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
@@ -190,16 +191,21 @@ def test_an_interruption_inside_a_pass(monkeypatch):
     is the uninterrupted one, its estimate of the error included."""
     arguments = [*ARGUMENTS, "--spp", "63", "-P", "variance=true"]  # too few for a pilot
     assert main([*arguments, "-o", "whole.exr"]) == 0
-    original, waits = rendering.Render._wait, []
+    original, close_pass, waits, closed = work.Meter.wait, Accumulator.close_pass, [], []
+
+    def close(self, spp):
+        close_pass(self, spp)
+        closed.append(spp)
 
     def wait(self):
-        waits.append(len(self.accumulator.passes))
+        waits.append(len(closed))
         if waits[-1] == 5 and waits.count(5) == 1:
             raise KeyboardInterrupt
         original(self)
 
     with monkeypatch.context() as patch:
-        patch.setattr(rendering.Render, "_wait", wait)
+        patch.setattr(Accumulator, "close_pass", close)
+        patch.setattr(work.Meter, "wait", wait)
         assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60"]) == 130
     assert read(Path("cut.checkpoint.npz")).passes == (1, 4, 3, 4)  # the next one ends a replicate
     assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60", "--resume"]) == 0
@@ -232,7 +238,7 @@ def test_a_full_disk_does_not_cost_the_render(monkeypatch, capsys):
 def test_a_render_that_had_reached_its_error_is_not_traced_on(monkeypatch):
     """Rationale: killed between its last pass and the image. Expected: --resume writes the image of the
     passes that there are."""
-    arguments = [*ARGUMENTS, "--until-error", "0.02", "-o", "a.exr", "--checkpoint", "0"]
+    arguments = [*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr", "--checkpoint", "0"]
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints.Checkpoints, "end", lambda self, finished: None)
         assert main(arguments) == 0
@@ -242,7 +248,7 @@ def test_a_render_that_had_reached_its_error_is_not_traced_on(monkeypatch):
 
 
 def test_an_error_that_is_not_reached_is_said(capsys):
-    assert main([*ARGUMENTS, "--until-error", "1e-9", "--spp", "32", "-o", "a.exr"]) == 0
+    assert main([*ARGUMENTS, "--target-error", "1e-9", "--spp", "32", "-o", "a.exr"]) == 0
     assert "not the 1e-09 asked for" in capsys.readouterr().out
 
 
@@ -259,7 +265,7 @@ def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
 def test_until_an_error(capsys):
     """Expected: the render ends at 2^n * 32 spp with an estimate below what is asked for, and the image
     has the layers of the variance."""
-    assert main([*ARGUMENTS, "--until-error", "0.02", "-o", "a.exr"]) == 0
+    assert main([*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr"]) == 0
     channels = OpenEXR.File("a.exr", separate_channels=True).channels()
     assert "variance.R" in channels
     statistics = image("a.exr")[1]
@@ -273,16 +279,16 @@ def test_until_an_error(capsys):
         (["--parts", "3"], "parts needs --scheduler"),
         (["--scheduler", "x:1", "--time", "1"], "scheduler together with time"),
         (["--scheduler", "x:1", "--checkpoint", "1"], "scheduler together with checkpoint"),
-        (["--scheduler", "x:1", "--until-error", "1"], "scheduler together with until_error"),
+        (["--scheduler", "x:1", "--target-error", "1"], "scheduler together with target_error"),
         (["--scheduler", "x:1", "-P", "timeout=3"], "scheduler with timeout=3.0 is not possible"),
         (["--scheduler", "x:1", "-P", "aovs=a:duv_dx"], "duv_dx depends on the samples per pixel of a part"),
         (["--checkpoint", "1", "-P", "points=sampler"], "checkpoint with points=sampler"),
         (["--integrator", "path", "--checkpoint", "1"], "checkpoint is for the integrator bdpt"),
         (["--integrator", "path", "--scheduler", "x:1"], "scheduler is for the integrator bdpt"),
         (["--time", "2", "-P", "timeout=3"], "-P timeout=3 together with --time 2 is not possible"),
-        (["--until-error", "1", "-P", "until_error=2"], "-P until_error=2 together with --until-error 1"),
-        (["--until-error", "1", "-P", "variance=false"], "-P variance=False together with --until-error 1"),
-        (["--integrator", "path", "--until-error", "1"], "until_error is for the integrator bdpt"),
+        (["--target-error", "1", "-P", "target_error=2"], "-P target_error=2 together with --target-error 1"),
+        (["--target-error", "1", "-P", "variance=false"], "-P variance=False together with --target-error 1"),
+        (["--integrator", "path", "--target-error", "1"], "target_error is for the integrator bdpt"),
     ],
 )
 def test_contradictions_are_refused(arguments, words, capsys):
@@ -292,16 +298,16 @@ def test_contradictions_are_refused(arguments, words, capsys):
 
 def test_defaults_of_the_command_line():
     options = build_parser().parse_args(["render", "a.xml"])
-    assert options.checkpoint is options.until_error is options.scheduler is options.parts is None
+    assert options.checkpoint is options.target_error is options.scheduler is options.parts is None
     assert not options.resume
 
 
 def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):
-    """Expected: with the parameters instead of --until-error the checkpoint goes as well when the error is
+    """Expected: with the parameters instead of --target-error the checkpoint goes as well when the error is
     reached, and the closing line says so when it is not."""
     asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "variance=true", "-o", "a.exr"]
-    assert main([*asked, "--spp", "1024", "-P", "until_error=0.5"]) == 0
+    assert main([*asked, "--spp", "1024", "-P", "target_error=0.5"]) == 0
     assert not Path("a.checkpoint.npz").exists() and "asked for" not in capsys.readouterr().out
     assert image("a.exr")[1]["spp"] < 1024
-    assert main([*asked, "--spp", "32", "-P", "until_error=1e-6"]) == 0
+    assert main([*asked, "--spp", "32", "-P", "target_error=1e-6"]) == 0
     assert "not the 1e-06 asked for" in capsys.readouterr().out

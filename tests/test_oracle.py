@@ -34,7 +34,8 @@ from mitsuba_bdpt.measure import oracle
 from mitsuba_bdpt.measure.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
-from mitsuba_bdpt.transport import bsdf, connections, kernel, light_path, mis, techniques
+from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, light_path, mis, techniques
+from mitsuba_bdpt.transport.counters import Counters
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------
@@ -428,7 +429,7 @@ class Sensor:
         return sensor_records.SensorHit(
             dist2=self.dist2,
             cos=self.cos,
-            pdf_area=self.lens_pdf,
+            pdf_a=self.lens_pdf,
             pdf_w=self.density,
             importance=mi.Float(1),
             position=mi.Point2f(0.5),
@@ -515,6 +516,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         strategy_images=False,
         store_size=64,
         surfaces=True,
+        observer=None,
         max_depth=u32(k),
         rr_depth=u32(10**6),
         last_stored=u32(k - 2 if k > 2 else 0),
@@ -523,7 +525,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         last_arrival=u32(k),
         last_light=u32(k if plan.arrival else k - 1),
         count_light=f(1),
-        kappa=kernel.Coefficients(
+        kappa=inputs.Coefficients(
             hit=f(1),
             direct=f(1),
             splat=f(kappa.splat) if plan.splat else 0,
@@ -542,11 +544,10 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     def record(function, edges_of):
         def recorded(kernel_, *arguments):
             out = function(kernel_, *arguments)
-            c = out[0] if isinstance(out, tuple) else out
             s, edges = edges_of(*arguments)
             if edges == k:
-                result[s] = c.weight
-                world.demands.append((c.s == s) & (c.t == k + 1 - s))
+                result[s] = out.weight
+                world.demands.append((out.s == s) & (out.t == k + 1 - s))
             return out
 
         return recorded
@@ -554,12 +555,12 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     def edges(vertex):
         return int(vertex.edges[0])
 
-    def connect_all(kernel_, z, path, counters, total, add):
+    def connect_all(kernel_, z, path, total, add):
         for y in stored:
             # Other pairs are not neighbours on a path of k edges.
             if edges(y) + edges(z) + 1 == k:
                 connections.inner(kernel_, z, y)
-        return total
+        return total, Counters()
 
     for function, edges_of in (
         (techniques.hit_emitter, lambda z: (0, edges(z))),
@@ -570,7 +571,11 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         (connections.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),
     ):
         monkeypatch.setattr(sys.modules[function.__module__], function.__name__, record(function, edges_of))
-    monkeypatch.setattr(light_path, "store_light_vertex", lambda kernel_, y, path: stored.append(y))
+    monkeypatch.setattr(
+        light_path,
+        "store_light_vertex",
+        lambda kernel_, y, path: stored.append(light_path.StoredVertex.of(y)),
+    )
     monkeypatch.setattr(connections, "connect_all", connect_all)
     monkeypatch.setattr(techniques, "sees_emitter", lambda kernel_, z: z.active)
     monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))
@@ -583,8 +588,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
     lane = kernel._Lane(place, shared, path)
-    counters = dict.fromkeys(kernel.COUNTERS, u32(0))
-    kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), counters, mi.Bool(True))
+    kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
     return columns(result, world.n)

@@ -17,7 +17,7 @@ import mitsuba_bdpt
 import numpy as np
 import pytest
 from mitsuba_bdpt.parameters import check_variant
-from mitsuba_bdpt.run import rendering, schedule
+from mitsuba_bdpt.run import schedule, work
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
 
@@ -376,7 +376,7 @@ def test_timeout_stops_after_a_pass(monkeypatch):
     normalised by what was done (0.5 exactly, without light subpaths), and timeout=0 does one pass.
     """
     clock = Clock()
-    monkeypatch.setattr(rendering, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+    monkeypatch.setattr(work, "time", SimpleNamespace(perf_counter=clock.perf_counter))
     for timeout, count in ((2.5, 3), (0, 1), (-1, 10), (100, 10), (float("inf"), 10)):
         bdpt = integrator(max_depth=1, light_paths=0, skip="none", spp_per_pass=1, timeout=timeout)
 
@@ -840,7 +840,7 @@ def test_gradients_do_not_matter_to_what_is_told():
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
     Expected: on a machine that has room for the film alone, each of them is refused in words."""
-    monkeypatch.setattr("mitsuba_bdpt.parameters._memory", lambda: 300 * 64 * 64)
+    monkeypatch.setattr("mitsuba_bdpt.image.memory.available", lambda: 300 * 64 * 64)
     scene = glowing_sphere(size=64)
     assert image(integrator(), scene, spp=8).shape == (64, 64, 3)
     for more in ({"variance": True}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
@@ -1302,7 +1302,7 @@ def test_passes_are_short_under_a_timeout(monkeypatch):
     compilation = [
         {"type": dr.KernelType.JIT, "cache_hit": False, "codegen_time": 50.0, "backend_time": 150.0}
     ]
-    monkeypatch.setattr(rendering.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(work.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(dr, "kernel_history", lambda: [compilation.pop()] if compilation else [])
     bdpt.on_pass = lambda report: clock.__setitem__(0, float(report.spp_done))
     bdpt.render(lamp_in_a_sphere(), spp=1000)

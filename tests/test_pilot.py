@@ -15,7 +15,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.planning import choice, moments, pilot
+from mitsuba_bdpt.planning import budget, choice, costs, even_sky, moments, pilot
+from mitsuba_bdpt.planning.candidates import candidates
+from mitsuba_bdpt.planning.choice import Alternatives
+from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Weighting
+from mitsuba_bdpt.planning.decision import Decision
+from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
 from mitsuba_bdpt.transport.batch import NET, NETS, Batch, Places
@@ -108,22 +113,28 @@ def made_of(base, rays, light=0.0):
     return moments.Moments(base, none, none + light, none, gain, 1.0, rays, 4096)
 
 
-def decision(weighting: pilot.Weighting, served: int, connections: str, mean=0.0):
-    number = pilot.WEIGHTINGS.index(weighting)
-    return choice.Candidate(number, served, connections).decided(0, 1.0, 1.0, mean)
+def candidate(number: int, served: int, connections: str) -> Configuration:
+    """That of the weighting of this number."""
+    return Configuration.weighted(WEIGHTINGS[number], served, connections)
+
+
+def decision(weighting: Weighting, served: int, connections: str, mean=0.0):
+    chosen = Configuration.weighted(weighting, served, connections)
+    return Decision.of(chosen, first_pass=0, cost=1.0, variance=1.0, mean=mean)
 
 
 def forced(*decisions, **parameters):
     return bdpt(decisions=json.dumps([d.record() for d in decisions]), **parameters)
 
 
-ALONE = pilot.Weighting(1, 1, 0, 0)
+ALONE = Weighting(1, 1, 0, 0)
+ALL_ALONE = [candidate(number, 1, "none") for number in range(3)]
 CANDIDATES = {
     "n0c0": (ALONE, 1, "none"),
-    "n0c0, kappa of s=1": (pilot.Weighting(1, 1 / 16, 0, 0), 1, "none"),
-    "n1c0": (pilot.Weighting(1, 1, 1 / 16, 0), 4, "none"),
-    "n1c1": (pilot.Weighting(1, 1, 1, 1), 1, "all"),
-    "n1c1, one": (pilot.Weighting(1, 1, 1 / 4, 1), 4, "one"),
+    "n0c0, kappa of s=1": (Weighting(1, 1 / 16, 0, 0), 1, "none"),
+    "n1c0": (Weighting(1, 1, 1 / 16, 0), 4, "none"),
+    "n1c1": (Weighting(1, 1, 1, 1), 1, "all"),
+    "n1c1, one": (Weighting(1, 1, 1 / 4, 1), 4, "one"),
 }
 
 
@@ -149,7 +160,7 @@ def test_predicted_variance(make, name):
     target = make()
     hidden = {"hide_emitters": True, "points": "independent"}
     found = moments_of(target, 1 << 14, rounds=8, **hidden)
-    number = pilot.WEIGHTINGS.index(weighting)
+    number = WEIGHTINGS.index(weighting)
     base, light = found.variance(found.draw if connections == "one" else 0)[:, :, number].mean(axis=0)
     predicted = base + served * light
     integrator = forced(decision(weighting, served, connections), **hidden)
@@ -168,11 +179,11 @@ def test_choice(make, light, monkeypatch):
     """Expected: path tracing alone where nothing is to be gained, light subpaths where they pay, with the
     reason in ``skipped`` and ``explain``, for pilots of five seeds. (Under a sky a pilot is asked in long
     renders only; here in this one.)"""
-    monkeypatch.setattr(choice, "UNIFORM_SAMPLES", 0)
+    monkeypatch.setattr(even_sky, "UNIFORM_SAMPLES", 0)
     target = make(128)
     integrator = bdpt()
     for seed in range(5):
-        monkeypatch.setattr(rendering.Render, "pilot_seed", seed)
+        monkeypatch.setattr(Planner, "pilot_seed", seed)
         integrator.render(target, seed=seed, spp=32)
         statistics = integrator.statistics
         (made,) = statistics["decisions"]
@@ -211,7 +222,7 @@ def test_rare_paths_count_by_how_often_they_are_made():
     for share, expected in ((1 / 160, 160), (1 / 10240, 1024)):
         shares = mi.Vector4f(*({"light": share, "inner": 1 - share}.get(kind, 0) for kind in mis.CLASSES))
         _, parts = sink._parts(mi.Float(1), SimpleNamespace(shares=shares, kind="inner"))
-        lit = [w for w in pilot.WEIGHTINGS if w.light]
+        lit = [w for w in WEIGHTINGS if w.light]
         found = [p[0] for w, p in zip(lit, parts["light"], strict=True) if not w.inner]
         assert len(found) > 1 and found == pytest.approx([expected] * len(found), rel=1e-4)
 
@@ -219,10 +230,10 @@ def test_rare_paths_count_by_how_often_they_are_made():
 def test_open_ends_are_not_counted_on():
     """Expected: a render whose samples are only a bound gets the pilot of 2^20, and rare paths count by
     that."""
-    for parameters in ({"timeout": 5.0}, {"until_error": 0.1, "variance": True}):
-        assert choice.expected_samples(bdpt(**parameters).settings, 1 << 30) == 1 << 20
-        assert choice.expected_samples(bdpt(**parameters).settings, 1 << 18) == 1 << 18
-    assert choice.expected_samples(bdpt().settings, 1 << 30) == 1 << 30
+    for parameters in ({"timeout": 5.0}, {"target_error": 0.1, "variance": True}):
+        assert budget.expected_samples(bdpt(**parameters).settings, 1 << 30) == 1 << 20
+        assert budget.expected_samples(bdpt(**parameters).settings, 1 << 18) == 1 << 18
+    assert budget.expected_samples(bdpt().settings, 1 << 30) == 1 << 30
 
 
 @pytest.mark.parametrize("fov", [40, 3], ids=["the whole spot is seen", "a part of the spot is seen"])
@@ -356,12 +367,12 @@ def test_gain_of_single_weightings_is_mostly_that_of_all():
     """Rationale: some 128 pairs of nets know what points leave of all weightings together, and hardly of
     each. Expected: 0.65 of all leaves 0.65^2 (what 64 points leave over what nets do is 0.65 again); of one
     weighting that seems to gain ten times as much `OWN_GAIN` counts; one that is ruled out does not."""
-    made = made_of(np.ones((moments.GROUPS, len(pilot.WEIGHTINGS))), {})
-    even = replace(made, gain=np.full(len(pilot.WEIGHTINGS), 0.65))
+    made = made_of(np.ones((moments.GROUPS, len(WEIGHTINGS))), {})
+    even = replace(made, gain=np.full(len(WEIGHTINGS), 0.65))
     np.testing.assert_allclose(even.variance(0, True)[:, 0], 0.65**2, rtol=1e-12)
     base = made.base.copy()
     base[:, 0] = np.inf
-    gain = np.where(np.arange(len(pilot.WEIGHTINGS)) == 1, 0.05, 0.5)
+    gain = np.where(np.arange(len(WEIGHTINGS)) == 1, 0.05, 0.5)
     gain[0] = 1
     seen = replace(made, base=base, gain=gain).variance(0, True)[0, 0]
     common = (0.05 + 8 * 0.5) / 9
@@ -390,9 +401,9 @@ def test_light_subpaths_from_infinity_cost_more():
         target = mi.load_dict({"type": "scene", "sensor": camera(16), **emitters})
         assert of(target).prepared.emitters.far_share == share
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    way = choice.Candidate(pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, 0)), 4, "none")
-    more = choice.cost(way, rays) - choice.cost(way, rays | {"far": 0.0})
-    assert more == pytest.approx(choice.COSTS["far"] / 4 / 2)
+    way = Configuration.weighted(Weighting(1, 1, 1 / 16, 0), 4, "none")
+    more = costs.cost(way, rays) - costs.cost(way, rays | {"far": 0.0})
+    assert more == pytest.approx(costs.COSTS["far"] / 4 / 2)
 
 
 @pytest.mark.parametrize("make, least, most", [(sky, 0.05, 0.5), (cornell, 0.4, 0.9)])
@@ -409,7 +420,7 @@ def test_measured_gain_of_points(make, least, most):
         images = np.stack([np.array(image)[..., :3].mean(-1) for image in renders]).astype(float)
         variances[points] = relative_variance(images, images.mean(axis=0))
     measured = variances["sobol"] / variances["independent"]
-    predicted = found.gain[pilot.WEIGHTINGS.index(ALONE)]
+    predicted = found.gain[WEIGHTINGS.index(ALONE)]
     assert least < measured < most and measured / 1.5 < predicted < 1.5 * measured
 
 
@@ -438,7 +449,7 @@ def test_small_caustics_get_their_light(name, monkeypatch):
     subpath, or for two, in place of 1/4 to 1/16."""
     target = mi.load_file(str(Path(__file__).parents[1] / "scenes" / "small_casters" / f"{name}.xml"))
     for seed in range(4):
-        monkeypatch.setattr(rendering.Render, "pilot_seed", seed)
+        monkeypatch.setattr(Planner, "pilot_seed", seed)
         render = rendering.Render(target, target.sensors()[0], bdpt(max_depth=8).settings, seed, 64)
         assert render.decide()[0].candidate.light_paths >= 1 / 2
 
@@ -480,21 +491,25 @@ def test_an_even_sky_decides_without_a_pilot(monkeypatch):
     monkeypatch.setattr(pilot, "measure", None)
     integrator = bdpt()
     integrator.render(sky(), spp=1 << 9, develop=False)
-    assert integrator.statistics["decisions"][0]["coefficients"]["s=1"] == choice.SKY_DIRECT
+    assert integrator.statistics["decisions"][0]["coefficients"]["s=1"] == even_sky.SKY_DIRECT
     monkeypatch.undo()
     for target, samples in (
-        (sky(), choice.UNIFORM_SAMPLES),
-        (surroundings(bright=10.0), choice.CHEAP_SAMPLES),
+        (sky(), even_sky.UNIFORM_SAMPLES),
+        (surroundings(bright=10.0), budget.CHEAP_SAMPLES),
     ):
         render = of(target)
         asked = [
-            choice.by_scene(render.prepared, render.plan, bdpt().settings, n) is None
+            even_sky.decision(render.prepared, render.plan, bdpt().settings, n) is None
             for n in (samples - 1, samples)
         ]
         assert asked == [False, True]
-    for bright, kappa in ((1.5, choice.SKY_DIRECT), (10.0, 1.0)):  # a map worth sampling gets its full weight
+    for bright, kappa in (
+        (1.5, even_sky.SKY_DIRECT),
+        (10.0, 1.0),
+    ):
+        # A map worth sampling gets its full weight.
         render = of(surroundings(bright=bright))
-        made = choice.by_scene(render.prepared, render.plan, bdpt().settings, 1 << 14)
+        made = even_sky.decision(render.prepared, render.plan, bdpt().settings, 1 << 14)
         assert made.kappa_direct == kappa
     by_hand = bdpt(light_paths=1)
     by_hand.render(sky(), spp=4, develop=False)
@@ -512,15 +527,15 @@ def test_why_there_is_no_pilot():
 def test_path_tracing_alone_before_what_is_hardly_better():
     """Expected: light subpaths that gain less than `LIGHT_GAIN` are left out, and it is said by how much;
     those that gain more are used."""
-    shape = (moments.GROUPS, len(pilot.WEIGHTINGS))
+    shape = (moments.GROUPS, len(WEIGHTINGS))
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    alone, light = (pilot.WEIGHTINGS.index(w) for w in (ALONE, pilot.Weighting(1, 1, 1 / 16, 0)))
-    possible = [choice.Candidate(n, s, "none") for n, s in ((alone, 1), (light, 16))]
-    cost = choice.cost(possible[1], rays)
+    alone, light = (WEIGHTINGS.index(w) for w in (ALONE, Weighting(1, 1, 1 / 16, 0)))
+    possible = [candidate(n, s, "none") for n, s in ((alone, 1), (light, 16))]
+    cost = costs.cost(possible[1], rays)
     for gain, chosen in ((1.1, False), (1.2, True)):
         base = np.full(shape, 1.0)
         base[:, light] = 1 / (gain * cost)
-        table = choice.choose(made_of(base, rays), possible, True)
+        table = choice.choose(made_of(base, rays), Alternatives(possible, True))
         assert bool(table[0].candidate.light_paths) == chosen and len(table) == 2
         assert chosen or "it gains 1.10x at most" in choice.left_out(table)[0]["why"]
 
@@ -534,7 +549,7 @@ def test_what_renders_do_not_meet_does_not_decide(monkeypatch):
     target = mi.load_file(str(file), resolution=128)
     integrator = bdpt(max_depth=target.integrator().max_depth)
     for seed in range(6):
-        monkeypatch.setattr(rendering.Render, "pilot_seed", seed)
+        monkeypatch.setattr(Planner, "pilot_seed", seed)
         render = rendering.Render(target, target.sensors()[0], integrator.settings, seed, 64)
         table = render.decide()
         alone = min(row.time for row in table if not row.candidate.light_paths)
@@ -572,8 +587,8 @@ def test_light_that_only_connections_find():
 
     def combinations(**scene):
         render = of(mi.load_dict({"type": "scene", "floor": floor, "lamp": lamp, **scene}))
-        found = choice.candidates(render.prepared, render.plan, render.settings)
-        return {c.combination for c in found}
+        found = candidates(render.prepared, render.plan, render.settings)
+        return {c.weighting.combination for c in found}
 
     assert combinations(sensor=camera(16)) == {"n0c0", "n1c0", "n1c1"}
     assert combinations(sensor=camera(16), ball=ball) == {"n1c1"}
@@ -584,9 +599,9 @@ def test_candidates_draw_their_connections():
     """Rationale: all connections gain nothing over a drawn one in any scene of the benchmark, and what a
     pilot finds of the outliers of drawing is noisy. Expected: they are no candidate."""
     render = of(cornell())
-    found = choice.candidates(render.prepared, render.plan, render.settings)
+    found = candidates(render.prepared, render.plan, render.settings)
     assert {c.connections for c in found} == {"none", "one"}
-    assert len(set(found)) == len(found) == 30  # as docs/skipping.md says
+    assert len(set(found)) == len(found) == 30  # as docs/method/skipping.md says
 
 
 @pytest.mark.parametrize("name", CANDIDATES)
@@ -657,20 +672,19 @@ def test_changed_decisions_change_the_points():
     Expected: the image's own sequence before the change, another one after it, none where nothing changes.
     """
     render = of(cornell())
-    path, full = decision(ALONE, 1, "none"), decision(pilot.Weighting(1, 1, 1 / 4, 1), 4, "one")
+    path, full = decision(ALONE, 1, "none"), decision(Weighting(1, 1, 1 / 4, 1), 4, "one")
     changes = []
     for made in (full, full, path, path, full):
-        render._adopt(made)
-        changes.append(render._changes)
+        render.planner.adopt(made, ())
+        changes.append(render.planner.changes)
     assert changes == [0, 0, 1, 1, 2]
     late = of(cornell())
-    late._adopt(replace(path, first_pass=2))  # after passes without a decision
-    assert late._changes == 1
+    late.planner.adopt(replace(path, first_pass=2), ())  # after passes without a decision
+    assert late.planner.changes == 1
     step = schedule.Step(0, 0, 1, 64, False)
     batch = schedule.batches(render.prepared.camera, 0, 1, render.settings)[0]
-    seeds = {int(render._points(step, batch).seed[0])}
-    render._changes = 0
-    assert render._points(step, batch).seed[0] == 1 and seeds.isdisjoint({1})
+    changed, first = (render.points.of(step, batch, n) for n in (render.planner.changes, 0))
+    assert first.seed[0] == 1 != changed.seed[0]
 
 
 @pytest.mark.parametrize(
@@ -714,7 +728,7 @@ def test_bad_decisions(text, words):
 def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     """Rationale: a sky alone is seen directly, which pilots leave out; `explain` printed a
     table of equals beside a plan that was not the first of them. Expected: no decision, and no table."""
-    monkeypatch.setattr(choice, "UNIFORM_SAMPLES", 0)
+    monkeypatch.setattr(even_sky, "UNIFORM_SAMPLES", 0)
     scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "sensor": camera(24)})
     integrator = bdpt()
     assert "time to the same error" not in integrator.explain(scene, spp=1024)
@@ -786,15 +800,15 @@ def test_the_same_kernel_where_it_hardly_matters():
     """Rationale: another kernel takes seconds to compile in rooms of many materials, and seeds differ by what
     pilots are off by. Expected: no connections (`KERNELS`) where drawing them takes 1 / 1.03 of the time, but
     where it takes 1 / 1.1."""
-    numbers = [pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, inner)) for inner in (0, 1)]
-    possible = [choice.Candidate(n, 4, kind) for n, kind in zip(numbers, ("none", "one"), strict=True)]
+    numbers = [WEIGHTINGS.index(Weighting(1, 1, 1 / 16, inner)) for inner in (0, 1)]
+    possible = [candidate(n, 4, kind) for n, kind in zip(numbers, ("none", "one"), strict=True)]
     kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "bsdfs", "far")
     rays = dict.fromkeys(kinds, 1.0)
-    ratio = choice.cost(possible[1], rays) / choice.cost(possible[0], rays)
+    ratio = costs.cost(possible[1], rays) / costs.cost(possible[0], rays)
     for faster, chosen in ((1.03, "none"), (1.1, "one")):
-        base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+        base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
         base[:, numbers[1]] = 1 / (faster * ratio)
-        table = choice.choose(made_of(base, rays), possible, True)
+        table = choice.choose(made_of(base, rays), Alternatives(possible, True))
         assert table[0].candidate.connections == chosen and len(table) == 2
 
 
@@ -802,45 +816,50 @@ def test_the_same_kernel_where_it_hardly_matters():
 def test_coefficients_under_a_nearly_uniform_sky(gain, kappa):
     """Expected: 1/2, which such scenes have without a pilot, unless another one gains 1.1 (`UNIFORM_GAIN`)
     over it; the coefficient 1, of the same variance as 1/2 here, is not taken."""
-    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
     base[:, 0] = 1 / gain
-    rays = {"camera": 1.0, "shadow_s1": 1.0, "evenness": 1 / choice.UNIFORM}
-    table = choice.choose(made_of(base, rays), [choice.Candidate(i, 1, "none") for i in range(3)], True)
-    assert table[0].candidate.direct == kappa and all(row.candidate.direct < 1 for row in table)
+    rays = {"camera": 1.0, "shadow_s1": 1.0, "evenness": 1 / even_sky.UNIFORM}
+    table = choice.choose(made_of(base, rays), Alternatives(ALL_ALONE, True))
+    assert table[0].candidate.kappa_direct == kappa and all(row.candidate.kappa_direct < 1 for row in table)
 
 
 def test_recording_counts_in_short_renders():
     """Rationale: in previews most of the time is that of recording the kernel, twice as long with light
     subpaths. Expected: with 0.55 of the variance for a sixth more per sample light subpaths are taken for a
     million samples, and not for 2^16, whose cost is that of the samples and of what is fixed."""
-    light = pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, 0))
-    alone = pilot.WEIGHTINGS.index(ALONE)
-    possible = [choice.Candidate(alone, 1, "none"), choice.Candidate(light, 16, "none")]
+    light = WEIGHTINGS.index(Weighting(1, 1, 1 / 16, 0))
+    alone = WEIGHTINGS.index(ALONE)
+    possible = [
+        candidate(alone, 1, "none"),
+        candidate(light, 16, "none"),
+    ]
     rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0, "far": 0.0}
-    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
     base[:, light] = 0.55
     for samples, lit in ((1 << 20, True), (1 << 16, False)):
-        table = choice.choose(made_of(base, rays), possible, True, samples)
+        table = choice.choose(made_of(base, rays), Alternatives(possible, True, samples))
         assert bool(table[0].candidate.light_paths) == lit
-    fixed = choice.FIXED
-    extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16
+    fixed = costs.FIXED
+    extra = (costs.COSTS["light_path"] + 12 * costs.COSTS["light"]) / 16
     expected = 1 + (extra + fixed["light"] / 2**16) / (4 + fixed["start"] / 2**16)
-    assert choice.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
-    assert choice.cost(possible[0], rays, 1 << 16) == 1 == choice.cost(possible[0], rays)
+    assert costs.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
+    assert costs.cost(possible[0], rays, 1 << 16) == 1 == costs.cost(possible[0], rays)
 
 
 def test_twice_the_light_subpaths_have_to_gain():
     """Rationale: along S the product of time and variance is flat, and pilots of other seeds wander on it.
     Expected: of four and two camera subpaths per light subpath the four, where two gain 1.01, and two where
     they gain 1.03 (`MORE_GAIN`: 1.02)."""
-    number = pilot.WEIGHTINGS.index(pilot.Weighting(1, 1, 1 / 16, 0))
-    possible = [choice.Candidate(number, served, "none") for served in (2, 4)]
+    number = WEIGHTINGS.index(Weighting(1, 1, 1 / 16, 0))
+    possible = [candidate(number, served, "none") for served in (2, 4)]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    costs = [choice.cost(candidate, rays) for candidate in possible]
+    each = [costs.cost(way, rays) for way in possible]
     for gain, chosen in ((1.01, 4), (1.03, 2)):
         # base + S light: (base + 4 light) cost_4 = gain (base + 2 light) cost_2, with base = 1.
-        light = (gain * costs[0] - costs[1]) / (4 * costs[1] - 2 * gain * costs[0])
-        table = choice.choose(made_of(np.ones((moments.GROUPS, 10)), rays, light), possible, False)
+        light = (gain * each[0] - each[1]) / (4 * each[1] - 2 * gain * each[0])
+        table = choice.choose(
+            made_of(np.ones((moments.GROUPS, 10)), rays, light), Alternatives(possible, False)
+        )
         assert table[0].candidate.camera_paths_per_light_path == chosen and len(table) == 2
 
 
@@ -848,16 +867,21 @@ def test_certainty():
     """Expected: where all parts of a pilot agree the choice is certain; where one of sixteen has seen what
     decides, in about the share 1 - (15/16)^16 = 0.64 of its resamplings (100 of them: 0.05 is its standard
     error, three allowed)."""
-    light = pilot.Weighting(1, 1, 1 / 16, 0)
-    alone, lit = (pilot.WEIGHTINGS.index(w) for w in (ALONE, light))
-    possible = [choice.Candidate(alone, 1, "none"), choice.Candidate(lit, 16, "none")]
+    light = Weighting(1, 1, 1 / 16, 0)
+    alone, lit = (WEIGHTINGS.index(w) for w in (ALONE, light))
+    possible = [
+        candidate(alone, 1, "none"),
+        candidate(lit, 16, "none"),
+    ]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
     base[:, alone] = 10
-    assert choice.certainty(made_of(base, rays), possible, True) == 1
+    assert choice.certainty(made_of(base, rays), Alternatives(possible, True)) == 1
     base[:, alone] = 0.5
     base[3, alone] = 1e3
-    assert choice.certainty(made_of(base, rays), possible, True) == pytest.approx(0.64, abs=0.15)
+    assert choice.certainty(made_of(base, rays), Alternatives(possible, True)) == pytest.approx(
+        0.64, abs=0.15
+    )
 
 
 def test_losing_light_counts_beside_outliers():
@@ -883,13 +907,13 @@ def test_weightings_in_order():
     """Rationale: sums are added to the last weightings that have a class. Expected: each class is in use from
     some weighting on, all of them in the last."""
     for kind in mis.CLASSES:
-        used = [w.of(kind) > 0 for w in pilot.WEIGHTINGS]
+        used = [w.of(kind) > 0 for w in WEIGHTINGS]
         assert used == sorted(used) and used[-1]
 
 
 def test_threshold_of_roulette():
     """Expected: a tenth of the mean, less where there is little noise, 0 in a black image."""
-    way = pilot.Weighting(1, 1, 1 / 64, 1)
+    way = Weighting(1, 1, 1 / 64, 1)
     for variance, mean, expected in ((1.0, 0.5, 0.05), (0.01, 0.5, 0.001), (1.0, 0.0, 0.0)):
         made = replace(decision(way, 16, "one", mean), variance=variance)
         assert made.threshold == pytest.approx(expected)
@@ -919,7 +943,7 @@ def test_roulette_follows_the_noise():
     known to 5 %); both images have the same mean. Tolerance of the means: five of the standard errors that
     follow."""
     target, renders = furnace(), {}
-    way = pilot.Weighting(1, 1, 1 / 64, 1)
+    way = Weighting(1, 1, 1 / 64, 1)
     usual = decision(way, 16, "one", mean=0.3)
     for variance in (1.0, 1e-3):
         integrator = forced(replace(usual, variance=variance), max_depth=-1)
@@ -945,13 +969,13 @@ def test_loops_are_recorded_once(parameters, capfd):
     say so, of a pass and of a pilot."""
     target, before = cornell(8), dr.log_level()
     render = of(target, **parameters)
-    drawn = render._points(schedule.Step(0, 0, 1, 1, True), Batch(0, 4, 0, 1))
+    drawn = render.points.of(schedule.Step(0, 0, 1, 1, True), Batch(0, 4, 0, 1), 0)
     dr.set_log_level(dr.LogLevel.Debug)
     try:
         counts = kernel.trace(render.kernel, sink.Image(render.accumulator), Batch(0, 4, 0, 1), drawn, 1)
         render.accumulator.evaluate(counts)
         if parameters.get("light_paths") != 0:  # else there is nothing to choose
-            pilot.measure(render.prepared, render.plan, render.settings, render.seed, 64)
+            pilot.measure(render.prepared, render.plan, render.settings, render.points.seed, 64)
     finally:
         dr.set_log_level(before)
     log = "".join(capfd.readouterr())
@@ -965,11 +989,11 @@ def test_coefficients_of_direct_light_have_to_gain_much(gain, stratified, kappa)
     """Rationale: what points leave of two strategies' variances is known to a fifth. Expected: with
     stratified points a gain of 1.2 is not taken, one of 1.5 is; with independent ones that of 1.2 is. Its
     figures are printed as they are."""
-    base = np.ones((moments.GROUPS, len(pilot.WEIGHTINGS)))
+    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
     base[:, 1] = 1 / gain
     rays = {"camera": 1.0, "shadow_s1": 1.0}
-    table = choice.choose(made_of(base, rays), [choice.Candidate(i, 1, "none") for i in range(3)], stratified)
-    assert table[0].candidate.direct == kappa
+    table = choice.choose(made_of(base, rays), Alternatives(ALL_ALONE, stratified))
+    assert table[0].candidate.kappa_direct == kappa
     assert table[0].time == pytest.approx(1 / gain if kappa != 1 else 1)
 
 

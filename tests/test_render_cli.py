@@ -570,7 +570,7 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
         (["plain.xml"], "did you mean render plain.xml?"),
         (["rendr", "plain.xml"], "did you mean render?"),
         (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
-        (["render", "plain.xml", "--untl-error=1"], "did you mean --until-error?"),
+        (["render", "plain.xml", "--traget-error=1"], "did you mean --target-error?"),
         (["explain", "plain.xml", "--integrator", "path"], "that is an option of render"),
     ],
 )

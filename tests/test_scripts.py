@@ -207,9 +207,10 @@ def test_help_does_nothing_else(here, monkeypatch, capsys, script, words):
     assert (shown.out + shown.err).startswith("usage: ") and sorted(here.rglob("*")) == before
 
 
-def test_every_script_of_the_readme_exists():
-    """Expected: the commands that the README names are there, and are commands."""
-    named = set(re.findall(r"python scripts/(\w+\.py)", (SCRIPTS.parent / "README.md").read_text()))
+def test_every_script_of_the_documents_exists():
+    """Expected: the commands that the README and the pages of docs/ name are there, and are commands."""
+    pages = SCRIPTS.parent / "README.md", *(SCRIPTS.parent / "docs").rglob("*.md")
+    named = {name for page in pages for name in re.findall(r"python scripts/(\w+\.py)", page.read_text())}
     assert len(named) > 10 and named <= set(COMMANDS)
 
 

@@ -101,6 +101,22 @@ def test_a_join_is_the_ray_back(name):
             np.testing.assert_allclose(found, known, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", [name for name in SENSORS if not name.startswith(("distant", "irrad"))])
+def test_nothing_is_joined_beyond_the_far_plane(name):
+    """Rationale: camera rays end at the far clip plane, and so must what light subpaths add. Expected: a
+    point on a camera ray is joined before its end, at 0.999 of its length, and not at 1.001 of it."""
+    _, _, camera, u = prepared(name)
+    start = start_of(camera, u)
+    u_film = camera.region.to_uv(start.position)
+    if "batch" in name:
+        u_film = mi.Point2f(u_film.x, 0)
+    for part, share in ((0.999, 1), (1.001, 0)):
+        p = start.ray.o + start.ray.d * (start.ray.maxt * part)
+        join = camera.join(p, mi.Point2f(u[2], u[3]), u_film)
+        # Film positions at the edge of the region, or of a view, may be rounded out of it.
+        assert abs(column(dr.select(join.valid, 1.0, 0.0)).mean() - share) < 1e-3
+
+
 @pytest.mark.parametrize("name", SENSORS)
 def test_importance_integrates_to_the_weight(name):
     """Rationale: what a sensor makes of uniform radiance 1 does not depend on the strategy.
@@ -139,7 +155,8 @@ def test_an_arrival_is_a_start_in_reverse(name):
 
     Expected: light that comes along a camera ray arrives at its film position (a meter: anywhere on its
     pixel), and importance times cosine over both densities is the camera subpath's weight; the
-    densities are those of the start, which also states cos / (both densities). Tolerance: 5e-3.
+    densities are those of the start, which also states cos / (both densities), and of the join, which states
+    cos / (squared distance, density of z_0). Tolerance: 5e-3.
     """
     scene, _, camera, u = prepared(name)
     start = start_of(camera, u)
@@ -158,11 +175,14 @@ def test_an_arrival_is_a_start_in_reverse(name):
     cos = column(arrival.cos)
     keep = active & (cos > 0.05)
     assert active.mean() > (0.999 if lens else 0.4)  # before a meter lies the scene
-    cos, both = cos[keep], (column(arrival.pdf_area) * column(arrival.pdf_w))[keep]
+    cos, both = cos[keep], (column(arrival.pdf_a) * column(arrival.pdf_w))[keep]
     weight = column(arrival.importance)[keep] * cos / both
     np.testing.assert_allclose(weight, column(start.weight)[keep], rtol=5e-3)
     np.testing.assert_allclose(column(arrival.pdf_w)[keep], column(start.pdf_w)[keep], rtol=5e-3)
     np.testing.assert_allclose(cos / both, column(start.arrival)[keep], rtol=5e-3)
+    join = camera.join(p, mi.Point2f(u[2], u[3]), camera.region.to_uv(start.position))
+    ratio = column(join.arrival * join.dist2)[keep]
+    np.testing.assert_allclose(ratio, cos / column(arrival.pdf_area)[keep], rtol=5e-3)
     if lens:
         for axis in "xy":
             found, known = (column(getattr(r.position, axis))[keep] for r in (arrival, start))

@@ -22,25 +22,28 @@ def test_what_is_expected_happens(name):
 def test_the_record_is_of_these_cases():
     """Rationale: a case that was changed after the last whole run would stand in the table with words that
     nothing has checked. Expected: the record's names, what was tried and what is expected are those of the
-    cases, in their order; the page shows the record."""
+    cases, in their order; the page with the counts and that with the tables show the record."""
     record = json.loads(stress.RECORD.read_text())
     recorded = [tuple(row[key] for key in ("name", "section", "tried", "expected")) for row in record]
     assert recorded == [(case.name, case.section, case.tried, case.expected) for case in cases()]
     page = stress.PAGE.read_text()
-    assert page == replace_part(page, "stress", stress.page(record))
+    assert page == replace_part(page, "stress", stress.summary(record))
+    assert stress.TABLES.read_text() == stress.page(record)
 
 
 @pytest.mark.parametrize(
     "ok, mark", [(True, "| done"), (False, "| **no**: done"), (None, "| **not tried**: done")]
 )
 def test_what_was_not_tried_is_not_called_well(ok, mark, monkeypatch, capsys):
-    """Expected: the table marks what went wrong and what could not be tried; only the former is an exit
-    status of 1."""
+    """Expected: the table marks what went wrong and what could not be tried, and the summary names both;
+    only the former is an exit status of 1."""
     outcome = stress.Outcome(ok, "done")
     monkeypatch.setattr(stress, "apart", lambda name: outcome)
     assert stress.main(["black"]) == (ok is False)
     (case,) = [case for case in cases() if case.name == "black"]
-    assert mark in stress.page([stress.tried(case)])
+    row = stress.tried(case)
+    assert mark in stress.page([row])
+    assert (f"* `black`: {mark.removeprefix('| ')}" in stress.summary([row])) == (ok is not True)
 
 
 def test_the_source_of_the_rows_is_told(monkeypatch, capsys):

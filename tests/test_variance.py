@@ -62,7 +62,7 @@ def test_the_estimated_error_sees_fireflies():
 
 
 def test_the_estimated_error_of_a_black_image():
-    """Expected: 0, so that `until_error` stops, not 0 / 0."""
+    """Expected: 0, so that `target_error` stops, not 0 / 0."""
     assert replicates(np.zeros((8, 4)), 4).error(32, 1.0) == 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from fractions import Fraction
 from numbers import Integral, Real
 
@@ -13,28 +12,15 @@ import numpy as np
 
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import all_shapes, named
-from .image import features
+from .image import features, memory
+from .image.channels import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
-from .planning import choice
-from .settings import (
-    CONNECTIONS,
-    DEFAULT_STORED,
-    HEURISTICS,
-    LIGHT_PATHS,
-    MAX_STORED,
-    POINTS,
-    SKIP,
-    UNLIMITED,
-    Settings,
-)
+from .planning.decision import read_decisions
+from .settings import ALIASES, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
-# What numbers mean, for messages.
-MEANING = {
-    "max_depth": "the longest path in edges, -1 for unlimited",
-    "rr_depth": "the depth at which Russian roulette starts, 1 or more",
-    "stored_vertices": f"the longest path that uses all strategies, 1 to {MAX_STORED}",
-    "spp_per_pass": "samples per pixel in one pass, 0 to choose",
+# What numbers that are arguments of a render mean, for messages; of parameters see `settings.PARAMETERS`.
+ARGUMENTS = {
     "spp": f"samples per pixel, at most {UNLIMITED}, 0 for the sampler's sample_count",
     "seed": "any number from 0 to 2^32 - 1",
 }
@@ -57,17 +43,15 @@ REMEDIES = {
     "sample_direct": _SAMPLE_DIRECT,
 }
 
-# Of one array.
-MOST_NUMBERS = 1 << 32
 
-
-def integer(value, name: str, low: int, high: int = UNLIMITED) -> int:
-    """``value`` as an int within [low, high]; raises ``TypeError`` and ``ValueError``."""
+def integer(value, name: str, low: float, high: float = UNLIMITED) -> int:
+    """``value`` as an int within [low, high]; raises ``UsageTypeError`` and ``UsageError``."""
+    what = ARGUMENTS[name] if name in ARGUMENTS else PARAMETERS[name].what
     number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
     if not number or not math.isfinite(value) or value != int(value):
-        raise UsageTypeError(f"{name}={value!r} must be an integer: {MEANING[name]}")
+        raise UsageTypeError(f"{name}={value!r} must be an integer: {what}")
     if not low <= value <= high:
-        raise UsageError(f"{name}={value!r} is out of range; it is {MEANING[name]}")
+        raise UsageError(f"{name}={value!r} is out of range; it is {what}")
     return int(value)
 
 
@@ -76,20 +60,39 @@ def is_index(value) -> bool:
     return isinstance(value, Integral) and not isinstance(value, (bool, np.bool_))
 
 
-def _boolean(props, name):
-    value = props.get(name, False)
-    if not isinstance(value, bool):
-        raise UsageTypeError(f"{name}={value!r} must be a boolean (true or false)")
-    return value
-
-
 def _shown(value) -> str:
     """``value`` in one line, for messages."""
     return " ".join(repr(value).split())
 
 
-def _choice(props, name, choices):
-    value = props.get(name, choices[0])
+def _integer(value, name: str) -> int:
+    return integer(value, name, PARAMETERS[name].low, PARAMETERS[name].high)
+
+
+def _boolean(value, name: str) -> bool:
+    if not isinstance(value, bool):
+        raise UsageTypeError(f"{name}={value!r} must be a boolean (true or false)")
+    return value
+
+
+def _number(value, name: str) -> float:
+    parameter = PARAMETERS[name]
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+        raise UsageTypeError(f"{name}={value!r} must be a number: {parameter.what}")
+    # Without bounds infinity is a number like any other.
+    if not parameter.low <= value or parameter.low > -math.inf and value == math.inf:
+        raise UsageError(f"{name}={value!r} is out of range; it is {parameter.what}")
+    return float(value)
+
+
+def _string(value, name: str) -> str:
+    if not isinstance(value, str):
+        raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
+    return value
+
+
+def _choice(value, name: str) -> str:
+    choices = PARAMETERS[name].choices
     if not isinstance(value, str):
         raise UsageTypeError(f"{name}={_shown(value)} must be a string, one of {', '.join(choices)}")
     if value not in choices:
@@ -97,10 +100,14 @@ def _choice(props, name, choices):
     return value
 
 
-def _light_paths(props):
-    value = props.get("light_paths", "auto")
+def _max_depth(value, name: str) -> int:
+    depth = _integer(value, name)
+    return UNLIMITED if depth < 0 else depth
+
+
+def _light_paths(value, name: str) -> float | str:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise UsageTypeError(f"light_paths={_shown(value)} must be a number or 'auto'")
+        raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
     if value == "auto":
         return value
     try:
@@ -109,32 +116,28 @@ def _light_paths(props):
         number = None
     if number not in LIGHT_PATHS:
         choices = ", ".join(str(Fraction(n)) for n in LIGHT_PATHS)
-        raise UsageError(f"light_paths={value!r} is not possible; use auto, {choices}")
+        raise UsageError(f"{name}={value!r} is not possible; use auto, {choices}")
     return number
 
 
-def _decisions(props):
-    value = props.get("decisions", "")
-    if not isinstance(value, str):
-        raise UsageTypeError(f"decisions={value!r} must be a string of JSON")
-    return choice.read_decisions(value) if value else None
+def _decisions(value, name: str) -> tuple | None:
+    text = _string(value, name)
+    return read_decisions(text) if text else None
 
 
-def _aovs(props):
-    value = props.get("aovs", "")
-    if not isinstance(value, str):
-        raise UsageTypeError(f"aovs={value!r} must be a string, for example 'albedo:albedo,nn:sh_normal'")
-    features.check_syntax(value)
+def _aovs(value, name: str) -> str:
+    features.check_syntax(_string(value, name))
     return value
 
 
-def _until_error(props):
-    value = props.get("until_error", 0.0)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise UsageTypeError(f"until_error={value!r} must be a number, the relMSE to stop at")
-    if not 0 <= value < math.inf:
-        raise UsageError(f"until_error={value!r} must be a positive relMSE, or 0 for none")
-    return float(value)
+# Parameters that more is to be said of than their kind and bounds.
+_READERS = {
+    "max_depth": _max_depth,
+    "light_paths": _light_paths,
+    "decisions": _decisions,
+    "aovs": _aovs,
+}
+_READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice}
 
 
 def _check_layers(settings: Settings):
@@ -149,54 +152,49 @@ def _check_layers(settings: Settings):
         seen.add(layer)
 
 
-def _check_names(props):
-    """Raise ``ValueError`` for parameters that do not exist."""
-    known = [f for f in Settings.__dataclass_fields__]
+def _given(props) -> dict:
+    """The parameters that are given, by their present names; raises ``UsageError`` for those that do not
+    exist or are given twice."""
+    given = {}
     for name in props.keys():
-        if name in known:
-            continue
-        if isinstance(props[name], mi.Object):
-            raise UsageError(
-                f"{name} ({props[name].class_name()}) cannot be nested in it: bdpt holds no other "
-                "object; take it out"
-            )
-        remedy = REMEDIES.get(name)
-        if remedy is None:
-            remedy = f"{did_you_mean(name, known)}Parameters: {', '.join(known)}"
-        raise UsageError(f"{name}={_shown(props[name])} is not a parameter; {remedy}")
+        present = ALIASES.get(name, name)
+        if present not in PARAMETERS:
+            raise UsageError(_not_a_parameter(name, props[name]))
+        if present in given:
+            raise UsageError(f"{present} is given twice, {name} is its old name; leave out one of them")
+        given[present] = props[name]
+    return given
+
+
+def _not_a_parameter(name: str, value) -> str:
+    if isinstance(value, mi.Object):
+        return (
+            f"{name} ({value.class_name()}) cannot be nested in it: bdpt holds no other object; take it out"
+        )
+    remedy = REMEDIES.get(name)
+    if remedy is None:
+        remedy = f"{did_you_mean(name, PARAMETERS)}Parameters: {', '.join(PARAMETERS)}"
+    return f"{name}={_shown(value)} is not a parameter; {remedy}"
 
 
 def read_settings(props) -> Settings:
-    """Read and check the plugin's parameters; raises ``TypeError``, ``ValueError`` and
-    ``NotImplementedError``."""
-    _check_names(props)
-    max_depth = integer(props.get("max_depth", -1), "max_depth", -1)
-    timeout = props.get("timeout", -1.0)
-    if isinstance(timeout, bool) or not isinstance(timeout, (int, float)) or timeout != timeout:
-        raise UsageTypeError(f"timeout={timeout!r} must be a number of seconds, or -1 for none")
-    settings = Settings(
-        max_depth=UNLIMITED if max_depth < 0 else max_depth,
-        rr_depth=integer(props.get("rr_depth", 5), "rr_depth", 1),
-        hide_emitters=_boolean(props, "hide_emitters"),
-        heuristic=_choice(props, "heuristic", HEURISTICS),
-        skip=_choice(props, "skip", SKIP),
-        light_paths=_light_paths(props),
-        connections=_choice(props, "connections", CONNECTIONS),
-        points=_choice(props, "points", POINTS),
-        decisions=_decisions(props),
-        stored_vertices=integer(
-            props.get("stored_vertices", DEFAULT_STORED), "stored_vertices", 1, MAX_STORED
-        ),
-        strategy_images=_boolean(props, "strategy_images"),
-        variance=_boolean(props, "variance"),
-        until_error=_until_error(props),
-        aovs=_aovs(props),
-        spp_per_pass=integer(props.get("spp_per_pass", 0), "spp_per_pass", 0),
-        timeout=float(timeout),
-    )
+    """The plugin's parameters, checked; raises ``UsageError`` and ``UsageTypeError``."""
+    given = _given(props)
+    values = {}
+    for name, parameter in PARAMETERS.items():
+        read = _READERS.get(name) or _READERS_OF_KINDS[parameter.kind]
+        values[name] = read(given.get(name, parameter.default), name)
+    settings = Settings(**values)
+    _check_together(settings)
+    return settings
+
+
+def _check_together(settings: Settings):
+    """Raise ``UsageError`` for parameters that contradict each other."""
     if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
+        depth = -1 if settings.max_depth == UNLIMITED else settings.max_depth
         raise UsageError(
-            f"strategy_images needs a finite max_depth of 1 or greater, not {max_depth}; "
+            f"strategy_images needs a finite max_depth of 1 or greater, not {depth}; "
             "set max_depth, for example to 5"
         )
     by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
@@ -206,21 +204,20 @@ def read_settings(props) -> Settings:
             "contradictory; leave out one or the other"
         )
     _check_layers(settings)
-    if settings.until_error and not settings.variance:
+    if settings.target_error and not settings.variance:
         raise UsageError(
-            f"until_error={settings.until_error} follows from the variance; set variance to true"
+            f"target_error={settings.target_error} follows from the variance; set variance to true"
         )
-    if settings.until_error and settings.points == "sampler":
+    if settings.target_error and settings.points == "sampler":
         raise UsageError(
-            f"until_error={settings.until_error} with points=sampler is not possible: a sampler's "
+            f"target_error={settings.target_error} with points=sampler is not possible: a sampler's "
             "samples are numbered before it is known how many there will be; use points=sobol"
         )
-    return settings
 
 
 def check_variant():
     """Raise ``NotImplementedError`` for variants that the method cannot serve, or is not known to."""
-    variant = mi.variant()
+    variant = mi.variant() or "none"
     if variant.startswith("scalar"):
         raise UnsupportedError(
             f"the variant {variant} is scalar; use a vectorised one, for example "
@@ -248,16 +245,6 @@ def check_not_frozen():
         )
 
 
-def check_made_for(integrator, scene):
-    """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
-    for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
-        if not isinstance(thing, kind):
-            raise UsageTypeError(
-                f"{name}={type(thing).__name__} was not loaded under the present variant "
-                f"{mi.variant()}; load it again after mi.set_variant"
-            )
-
-
 def check_scene(scene, sensor):
     """Raise ``NotImplementedError`` for what the method cannot render."""
     if sensor.get_medium() is not None:
@@ -282,34 +269,16 @@ def check_film(sensor, settings: Settings):
             f"strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
-    _check_size(sensor.film(), len(colour.names), settings)
+    _check_has_pixels(sensor.film())
+    channels = Channels.of(sensor.film(), len(colour.names), len(features.feature_names(settings.aovs)))
+    memory.check_film(sensor.film(), channels, settings.variance)
+    memory.check_strategies(sensor.film(), settings.strategy_depth)
     return colour
 
 
-def _check_size(film, colours: int, settings: Settings):
+def _check_has_pixels(film):
+    """Raise ``ValueError`` for a film without pixels."""
     width, height = (int(x) for x in film.crop_size())
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
-    # Sums of a pass, of all passes and, while they are added, of both (see `accumulator.Accumulator`).
-    layers = 1 + mi.has_flag(film.flags(), mi.FilmFlags.Alpha) + len(features.feature_names(settings.aovs))
-    camera, light = (n + n % 2 for n in (colours + layers, colours))
-    numbers = width * height * max(camera, light)
-    per_pixel = camera * (4 + 16) + light * (8 + 16)
-    if settings.variance:  # sums at the last replicate; means and squares of two halves
-        per_pixel += 8 * (camera + light) + 2 * 2 * 8 * colours
-    needed, there = width * height * per_pixel, _memory()
-    if needed > there or numbers >= MOST_NUMBERS:
-        raise UsageError(
-            f"the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
-            f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render crop windows"
-        )
-
-
-def _memory() -> float:
-    """What the machine has, in bytes."""
-    if mi.variant().startswith("cuda"):
-        return math.inf  # what a GPU has is not known here
-    if not hasattr(os, "sysconf"):
-        return math.inf  # Windows: Dr.Jit says it
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

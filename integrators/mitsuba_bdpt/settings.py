@@ -1,48 +1,187 @@
-"""The integrator's parameters as one record."""
+"""The integrator's parameters: the one place that knows their names, defaults, bounds and meanings.
+
+`parameters.read_settings` reads them, the plugin's manual is `manual` and docs/user/parameters.md is `table`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field, fields
+from math import inf
+from typing import Any
 
+# Path length, or number of samples, that stands for no limit: the largest of Dr.Jit's 32-bit integers.
 UNLIMITED = 2**32 - 1
-
 
 # Most light vertices per lane (a lane's local memory lies on a thread's stack).
 MAX_STORED = 1024
 
-
 DEFAULT_STORED = 64
 
-
-LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
-
-
-CONNECTIONS = ("auto", "all", "one", "none")
-
-
+HEURISTICS = ("balance", "power", "maximum", "uniform")
 SKIP = ("auto", "impossible", "none")
+LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
+CONNECTIONS = ("auto", "all", "one", "none")
+POINTS = ("sobol", "sampler", "independent")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of the plugin.
+
+    ``default`` as in a scene file; ``what``: its value, in a few words for error messages; ``meaning``: its
+    entry in the manual, in reStructuredText; ``low`` and ``high`` bound numbers, both included (of a
+    ``float`` infinity is not); ``choices`` of a string, the default first. A ``decisive`` one is chosen by
+    the scene or a pilot unless it is given.
+    """
+
+    default: bool | int | float | str
+    what: str
+    meaning: str
+    low: float = -inf
+    high: float = inf
+    choices: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> type:
+        """Type of the value: ``bool``, ``int``, ``float`` or ``str``."""
+        return type(self.default)
+
+
+Value = bool | int | float | str
+
+
+def _parameter(default: Value, what: str, meaning: str, **bounds: Any) -> Any:
+    """A field of `Settings` that holds the value as it is given."""
+    return _converted(default, default, what, meaning, **bounds)
+
+
+def _converted(default: Value, value: Value | None, what: str, meaning: str, **bounds: Any) -> Any:
+    """A field of `Settings` that holds ``value`` for the parameter's ``default``."""
+    text = " ".join(meaning.split())
+    return field(default=value, metadata={"parameter": Parameter(default, what, text, **bounds)})
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The integrator's parameters, checked. See `integrator` for their meaning."""
+    """The parameters, checked. ``max_depth`` is `UNLIMITED` for -1, ``decisions`` a tuple or None."""
 
-    max_depth: int
-    rr_depth: int
-    hide_emitters: bool
-    heuristic: str
-    skip: str
-    light_paths: float | str
-    connections: str
-    points: str
-    decisions: tuple | None
-    stored_vertices: int
-    strategy_images: bool
-    variance: bool
-    until_error: float
-    aovs: str
-    spp_per_pass: int
-    timeout: float
+    max_depth: int = _converted(
+        -1,
+        UNLIMITED,
+        "the longest path in edges, -1 for unlimited",
+        "Longest path in edges, as in ``path``: 1 is directly visible emitters, -1 unlimited.",
+        low=-1,
+        high=UNLIMITED,
+    )
+    rr_depth: int = _parameter(
+        5,
+        "the depth at which Russian roulette starts, 1 or more",
+        "Russian roulette starts at this depth, as in ``path``.",
+        low=1,
+        high=UNLIMITED,
+    )
+    hide_emitters: bool = _parameter(
+        False,
+        "true or false",
+        "Hide directly visible emitters, as in ``path``.",
+    )
+    heuristic: str = _parameter(
+        "balance",
+        "a heuristic",
+        """How multiple importance sampling weighs strategies: ``balance``, ``power``, ``maximum`` or
+        ``uniform``.""",
+        choices=HEURISTICS,
+    )
+    skip: str = _parameter(
+        "auto",
+        "what may be left out",
+        """``none``: do everything. ``impossible``: leave out what the scene cannot use, draw one connection
+        per camera vertex, drop small contributions by unbiased Russian roulette. ``auto``: as ``impossible``,
+        and in renders of 2^14 samples or more (2^22 in scenes of ten BSDFs or more) a pilot, or the scene
+        alone where that tells, chooses what pays. What a pilot finds is remembered for later renders of the
+        scene, until its parameters are edited.""",
+        choices=SKIP,
+    )
+    light_paths: float | str = _parameter(
+        "auto",
+        "a number or 'auto'",
+        """Light subpaths per camera subpath: 0, 1, 1/2, 1/4, 1/8 or 1/16; one light subpath serves camera
+        subpaths of different pixels. ``auto``: the pilot's choice; without one 1/4, but 1 on films of fewer
+        than 64 pixels and 0 under an even sky; with ``skip=none`` 1. Given by hand, there is no pilot.""",
+    )
+    connections: str = _parameter(
+        "auto",
+        "a kind of inner connections",
+        """Inner connections per camera vertex: ``all``, ``one`` (drawn by its unshadowed contribution) or
+        ``none``. ``auto``: the pilot's choice; without one ``one``, but ``none`` under an even sky; with
+        ``skip=none`` ``all``. Given by hand, there is no pilot.""",
+        choices=CONNECTIONS,
+    )
+    points: str = _parameter(
+        "sobol",
+        "a kind of sample points",
+        """``sobol``: Owen-scrambled Sobol' points for all draws that gain by them, at every vertex.
+        ``sampler``: the scene's sampler for a path's first draws. ``independent``: random numbers.""",
+        choices=POINTS,
+    )
+    decisions: tuple[Any, ...] | None = _converted(
+        "",
+        None,
+        "a string of JSON",
+        """JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.""",
+    )
+    stored_vertices: int = _parameter(
+        DEFAULT_STORED,
+        f"the longest path that uses all strategies, 1 to {MAX_STORED}",
+        "Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1.",
+        low=1,
+        high=MAX_STORED,
+    )
+    strategy_images: bool = _parameter(
+        False,
+        "true or false",
+        """Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` of all *k* + 2 strategies of each
+        length *k*; needs a finite ``max_depth``.""",
+    )
+    variance: bool = _parameter(
+        False,
+        "true or false",
+        """Adds the layers ``variance.R``, ``.G``, ``.B`` (on a ``specfilm``: of its bands): the variance of
+        each pixel, splats included, estimated from 8 independent parts of the render;
+        ``statistics["error"]`` is the relMSE that follows. Needs at least 8 samples per pixel. Under
+        ``timeout`` at least two of the parts have to end (four for the error), so ask for no more samples
+        than it allows.""",
+    )
+    target_error: float = _parameter(
+        0.0,
+        "the relMSE to stop at, or 0 for none",
+        """Stop when the estimate of the relMSE is this or less; needs ``variance``. It is looked at after 32
+        samples per pixel, 64, 128, …; ``spp`` is the most that is spent. An estimate that is too small by
+        chance ends a render too early: see docs/user/long_renders.md for by how much. (Its old name
+        ``until_error`` is known too.)""",
+        low=0,
+    )
+    aovs: str = _parameter(
+        "",
+        "a string, for example 'albedo:albedo,nn:sh_normal'",
+        """Adds feature layers, named by pairs ``name:kind`` as in Mitsuba's ``aov`` and equal to its layers:
+        ``albedo``, ``depth``, ``position``, ``uv``, ``geo_normal``, ``sh_normal``, ``dp_du``, ``dp_dv``,
+        ``duv_dx``, ``duv_dy``, ``prim_index``, ``shape_index``. Emitters show in them under
+        ``hide_emitters`` too.""",
+    )
+    spp_per_pass: int = _parameter(
+        0,
+        "samples per pixel in one pass, 0 to choose",
+        "Samples per pixel in one pass; 0: chosen from a budget.",
+        low=0,
+        high=UNLIMITED,
+    )
+    timeout: float = _parameter(
+        -1.0,
+        "a number of seconds, or -1 for none",
+        """Seconds after which no further pass is started (passes take about a tenth of it); -1: never.""",
+    )
 
     @property
     def strategy_depth(self) -> int:
@@ -50,7 +189,40 @@ class Settings:
         return self.max_depth if self.strategy_images else 0
 
 
-HEURISTICS = ("balance", "power", "maximum", "uniform")
+PARAMETERS: dict[str, Parameter] = {f.name: f.metadata["parameter"] for f in fields(Settings)}
+
+# Old names, which are read as the new ones.
+ALIASES = {"until_error": "target_error"}
+
+_MANUAL_KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
 
 
-POINTS = ("sobol", "sampler", "independent")
+def _default(parameter: Parameter) -> str:
+    """The default, as a scene file has it."""
+    if parameter.default == "":
+        return "none"
+    if isinstance(parameter.default, float):
+        return f"{parameter.default:g}"
+    return str(parameter.default).lower()
+
+
+def manual() -> str:
+    """The list of parameters of the plugin's manual, in reStructuredText as in Mitsuba's own."""
+    lines = [".. pluginparameters::", ""]
+    for name, parameter in PARAMETERS.items():
+        kind = "|string| or |float|" if name == "light_paths" else _MANUAL_KINDS[parameter.kind]
+        lines += [
+            f" * - {name}",
+            f"   - {kind}",
+            f"   - {parameter.meaning} (Default: {_default(parameter)})",
+        ]
+    return "\n".join(lines)
+
+
+def table() -> str:
+    """The parameters as a table in Markdown."""
+    lines = ["| parameter | default | meaning |", "| --- | --- | --- |"]
+    for name, parameter in PARAMETERS.items():
+        meaning = re.sub(r"``([^`]*)``", r"`\1`", parameter.meaning)
+        lines.append(f"| `{name}` | `{_default(parameter)}` | {meaning} |")
+    return "\n".join(lines)

@@ -40,7 +40,7 @@ SENSIBLE = {
     "stored_vertices": (1, 2, 64),
     "strategy_images": (False, True),
     "variance": (False, True),
-    "until_error": (0.0, 0.1),
+    "target_error": (0.0, 0.1),
     "spp_per_pass": (0, 1, 3),
     "timeout": (-1.0, 0.0, 1e9),
     "heuristic": ("balance", "power", "maximum", "uniform"),

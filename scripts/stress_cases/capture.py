@@ -1,28 +1,30 @@
 """Paths that the kernel itself makes, vertex by vertex, with the weights that it gives them.
 
-The kernel's own functions run unchanged, but the loop along a walk is one of Python, so that what it passes
-can be kept. The densities of each path from both sides are asked of the scene anew: BSDFs by their ``pdf``,
-endpoints in closed form (`endpoints`).
+The kernel runs unchanged, but its loops step by step, so that what it shows its observer can be kept. The
+densities of each path from both sides are asked of the scene anew: BSDFs by their ``pdf``, endpoints in
+closed form (`endpoints`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from types import SimpleNamespace
-from unittest.mock import patch
 
 import drjit as dr
 import numpy as np
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.run import rendering
-from mitsuba_bdpt.sampling.points import Points
+from mitsuba_bdpt.sampling.points import Points, Purpose
 from mitsuba_bdpt.transport import bsdf, kernel, techniques
+from mitsuba_bdpt.transport.batch import Batch
 
 import mitsuba as mi  # isort: skip
 
 from mitsuba_bdpt.measure.endpoints import Camera, disks_of, dot, lamps_of, length2
 from mitsuba_bdpt.measure.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
+from mitsuba_bdpt.measure.recording import stepwise
 from mitsuba_bdpt.transport import connections
+from mitsuba_bdpt.transport.counters import Counters
+from mitsuba_bdpt.transport.light_path import StoredVertex
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.
@@ -82,20 +84,20 @@ def densities(si, to_light, to_camera):
 
 
 class Capture:
-    """One run of the kernel over ``lanes`` pairs of subpaths; `made` yields all paths."""
+    """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer; `made` yields
+    all paths."""
 
     def __init__(self, scene, integrator, lanes: int, seed: int):
         self.scene, self.lanes = scene, lanes
         render = rendering.Render(scene, scene.sensors()[0], integrator.settings, seed, 1)
         self.world, self.plan = render.prepared, render.plan
-        self.kernel = render.kernel.bound(Points("independent", dr.opaque(mi.UInt32, seed)), 1.0)
         self.depth = integrator.settings.max_depth
         self.lamps, self.camera = lamps_of(scene), Camera.of(scene.sensors()[0])
         self.disks = disks_of(self.world.emitters.disks)
         self.walked = {"light": Walked(), "camera": Walked()}
         self.found, self.endpoint = {}, {}
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False):
-            self._run()
+            self._run(render.kernel, seed)
 
     @property
     def coefficients(self) -> Coefficients:
@@ -106,44 +108,59 @@ class Capture:
 
     # -- the run ----------------------------------------------------------------------------
 
-    def _run(self):
-        k, lane = self.kernel, dr.arange(mi.UInt32, self.lanes)
-        pixels = int(np.prod(k.camera.region.size))
-        place = SimpleNamespace(index=mi.UInt64, pixel=lambda slot: k.camera.region.pixel(slot % pixels))
-        emitters = k.emitters
-        emit, choose = emitters.sample_emission, emitters.sample_direct
+    def _run(self, unbound, seed: int):
+        pixels = int(np.prod(unbound.camera.region.size))
+        # So many that each of the lanes has a light subpath of its own.
+        samples = -(-self.lanes * self.plan.camera_paths_per_light_path // pixels)
+        batch = Batch(0, pixels, 0, samples)
+        points = Points("independent", dr.opaque(mi.UInt32, seed))
+        slot = dr.arange(mi.UInt32, self.lanes)
+        with stepwise():
+            dr.eval(kernel.retrace(unbound, self, batch, points, samples, slot, self))
 
-        def emission(*arguments):
-            self.emission = emit(*arguments)
-            return self.emission
+    # What the kernel shows: it has an observer, see `Observer`.
 
-        def direct(si, u, active):
-            self.choice = u
-            return choose(si, u, active)
+    def emitted(self, emission):
+        """Keep y_0."""
+        dr.eval(emission)
+        self.emission = emission
 
-        with (
-            patch.object(kernel, "random_walk", self._walk),
-            patch.object(emitters, "sample_emission", emission),
-            patch.object(emitters, "sample_direct", direct),
-            patch.object(techniques, "join_endpoints", self._join_endpoints(techniques.join_endpoints)),
-        ):
-            stream = k.points.stream("light", mi.UInt64(lane), lane)
-            shared = kernel._shared(k, stream)
-            kernel._light_subpath(k, self, stream, shared, None)
-            common = kernel._Lane(place, shared, None)
-            kernel._camera_subpath(k, self, common, lane, self._counters(), mi.Bool(True))
+    def started(self, bound, side, walk, stream):
+        """A subpath begins."""
+        self.kernel, self.stream, self.walking = bound, stream, self.walked[side.name]
+        self.walking.origin = mi.Point3f(walk.previous)
+        dr.eval(self.walking.origin)
+        if side.adjoint and self.plan.endpoints:
+            u = techniques._sensor_points(bound, stream)
+            join = bound.camera.join(self.emission.si.p, *u)
+            if not bound.camera.parallel:
+                distant = bound.camera.join_direction(self.emission.d, *u)
+                join = dr.select(self.emission.infinite, distant, join)
+            self._keep_endpoint(1, 1, join)
 
-    def _join_endpoints(self, original):
-        def joined(k, emission, stream, counters, active):
-            u = techniques._sensor_points(k, stream)
-            join = k.camera.join(emission.si.p, *u)
-            distant = k.camera.join_direction(emission.d, *u)
-            self.endpoint[1, 1] = dr.select(emission.infinite, distant, join)
-            return original(k, emission, stream, counters, active)
+    def vertex(self, side, walk, vertex, step):
+        """A subpath has reached a vertex."""
+        pair = (vertex.si.wi, step.wo) if side.adjoint else (step.wo, vertex.si.wi)
+        asked = densities(vertex.si, *pair)
+        dr.eval(vertex, step, asked, walk)
+        self.walking.vertices.append(vertex)
+        self.walking.d.append(self._wide(rows(walk.d)))
+        self.walking.points.append(self._point(vertex.si, *(rows(x) for x in asked), np.array(step.delta)))
+        reached = len(self.walking.vertices)
+        if side.adjoint and self.plan.arrival:
+            self._keep_endpoint(reached + 1, 0, self._on_lens(vertex, walk))
+        if not side.adjoint and self.plan.direct:
+            u = self.kernel.points.draw_2d("camera", self.stream, Purpose.EMITTER, vertex.edges)
+            self._keep_endpoint(1, reached + 1, u)
 
-        return joined
+    def drawn(self, end):
+        """All connections are weighed, whichever is drawn, see `made`."""
 
-    # Where the kernel puts contributions that no walk finds: it is a sink, see `sink`.
+    def _keep_endpoint(self, s, t, endpoint):
+        dr.eval(endpoint)
+        self.endpoint[s, t] = endpoint
+
+    # Where the kernel puts contributions: it has a sink, see `sink`.
 
     alpha = False
 
@@ -151,59 +168,31 @@ class Capture:
         """Nothing found yet."""
         return mi.Float(0)
 
-    def splat(self, kernel_, c, position, shared, counters):
-        """Keep (1,1); walks are seen by `_walk`."""
-        dr.eval(c)
-        self.found[1, 1] = c
+    def add(self, kernel_, c, total, start, shared):
+        """Keep s = 0 and s = 1."""
+        self._keep(0 if c.kind == "hit" else 1, len(self.walking.vertices) + 1, c)
+        return total
+
+    def connect(self, kernel_, z, lane, stream, total, start):
+        """Inner connections are made afterwards, see `made`."""
+        return total, Counters()
+
+    def splat(self, kernel_, c, shared):
+        """Keep (1,1), t = 1 and t = 0."""
+        self._keep(len(self.walked["light"].vertices) + 1, int(c.t[0]), c)
+        return Counters()
 
     def end(self, *_):
         """Nothing to add up."""
+        return Counters()
 
-    def _counters(self):
-        return dict.fromkeys(kernel.COUNTERS, mi.UInt32(0))
-
-    def _walk(self, k, side, walk, stream, visit, state):
-        """In the place of `walk.random_walk`."""
-        walked = self.walked[side.name]
-        dr.make_opaque(walk, self.emission)
-        walked.origin = mi.Point3f(walk.previous)
-        for edges in range(1, self.depth + 1):
-            vertex = walk._vertex(k, side, walk)
-            step = walk._interact(k, side, walk, vertex, stream)
-            visited = self._visit_light if side.adjoint else self._visit_camera
-            found = visited(edges, vertex, stream, walk)
-            after = walk._leave(k, side, walk, vertex, step, stream)
-            pair = (vertex.si.wi, step.wo) if side.adjoint else (step.wo, vertex.si.wi)
-            asked = densities(vertex.si, *pair)
-            dr.eval(vertex, step, list(found.values()), after, asked, list(self.endpoint.values()))
-            self.found.update(found)
-            walked.vertices.append(vertex)
-            walked.d.append(self._wide(rows(walk.d)))
-            walked.points.append(self._point(vertex.si, *(rows(x) for x in asked), np.array(step.delta)))
-            walk = after
-        return state, walk
+    def _keep(self, s, t, c):
+        dr.eval(c)
+        self.found[s, t] = c
 
     def _point(self, si, to_camera, to_light, delta=False) -> Point:
         arrays = (np.broadcast_to(x, self.lanes) for x in (to_camera, to_light, delta))
         return Point(self._wide(rows(si.p)), self._wide(rows(si.n)), *arrays)
-
-    def _visit_light(self, edges, vertex, stream, walk):
-        found, counters = {}, self._counters()
-        if self.plan.arrival:
-            found[edges + 1, 0], _ = techniques.hit_sensor(self.kernel, self.emission, vertex, walk)
-            self.endpoint[edges + 1, 0] = self._on_lens(vertex, walk)
-        if self.plan.splat:
-            found[edges + 1, 1], _ = techniques.splat(self.kernel, vertex, stream, counters)
-        return found
-
-    def _visit_camera(self, edges, vertex, stream, walk):
-        found, counters = {}, self._counters()
-        if self.plan.hit:
-            found[0, edges + 1] = techniques.hit_emitter(self.kernel, vertex)
-        if self.plan.direct:
-            found[1, edges + 1] = techniques.next_event(self.kernel, vertex, counters)
-            self.endpoint[1, edges + 1] = mi.Point2f(self.choice)
-        return found
 
     def _on_lens(self, vertex, walk):
         distance2 = self.kernel.camera.hit(walk, vertex, mi.Bool(False)).dist2
@@ -219,13 +208,14 @@ class Capture:
         if self.plan.connections == "none":
             return
         # Of "one" too: all are weighed, whichever is then drawn.
-        for s in range(2, self.depth):
-            for t in range(2, self.depth + 2 - s):
+        lights, cameras = (len(self.walked[name].vertices) for name in ("light", "camera"))
+        for s in range(2, min(self.depth, lights + 2)):
+            for t in range(2, min(self.depth + 2 - s, cameras + 2)):
                 yield self._inner(s, t)
 
     def _inner(self, s, t):
         y, z = self.walked["light"].vertices[s - 2], self.walked["camera"].vertices[t - 2]
-        c = connections.inner(self.kernel, z, y)
+        c = connections.inner(self.kernel, z, StoredVertex.of(y))
         c.active &= y.hit & bsdf.connectible(y.bsdf) & bsdf.connectible(z.bsdf)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         c.active &= ~rays.occluded(self.scene, ray, c.active)

@@ -17,7 +17,7 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 import repository
-from mitsuba_bdpt.planning import choice
+from mitsuba_bdpt.planning import budget
 
 import mitsuba as mi  # isort: skip
 
@@ -31,7 +31,7 @@ ROUNDING = 1e-4
 
 # Along each side of most films here, and samples per pixel with which such a render asks a pilot.
 SIZE = 8
-PILOTED = choice.LEAST_SAMPLES // SIZE**2
+PILOTED = budget.LEAST_SAMPLES // SIZE**2
 
 
 def _room(lamp=(0, 0.9, 0), light=1.0, wall=0.5, eye=(0, 0, 2.5), size=SIZE, moved=0.0, texture=0.5):
@@ -130,7 +130,7 @@ def _in_a_row(count: int, kinds: tuple) -> Outcome:
 
     def once(number):
         bdpt, size, spp = made[number % len(made)]
-        piloted = spp * size**2 >= choice.LEAST_SAMPLES
+        piloted = spp * size**2 >= budget.LEAST_SAMPLES
         # Anew where a pilot is asked, so that it is not remembered.
         scene = mi.load_dict(_room(size=size)) if piloted else scenes[size]
         compiled = _once(scene, bdpt, number, spp)
@@ -138,7 +138,7 @@ def _in_a_row(count: int, kinds: tuple) -> Outcome:
         return compiled
 
     grown, more, compiled = _growth(count, once)
-    pilots = [int(spp * size**2 >= choice.LEAST_SAMPLES) for _, size, spp in kinds] * (count // len(kinds))
+    pilots = [int(spp * size**2 >= budget.LEAST_SAMPLES) for _, size, spp in kinds] * (count // len(kinds))
     text = f"{_grown(grown, more, compiled)}, {sum(asked)} pilots"
     return Outcome(grown < GROWTH and more <= 0 and compiled == 0 and asked == pilots, text)
 

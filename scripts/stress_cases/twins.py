@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from mitsuba_bdpt.planning import choice
+from mitsuba_bdpt.planning import budget
 
 import mitsuba as mi  # isort: skip
 
@@ -23,7 +23,7 @@ ROUNDING = 1e-5
 EVERYTHING, DEFAULTS = (WAYS[name] | {"max_depth": 4} for name in ("all strategies", "default parameters"))
 
 # Each way to render with its samples per pixel: by default so many that a pilot is asked.
-PILOTED = choice.LEAST_SAMPLES // SIZE**2
+PILOTED = budget.LEAST_SAMPLES // SIZE**2
 SPP = 16
 RENDERS = {"all strategies": (EVERYTHING, SPP), "default parameters": (DEFAULTS, PILOTED)}
 

@@ -14,6 +14,7 @@ from itertools import cycle
 
 import numpy as np
 from hypothesis import HealthCheck, Phase, given, seed, settings
+from mitsuba_bdpt.settings import HEURISTICS
 
 import mitsuba as mi  # isort: skip
 
@@ -169,7 +170,7 @@ def extremes(batches: int, size: int) -> Outcome:
     and sum to 1 where the products of the densities are numbers of single precision."""
     rng, tally, sound, kappa = np.random.default_rng(8), Tally(), Tally(), COEFFICIENTS["odd"]
     for batch in range(batches):
-        heuristic = settings.HEURISTICS[batch // 8 % len(settings.HEURISTICS)]
+        heuristic = HEURISTICS[batch // 8 % len(HEURISTICS)]
         for extreme in (1e30, 1e10):
             paths = extreme_paths(rng, size, 8 - batch % 8, extreme)
             explicit, within = oracle.Explicit(paths, kappa), held(paths)

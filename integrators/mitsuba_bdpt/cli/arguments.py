@@ -85,7 +85,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     explain = commands.add_parser("explain", help=help_text, description=help_text)
     add_scene_arguments(explain)
-    explain.set_defaults(integrator="bdpt", time=None, until_error=None)
+    explain.set_defaults(integrator="bdpt", time=None, target_error=None)
     measuring.add_commands(commands)
     return parser
 
@@ -122,7 +122,14 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
-    add("--until-error", type=number(float, 1e-12), metavar="X", help=text)
+    add(
+        "--target-error",
+        "--until-error",
+        dest="target_error",
+        type=number(float, 1e-12),
+        metavar="X",
+        help=text,
+    )
     text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
     add("--resume", action="store_true", help="go on from the checkpoint of an earlier, unfinished render")

@@ -48,7 +48,7 @@ def start(options: Namespace, output: Path) -> Snapshot:
     if not path.exists():
         raise CommandError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
     kept = read(path)
-    if kept.progress.get("scene") != digest(options):
+    if kept.progress.scene != digest(options):
         raise CommandError(
             f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
             "it names, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
@@ -76,7 +76,7 @@ class Checkpoints:
         if self._report is None:
             return
         snapshot = self._report.snapshot()
-        whole = replace(snapshot, progress=snapshot.progress | {"scene": self._scene})
+        whole = replace(snapshot, progress=replace(snapshot.progress, scene=self._scene))
         try:
             with replacing(self.path) as temporary, temporary.open("wb") as file:
                 file.write(whole.to_bytes())

@@ -19,8 +19,9 @@ import mitsuba as mi
 
 from ..errors import CommandError
 from ..files.loading import load
-from ..run.rendering import RAYS, PassReport
+from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
+from ..run.statistics import RAYS
 from ..workers import connected, one_at_a_time, results, worker_count
 
 # Parts for each worker: the last one that is waited for then takes a quarter of what a worker does in all.
@@ -35,7 +36,7 @@ STRIDE = 0x9E3779B9
 
 def check_settings(settings) -> None:
     """Raise ``ValueError`` for parameters that would mean something else in each part."""
-    for name in ("timeout", "until_error"):
+    for name in ("timeout", "target_error"):
         value = getattr(settings, name)
         if value > 0 or name == "timeout" and value == 0:
             raise CommandError(
@@ -91,7 +92,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
                 merged.add(index, Snapshot.from_bytes(data))
                 done = merged.snapshot
                 if done is not None:
-                    rays = sum(done.progress["counts"][name] for name in RAYS)
+                    rays = sum(done.progress.work.counts[name] for name in RAYS)
                     seconds = time.perf_counter() - started
                     on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
         except KeyboardInterrupt:
@@ -121,7 +122,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     if settings.decisions is None:  # an empty list where there is nothing to choose
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
-    names = ("variant", "defines", "integrator", "sensor", "time", "until_error")
+    names = ("variant", "defines", "integrator", "sensor", "time", "target_error")
     kept = {name: getattr(options, name) for name in names}
     kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})

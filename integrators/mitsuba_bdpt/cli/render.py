@@ -29,7 +29,7 @@ UNLIMITED_SPP = 1 << 16
 PASS_SPP = 16
 """Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
 
-SETS = {"time": {"timeout"}, "until_error": {"until_error", "variance"}}
+SETS = {"time": {"timeout"}, "target_error": {"target_error", "until_error", "variance"}}
 """The integrator's parameters that an option sets, see `loading.load`."""
 
 INTERRUPTED = 130
@@ -57,7 +57,7 @@ def run(options: Namespace) -> int:
         check_integrator(options, integrator)
         sensor = choose_sensor(scene, options.sensor)
         check_png(sensor.film())
-        open_ended = options.time is not None or options.until_error is not None
+        open_ended = options.time is not None or options.target_error is not None
         spp = options.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
         if not spp:
             raise CommandError(
@@ -98,7 +98,7 @@ def check_options(options: Namespace, output: Path) -> None:
         raise CommandError("resume needs --checkpoint MINUTES: how often to write the next ones.")
     if options.parts is not None and options.scheduler is None:
         raise CommandError("parts needs --scheduler: without one, a render is made in one piece.")
-    for name in ("checkpoint", "until_error", "time"):
+    for name in ("checkpoint", "target_error", "time"):
         if options.scheduler is not None and getattr(options, name) is not None:
             raise CommandError(
                 f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
@@ -154,7 +154,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -
         watchers.append(kept.after_pass)
     if options.resume:
         arguments["start"] = checkpoints.start(options, output)
-        limit = limit and limit + arguments["start"].progress["seconds"]
+        limit = limit and limit + arguments["start"].progress.work.seconds
     with progress_bar() as bar:
         if hasattr(integrator, "on_pass"):
             watchers.append(show_pass(bar, limit))
@@ -178,8 +178,8 @@ def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -
 
 
 def asked_error(integrator) -> float:
-    """The parameter ``until_error``, from wherever it comes; 0 for other integrators than `bdpt`."""
-    return getattr(getattr(integrator, "settings", None), "until_error", 0)
+    """The parameter ``target_error``, from wherever it comes; 0 for other integrators than `bdpt`."""
+    return getattr(getattr(integrator, "settings", None), "target_error", 0)
 
 
 def reached(asked: float, statistics: Mapping) -> bool:
@@ -262,7 +262,7 @@ def report(outcome: Outcome) -> str:
     return json.dumps(found, default=str)
 
 
-def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: float) -> str:
+def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float) -> str:
     """The closing line."""
     width, height = size
     parts = [
@@ -275,8 +275,10 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], until_error: fl
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
     if "error" in outcome.statistics:
         error = outcome.statistics["error"]
-        missed = 0 < until_error < error
-        parts.append(f"relMSE about {error:.2g}" + (f", not the {until_error:g} asked for" if missed else ""))
+        missed = 0 < target_error < error
+        parts.append(
+            f"relMSE about {error:.2g}" + (f", not the {target_error:g} asked for" if missed else "")
+        )
     if outcome.statistics.get("no_pilot"):
         parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
     if outcome.statistics.get("non_finite"):

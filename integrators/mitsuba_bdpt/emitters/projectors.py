@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..geometry.to_world import check_angles
 from ..host.introspection import children, matrix_of, own_parameters
-from .kinds import PROJECTOR, check_angles
 
 
 class Projectors:
@@ -17,9 +17,9 @@ class Projectors:
     """
 
     @staticmethod
-    def of(emitters, kinds):
-        """Those of ``emitters`` that are projectors, or None."""
-        found = [(i, e) for i, (e, k) in enumerate(zip(emitters, kinds, strict=True)) if k == PROJECTOR]
+    def of(emitters, projects):
+        """Those of ``emitters`` for which ``projects`` is true, or None if there are none."""
+        found = [(i, e) for i, (e, p) in enumerate(zip(emitters, projects, strict=True)) if p]
         return Projectors(found) if found else None
 
     def __init__(self, projectors):
@@ -34,12 +34,12 @@ class Projectors:
             d, pdf_w = dr.select(mask, sampled, d), dr.select(mask, density, pdf_w)
         return d, pdf_w
 
-    def density(self, index, d, active):
+    def pdf_w(self, index, d, active):
         """Density (solid angle) of the direction ``d`` from the projector ``index``; 0 for others."""
         pdf_w = mi.Float(0)
         for number, projector in self._rows:
             mask = active & (index == number)
-            pdf_w = dr.select(mask, projector.density(d, mask), pdf_w)
+            pdf_w = dr.select(mask, projector.pdf_w(d, mask), pdf_w)
         return pdf_w
 
 
@@ -77,7 +77,7 @@ class _Projector:
         d = self._axes[0] * local.x + self._axes[1] * local.y + self._axes[2] * local.z
         return d, self._to_solid_angle(pdf, local.z)
 
-    def density(self, d, active):
+    def pdf_w(self, d, active):
         """Density (solid angle) with which `sample` returns the direction ``d``."""
         x, y, z = (dr.dot(axis, d) for axis in self._axes)
         a = self._to_uv

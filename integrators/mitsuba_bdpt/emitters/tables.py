@@ -1,107 +1,68 @@
-"""Tables of the scene's emitters that a kernel can index."""
+"""Tables of the scene's emitters that a kernel can index.
+
+All have one row for each emitter of the scene, be it of the group that asks or not.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UsageError
-from ..geometry.quadrics import Sphere, is_small
-from ..host.introspection import named, own_parameters
-from .kinds import AREA, DIRECTIONAL_AREA, POINT, PROJECTOR, SPOT, check_angles, is_textured
+
+def rows(emitters, default, row) -> list:
+    """``row(emitter)`` of each of ``emitters``, ``default`` where one is None."""
+    return [default if emitter is None else row(emitter) for emitter in emitters]
 
 
-@dataclass
-class Placement:
-    """Where an emitter is: axes ``x``, ``y``, ``z`` and ``position`` of point and spot lights, their
-    constant density of emission ``density_w`` (solid angle) within ``cos_cutoff``; ``position`` of
-    projectors. Of spheres ``position``; the ``radius`` up to which one that emits inwards, and everywhere
-    the same, samples as from inside, ``outward`` of a rotated one (see `Sphere`), the radius ``far`` of one
-    that may be so small, as seen from the scene, that Mitsuba's density is wrong (see
-    `quadrics.cone_density`); 0 for all others.
-    Scalars for one emitter, Dr.Jit arrays for a table of them."""
+def table(records: list):
+    """Dataclasses of scalars and points as one of opaque columns for `look_up`."""
 
-    x: object = (1, 0, 0)
-    y: object = (0, 1, 0)
-    z: object = (0, 0, 1)
-    position: object = (0, 0, 0)
-    density_w: object = 1.0
-    cos_cutoff: object = -1.0
-    radius: object = 0.0
-    outward: object = 0.0
-    far: object = 0.0
+    def column(name):
+        # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
+        values = np.array([getattr(record, name) for record in records], dtype=np.float64).T.tolist()
+        if not isinstance(values[0], list):
+            return mi.Float(values)
+        return mi.Vector3f(*(mi.Float(v) for v in values))
 
-    @staticmethod
-    def table(rows):
-        """The rows as columns that `at` can look up."""
+    made = replace(records[0], **{name: column(name) for name in vars(records[0])})
+    dr.make_opaque(made)
+    return made
 
-        def column(name):
-            # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
-            values = np.array([getattr(row, name) for row in rows], dtype=np.float64).T.tolist()
-            if not isinstance(values[0], list):
-                return mi.Float(values)
-            return (mi.Point3f if name == "position" else mi.Vector3f)(*(mi.Float(v) for v in values))
 
-        return Placement(**{name: column(name) for name in vars(Placement())})
+def look_up(columns, index, active):
+    """The row ``index`` of a `table`."""
+    return replace(columns, **{k: dr.gather(type(v), v, index, active) for k, v in vars(columns).items()})
+
+
+class Mask:
+    """Which emitters of a group have a property: ``any``, ``all`` of them, and each one's by its index.
+
+    ``values``: one for each emitter of the scene, None where it is of another group. Nothing is recorded
+    where none or all of them have the property.
+    """
+
+    def __init__(self, values):
+        known = [value for value in values if value is not None]
+        self.any, self.all = any(known), all(known)
+        self._table = mi.Bool([bool(value) for value in values])
+        dr.make_opaque(self._table)
 
     def at(self, index, active):
-        """The row ``index``."""
-        return Placement(**{k: dr.gather(type(v), v, index, active) for k, v in vars(self).items()})
-
-
-def placement(emitter, kind, extent) -> Placement:
-    """The row of one emitter in a scene of the diameter ``extent``."""
-    if kind == POINT:
-        position = dr.slice(mi.Point3f(own_parameters(emitter)["position"]))
-        return Placement(position=position, density_w=1 / (4 * dr.pi))
-    if kind == SPOT:
-        check_angles(emitter)
-        params = own_parameters(emitter)
-        to_world = params["to_world"]
-        x, y, z = (
-            dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
-            for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-        )
-        cutoff_angle = mi.Float(params["cutoff_angle"])
-        cos_cutoff = dr.slice(dr.cos(dr.deg2rad(cutoff_angle)))
-        if cos_cutoff >= 1:
-            raise UsageError(
-                f"spot {named(emitter)} has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
-                "width in single precision; make it 0.02 degrees or more"
-            )
-        return Placement(
-            x=x,
-            y=y,
-            z=z,
-            position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))),
-            density_w=1 / (2 * dr.pi * (1 - cos_cutoff)),
-            cos_cutoff=cos_cutoff,
-        )
-    if kind == PROJECTOR:
-        to_world = own_parameters(emitter)["to_world"]
-        return Placement(position=dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0))))
-    sphere = Sphere.of(emitter.get_shape()) if kind in (AREA, DIRECTIONAL_AREA) else None
-    if sphere is not None:
-        # By direction, unless it has a texture: then Mitsuba samples that, wherever the lit point is.
-        by_direction = not is_textured(emitter, kind)
-        small = kind == AREA and by_direction and is_small(sphere, extent)
-        return Placement(
-            position=sphere.center,
-            # Mitsuba's RayEpsilon, as in Sphere::sample_direction.
-            radius=sphere.radius * (1 + 1500 * 2.0**-24) if by_direction and sphere.outward < 0 else 0.0,
-            outward=sphere.outward if sphere.turned else 0.0,
-            far=sphere.radius if small else 0.0,
-        )
-    return Placement()
+        """Mask of those lanes whose emitter, of this group where they are ``active``, has the property."""
+        if not self.any:
+            return mi.Bool(False)
+        if self.all:
+            return mi.Bool(active)
+        return active & dr.gather(mi.Bool, self._table, index, active)
 
 
 def inverse_table(pointers):
     """Emitter index by the number that Dr.Jit gives to a pointer."""
     ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()
-    table = [0] * (int(ids.max()) + 1)
+    found = [0] * (int(ids.max()) + 1)
     for index, number in enumerate(ids):
-        table[int(number)] = index
-    return mi.UInt32(table)
+        found[int(number)] = index
+    return mi.UInt32(found)

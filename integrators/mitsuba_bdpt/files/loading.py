@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from ..errors import CommandError, did_you_mean
 from ..image import features
+from ..settings import ALIASES
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
@@ -128,13 +129,13 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     kind = mi.ObjectType.Integrator
     node = next((node for node in state.nodes if node.type == kind), None)
-    if options.until_error is not None:
+    if options.target_error is not None:
         used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
         if used != "bdpt":
             raise CommandError(
-                f"until_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
+                f"target_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
             )
-        overrides |= {"until_error": options.until_error, "variance": True}
+        overrides |= {"target_error": options.target_error, "variance": True}
     if options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator):
         if options.integrator != "aov" or not overrides.get("aovs"):
             raise CommandError(
@@ -376,6 +377,9 @@ def integrator_properties(
                 properties[key] = given[key]
                 # Not every integrator has all of them; that is no mistake of the user's.
                 properties.mark_queried(key)
+    for old, present in ALIASES.items():
+        if present in overrides and old in properties:
+            del properties[old]
     for key, value in overrides.items():
         properties[key] = value
     return properties

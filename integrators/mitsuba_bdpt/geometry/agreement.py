@@ -1,18 +1,50 @@
-"""Choices of Mitsuba's samplers that are repeated here, compared with what Mitsuba samples.
+"""Choices of Mitsuba's samplers that are repeated here, and the checks that Mitsuba makes the same ones.
 
-A face of a mesh is compared where its table is made (`SmoothMeshes`), shapes by their ``to_world`` alone
-(`to_world`); here the densities of points that a texture chooses, and of spheres seen from inside. Only the
-emitters that need it are sampled, each a few thousand times: some milliseconds.
+Strategies need densities of points that they have not sampled, and normals that Mitsuba does not give, so
+some of what its samplers do inside is known here. Each choice has one home, which also has the check that
+runs when a render begins, only for the emitters (and irradiance meters) concerned:
+
+============================================  ===================================  =======================
+choice of Mitsuba's                           home                                 check before a render
+============================================  ===================================  =======================
+face of a mesh: by area, from ``sample.y``,   `smooth_meshes.SmoothMeshes`         points in the planes of
+on sums in single precision                                                        their faces, there
+points of textured area lights: by the        `is_sampled_by_texture`, here        `check_densities`, here
+texture on rectangles, disks, upright spheres
+spheres seen from inside: by area, up to      `quadrics.Sphere.inner_radius`,      `check_densities`, here
+``RayEpsilon`` beyond the radius              `is_sampled_by_direction`, here
+spheres seen from outside: a uniform          `quadrics.cone_pdf_w`                none: Mitsuba's formula
+direction in their cone                                                            without its cancellation
+turned spheres: the point is rotated by       `quadrics.Sphere.turned`,            none: normals follow
+``to_world``, the normal is not               `quadrics.sphere_normal`             from points alone
+shapes whose ``to_world`` samples other       `to_world.check_to_world`            the matrix alone
+points than rays find
+============================================  ===================================  =======================
+
+Tests: ``test_lamps.py`` plants other choices and expects the checks to name the emitter
+(``test_a_choice_that_is_not_mitsubas_is_noticed``, ``test_another_table_of_faces_is_noticed``), and shows
+that they are silent elsewhere; there are also ``test_normals_of_fine_meshes`` (faces),
+``test_shapes_that_may_be_sheared`` and ``test_a_sheared_disk_is_found_where_it_is_sampled`` (``to_world``).
+``test_emission_densities.py``: ``test_spheres_that_to_world_turns``. ``test_rays.py``:
+``test_lamps_on_spheres_however_small`` (cones).
 """
 
 from __future__ import annotations
+
+import math
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..errors import UnsupportedError
-from ..host.introspection import children, named
+from ..host.introspection import children, named, number
+from .quadrics import Sphere, sphere_normal
+
+# Shapes whose textured radiance Mitsuba samples rightly. On a cylinder the points have other densities than
+# stated (0.4 to 1.6 times), on a mesh all faces with the same texture coordinates share one density but
+# only one face is sampled (a cube: a sixth).
+TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
 
 CHECKED = 4096  # samples of an emitter
 
@@ -31,25 +63,73 @@ def spread_points(count: int):
     return mi.Point2f(x, y)
 
 
-def check_densities(emitters, index: int):
-    """Raise ``NotImplementedError`` unless the points of the emitter ``index`` have the densities that
-    ``emitters`` states: those of emission, over the area, where rays find the point and its front; and those
-    of next-event estimation from places about the emitter, inside and outside."""
-    emitter = emitters.scene.emitters()[index]
+def is_textured(emitter) -> bool:
+    """Whether an area light has another radiance at each of its points."""
+    return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
+
+
+def is_sampled_by_texture(emitter, sphere: Sphere | None) -> bool:
+    """Whether Mitsuba chooses points of an area light by its texture, and rightly.
+
+    ``sphere``: its shape, if that is one: of a turned one the texture's map to the surface misses parts of
+    it. (With a texel that is not finite all densities are NaN.)
+    """
+    if not is_textured(emitter) or emitter.get_shape().shape_type() not in TEXTURE_SAMPLED:
+        return False
+    if _is_turned(sphere) or _is_sampled_from_behind(emitter, sphere):
+        return False
+    try:
+        return math.isfinite(number(children(emitter)["radiance"].mean()))
+    except RuntimeError:  # a texture that knows no mean
+        return True
+
+
+def is_sampled_by_direction(emitter) -> bool:
+    """Whether next-event estimation towards an area light on a sphere chooses a direction: it has no texture,
+    which would be sampled wherever the lit point is."""
+    return not is_textured(emitter)
+
+
+def _is_turned(sphere: Sphere | None) -> bool:
+    return sphere is not None and sphere.turned
+
+
+def _is_sampled_from_behind(emitter, sphere: Sphere | None) -> bool:
+    """Whether the points that Mitsuba samples by the texture of an emitter have normals opposite to those of
+    its shape: ``eval_parameterization`` of a rectangle knows nothing of ``flip_normals``."""
+    if not emitter.get_shape().has_flipped_normals():  # of nearly all lamps: no kernel runs for them
+        return False
+    u = mi.Point2f(0.4, 0.6)
+    by_texture, _ = emitter.sample_position(0, u)
+    # A sphere's normals are compared at one point: those of two points may be opposite anyway.
+    if sphere is not None:
+        normal = sphere_normal(by_texture.p, sphere.center, sphere.outward)
+    else:
+        normal = emitter.get_shape().sample_position(0, u).n
+    return number(dr.dot(by_texture.n, normal)) < 0
+
+
+def check_densities(emitters, emitter, index: int):
+    """Check that the points of an area light have the densities that the group ``emitters`` states.
+
+    These are the densities of emission (area), where rays find the point and its front, and those of
+    next-event estimation (solid angle) from places about the emitter, inside and outside. ``emitters``: the
+    `area.AreaEmitters` that have ``emitter`` at ``index``. Raises ``UnsupportedError``.
+    """
     if _is_rounded(emitter):
         return
-    u, number = spread_points(CHECKED), dr.opaque(mi.UInt32, index)
+    u, place = spread_points(CHECKED), dr.opaque(mi.UInt32, index)
     ps, _ = emitter.sample_position(0, u)
-    ps = emitters.upright(ps, number, mi.Bool(True))
+    ps = emitters.upright(ps, place, mi.Bool(True))
     seen = _seen(emitter.get_shape(), ps)
-    stated = emitters.area_density(emitter, number, seen, seen.n, mi.Bool(True))
+    stated = emitters.pdf_a(emitter, place, seen, seen.n, mi.Bool(True))
     of_points = _differ(ps.pdf, dr.select(dr.dot(seen.sh_frame.n, ps.n) > 0, stated, 0))
     it = dr.zeros(mi.Interaction3f)
     others, _ = emitter.sample_position(0, mi.Point2f(u.y, u.x))
     it.p = _places(emitter.get_shape().bbox(), others.p)
     ds, _ = emitter.sample_direction(it, u)
     in_view = dr.abs(dr.dot(ds.n, ds.d)) > 0.01
-    stated = emitters.density_of_direction(emitter, number, it, ds, mi.Bool(True))
+    stated = emitters.direct_pdf_w(emitter, place, it, ds, mi.Bool(True))
     of_directions = _differ(dr.select(in_view, ds.pdf, 0), stated)
     dr.eval(of_points, of_directions)  # one kernel
     for what, (differ, compared) in (("points", of_points), ("directions", of_directions)):

@@ -1,4 +1,8 @@
-"""Spheres that emit or measure, where Mitsuba's own calls are wrong about them."""
+"""Spheres and cylinders: their curvature and sides, and spheres that emit or measure.
+
+Where Mitsuba's own calls are wrong about spheres, what stands here repeats the choice that its samplers make;
+`agreement` says which tests show that it does.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,16 @@ import numpy as np
 
 from ..host.introspection import matrix_of, number
 
-# Square of the sine of the half angle of cones below which `cone_density` is asked. Above, the rounding of
+# Square of the sine of the half angle of cones below which `cone_pdf_w` is asked. Above, the rounding of
 # the cosine, 2^-24, puts Mitsuba's own density off by 1.2e-4 at most.
-NARROW = 1e-3
+NARROW_SIN2 = 1e-3
+
+# As in ``Sphere::sample_direction``: from points up to the radius times 1 + this, a sphere is sampled by
+# area, as from inside.
+RAY_EPSILON = 1500 * 2.0**-24
+
+# Spheres and cylinders, with the height of their middle in their own coordinates.
+ROUND = {mi.ShapeType.Sphere.value: 0.0, mi.ShapeType.Cylinder.value: 0.5}
 
 
 @dataclass
@@ -25,6 +36,13 @@ class Sphere:
     radius: float
     outward: float
     turned: bool
+
+    @property
+    def inner_radius(self) -> float:
+        """Distance from the center up to which Mitsuba samples the sphere by area, as from inside; 0 for one
+        whose normals point outwards: from its inside it lights nothing. (Its ``pdf_direction`` knows nothing
+        of `RAY_EPSILON`.)"""
+        return self.radius * (1 + RAY_EPSILON) if self.outward < 0 else 0.0
 
     @staticmethod
     def of(shape) -> Sphere | None:
@@ -48,37 +66,44 @@ def sphere_normal(p, center, outward):
     return mi.Normal3f(dr.normalize(p - center) * outward)
 
 
-def is_turned_sphere(shape) -> bool:
-    """Whether ``shape`` is a sphere that Mitsuba samples wrongly, see `Sphere`."""
-    sphere = Sphere.of(shape)
-    return sphere is not None and sphere.turned
+def may_light_itself(shape, sphere: Sphere | None) -> bool:
+    """Whether ``shape``, which is this ``sphere`` or none, shines outwards and lets light through.
 
-
-def may_light_itself(shape) -> bool:
-    """Whether ``shape`` is a sphere that shines outwards and lets light through: no point of it lights
-    another, but rounding puts some outside, and Mitsuba samples the cone from there into the sphere."""
+    No point of it lights another, but rounding puts some outside, and Mitsuba samples the cone from there
+    into the sphere.
+    """
+    if sphere is None or sphere.outward < 0:
+        return False
     flags = shape.bsdf().flags()
     through = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
-    if not any(mi.has_flag(flags, flag) for flag in through):  # of nearly all lamps: no kernel runs for them
-        return False
-    sphere = Sphere.of(shape)
-    return sphere is not None and sphere.outward > 0
+    return any(mi.has_flag(flags, flag) for flag in through)
 
 
 def is_small(sphere: Sphere, extent) -> bool:
-    """Whether a sphere may be `NARROW` as seen from a point at most ``extent`` away."""
+    """Whether a sphere may be narrow (`NARROW_SIN2`) as seen from a point at most ``extent`` away."""
     # Not `<`: the extent of a scene with a vertex at infinity is NaN.
-    return sphere.outward > 0 and not sphere.radius**2 >= NARROW * extent**2
+    return sphere.outward > 0 and not sphere.radius**2 >= NARROW_SIN2 * extent**2
 
 
-def cone_density(center, radius, p):
+def cone_pdf_w(center, radius, p):
     """Density (solid angle) of a uniform direction in the cone from ``p`` to a sphere; 0 where the cone is
-    not `NARROW` or ``radius`` is 0.
+    not narrow (`NARROW_SIN2`) or ``radius`` is 0.
 
     Mitsuba has 1 / (2 pi (1 - cos)) for it, which cancels: off by up to 0.4 % where the distance is 200 times
     the radius, 5.8 % at 800, by factors of 2 to 4 from 4096 times on, infinite from 5793 = 2^12.5 times on.
     1 - cos = sin^2 / (1 + cos) does not.
     """
     sin_2 = dr.square(radius) / dr.squared_norm(p - center)
-    narrow = (sin_2 > 0) & (sin_2 < NARROW)
+    narrow = (sin_2 > 0) & (sin_2 < NARROW_SIN2)
     return dr.select(narrow, (1 + dr.sqrt(1 - sin_2)) / (dr.two_pi * sin_2), 0)
+
+
+def outward_sign(shape, matrix) -> float:
+    """1 if the normals of a sphere or cylinder point outwards, else -1: of a hit from its middle."""
+    middle = matrix[:3] @ [0, 0, ROUND[shape.shape_type()], 1]
+    radius = float(np.linalg.norm(matrix[:3, 0]))
+    pi = dr.zeros(mi.PreliminaryIntersection3f)
+    pi.t, pi.shape = dr.opaque(mi.Float, radius), mi.ShapePtr(shape)
+    d = dr.opaque(mi.Vector3f, (matrix[:3, 0] / radius).tolist())
+    si = shape.compute_surface_interaction(mi.Ray3f(dr.opaque(mi.Point3f, middle.tolist()), d), pi)
+    return 1.0 if number(dr.dot(si.n, d)) >= 0 else -1.0

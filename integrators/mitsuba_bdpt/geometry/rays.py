@@ -48,8 +48,10 @@ def surface_anchor(si, ray, shape_errors: ShapeErrors) -> Anchor:
 
 
 def sampled_anchor(p, n, reference, errors: Errors | None) -> Anchor:
-    """Anchor of a point sampled on a shape of these ``errors``, None off shapes, to be joined with the point
-    ``reference``."""
+    """Return the anchor of a point sampled on a shape of these ``errors``, None off shapes.
+
+    The point is to be connected to ``reference``.
+    """
     offset = rounding_offset(p, reference, dr.norm(p - reference), errors.reach if errors else 0)
     return Anchor(mi.Point3f(p), mi.Normal3f(n), offset, mi.Float(errors.ends if errors else 0))
 
@@ -75,9 +77,12 @@ def end_point(a: Anchor, b: Anchor):
 
 
 def _early(back, b: Anchor):
-    """The share of a ray's length, against the direction ``back``, in which it may meet the sphere or
-    cylinder of its end ``b`` already. On the far side of one so small that the ray would pass its front this
-    is half the chord at most: the front is in the way, the open end of a cylinder is not."""
+    """Return the share of a ray's length in which it may meet the sphere or cylinder of its end too early.
+
+    ``b`` is the end, ``back`` the direction against the ray. On the far side of a shape so small that the ray
+    would pass its front this is half the chord at most: the front is in the way, the open end of a cylinder
+    is not.
+    """
     dist = dr.norm(back)
     along = dr.dot(b.n, back)
     curvature = dr.abs(b.curvature)
@@ -103,16 +108,20 @@ def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
 
 @dataclass
 class Own:
-    """What a visibility ray ends at, by its number (see `met`), and the distance ``t`` from which on it may
-    meet it."""
+    """The surface that a visibility ray ends at.
+
+    Its number (see `met`), and the distance ``t`` from which on the ray may meet it.
+    """
 
     number: object
     t: object
 
 
 def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, shared):
-    """Ray from ``a`` to ``b`` on the shape of this ``number``, and an `Own` for `occluded`: None unless
-    ``shape_errors`` are small."""
+    """Return the visibility ray from ``a`` to ``b``, and an `Own` for `occluded`.
+
+    ``b`` is on the shape of this ``number``. The `Own` is None unless ``shape_errors`` are small.
+    """
     if not shape_errors.small:
         return segment(a, b, shared), None
     end = b.towards(a.p - b.p)
@@ -121,8 +130,10 @@ def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, shared):
 
 
 def occluded(scene, ray, active, own: Own | None = None):
-    """Whether any surface, null surfaces included (as in ``path``), blocks ``ray``; ``own`` is what it ends
-    at, where it can be met too early."""
+    """Return whether any surface blocks ``ray``, null surfaces included (as in ``path``).
+
+    ``own`` is what the ray ends at, where it can be met too early.
+    """
     if own is None:
         return scene.ray_test(ray, active=active)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)

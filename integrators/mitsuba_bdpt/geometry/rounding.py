@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..host.introspection import grouped_shapes, is_instance, matrix_of, number, own_parameters
+from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
+from .quadrics import ROUND, outward_sign
 
 # Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
 # cylinders), whether they are as large as the distances to them or 10^6 times larger.
@@ -116,32 +117,19 @@ def _curvatures(shape, grouped, extent) -> tuple[float, float]:
     """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent``; ``grouped``: the largest
     ``ends`` of shapes in groups."""
     kind = shape.shape_type()
-    if kind in _ROUND:
+    if kind in ROUND:
         matrix = matrix_of(shape)
         # Across the axis of a cylinder, and of a sphere whatever the axis.
         inverse = 1 / max(float(np.linalg.norm(matrix[:3, 0])), 1e-30)
         far = not inverse * extent <= FAR  # the extent may be NaN
-        sign = _outward(shape, matrix) if far and 0 < inverse < 1e30 and np.isfinite(matrix).all() else 1.0
+        sign = (
+            outward_sign(shape, matrix) if far and 0 < inverse < 1e30 and np.isfinite(matrix).all() else 1.0
+        )
         return sign * inverse, inverse if kind == mi.ShapeType.Cylinder.value else 0.0
     if is_instance(shape):
         within = grouped / max(_stretch(shape)[-1], 1e-30)
         return within, abs(within)
     return 0.0, 0.0
-
-
-_ROUND = {mi.ShapeType.Sphere.value: 0.0, mi.ShapeType.Cylinder.value: 0.5}
-"""Spheres and cylinders, with the height of their middle in their own coordinates."""
-
-
-def _outward(shape, matrix) -> float:
-    """1 if the normals of a sphere or cylinder point outwards, else -1: of a hit from its middle."""
-    middle = matrix[:3] @ [0, 0, _ROUND[shape.shape_type()], 1]
-    radius = float(np.linalg.norm(matrix[:3, 0]))
-    pi = dr.zeros(mi.PreliminaryIntersection3f)
-    pi.t, pi.shape = dr.opaque(mi.Float, radius), mi.ShapePtr(shape)
-    d = dr.opaque(mi.Vector3f, (matrix[:3, 0] / radius).tolist())
-    si = shape.compute_surface_interaction(mi.Ray3f(dr.opaque(mi.Point3f, middle.tolist()), d), pi)
-    return 1.0 if number(dr.dot(si.n, d)) >= 0 else -1.0
 
 
 def _stretch(shape) -> np.ndarray:
@@ -176,7 +164,7 @@ def reaches(shape) -> np.ndarray:
     return found.max(keepdims=True) if kind == mi.ShapeType.EllipsoidsMesh.value else found
 
 
-_WHOLE = {*_ROUND, mi.ShapeType.SDFGrid.value}
+_WHOLE = {*ROUND, mi.ShapeType.SDFGrid.value}
 
 
 def _reaches_of_triangles(positions, faces) -> np.ndarray:

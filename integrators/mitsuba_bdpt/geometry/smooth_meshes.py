@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
-from ..geometry.agreement import CHECKED, OFF, spread_points
 from ..host.introspection import named, own_parameters
+from .agreement import CHECKED, OFF, spread_points
 
 
 class SmoothMeshes:
@@ -86,8 +86,11 @@ class SmoothMeshes:
 
 @dataclass
 class _Faces:
-    """The faces of a mesh: unit ``normals`` and first ``corners`` (faces, 3), the running ``sums`` of their
-    areas as Mitsuba has them, and the whole ``area``."""
+    """The faces of a mesh.
+
+    Unit ``normals`` and first ``corners``, shape (faces, 3); the running ``sums`` of their areas as Mitsuba
+    has them, and the whole ``area``.
+    """
 
     normals: np.ndarray
     corners: np.ndarray
@@ -113,8 +116,10 @@ class _Faces:
 
 
 def _curved_faces(shape):
-    """Cross products of the edges of each face, shape (faces, 3), for a mesh whose vertex normals
-    differ from its faces' normals; None for all other shapes."""
+    """Return the cross products of the edges of each face, shape (faces, 3).
+
+    For a mesh whose vertex normals differ from its faces' normals; None for all other shapes.
+    """
     if shape is None or not shape.is_mesh():
         return None
     params = own_parameters(shape)

@@ -1,4 +1,9 @@
-"""What ``to_world`` may do to shapes that emit or measure: their points are sampled, and found by rays."""
+"""What ``to_world`` may do to shapes that emit or measure, and to emitters without a shape.
+
+Points of shapes are sampled, and found by rays: with some matrices Mitsuba samples other points, normals or
+densities than its rays find. Environments, spots and projectors turn directions, whose densities are those of
+the angles before: a matrix that distorts angles changes them.
+"""
 
 from __future__ import annotations
 
@@ -78,6 +83,47 @@ def _cylinder(matrix, inverse):
         f"squashes or shears it (the lengths of its columns are {_lengths(matrix)}): Mitsuba takes its "
         "points to be evenly spread and its area to be that of a round one; give rotate an axis of length 1, "
         "and x and y the same scale, or use a mesh"
+    )
+
+
+def check_rotation(emitter):
+    """Check that the ``to_world`` of an environment keeps lengths.
+
+    With any other matrix Mitsuba's own calls disagree with each other (next-event estimation four times the
+    radiance). Raises ``UsageError``.
+    """
+    columns = matrix_of(emitter)[:3, :3]
+    if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
+        raise UsageError(
+            f"to_world of {_plugin(emitter)} {named(emitter)} is not a rotation (the lengths of its "
+            f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
+        )
+
+
+def check_angles(emitter):
+    """Check that the ``to_world`` of a projector or spot keeps angles.
+
+    What it sends into a direction is a function of the angles before, and densities of directions are those
+    of these angles. Scaled by one factor or mirrored, it keeps them. Raises ``UsageError``.
+    """
+    columns = matrix_of(emitter)[:3, :3]
+    scale = np.linalg.norm(columns, axis=0).mean()
+    with np.errstate(invalid="ignore"):  # what is not finite is not close
+        keeps = np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2)
+    if not keeps:
+        plugin, angle = _ANGLES[emitter.class_name()]
+        raise UsageError(
+            f"to_world of {plugin} {named(emitter)} distorts angles (the lengths of its columns are "
+            f"{_lengths(columns)}); leave out scaling and shear, and set {angle} instead"
+        )
+
+
+_ANGLES = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}
+
+
+def _plugin(emitter) -> str:
+    return {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}.get(
+        emitter.class_name(), emitter.class_name().removesuffix("Emitter").lower()
     )
 
 

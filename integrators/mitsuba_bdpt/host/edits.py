@@ -17,11 +17,11 @@ KEPT = 64
 
 @dataclass(frozen=True)
 class State:
-    """The parameters of Mitsuba's objects at one time; equal to a later one, also as a key, if nothing was
-    edited in between.
+    """A record of the parameters of Mitsuba's objects, to find edits by.
 
-    ``marks``: small arrays of Dr.Jit by their number, transformations too, larger ones by a checksum of
-    their contents, all else by its text. ``kept``: what is known by its number.
+    Equal to a later one, also as a key, if nothing was edited in between. ``marks``: small arrays of Dr.Jit
+    by their number, transformations too, larger ones by a checksum of their contents, all else by its text.
+    ``kept``: what is known by its number.
     """
 
     marks: tuple

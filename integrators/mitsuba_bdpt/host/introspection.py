@@ -35,8 +35,10 @@ def is_instance(shape) -> bool:
 
 
 def grouped_shapes(scene) -> list:
-    """The shapes in the scene's shape groups. (An instance does not tell of which group it is: groups are
-    found among what the scene holds.)"""
+    """Return the shapes in the scene's shape groups.
+
+    An instance does not tell which group it is of: groups are found among what the scene holds.
+    """
     shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
     groups = [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
     return [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
@@ -48,8 +50,10 @@ def all_shapes(scene) -> list:
 
 
 def own_parameters(owner) -> dict:
-    """The parameters of ``owner`` alone, by name. (``mi.traverse`` goes through all that it holds: that takes
-    longer.)"""
+    """Return the parameters of ``owner`` alone, by name.
+
+    ``mi.traverse`` goes through all objects that it holds, which takes longer.
+    """
     collector = _collector(mi.variant())()
     found = collector.of(owner)
     return {
@@ -81,8 +85,10 @@ def matrix_of(owner) -> np.ndarray:
 
 
 def inverse_of(owner) -> np.ndarray:
-    """What Mitsuba takes to be the inverse of `matrix_of`, kept beside it: wrong after ``rotate`` about an
-    axis that is not of length 1, which is taken for a rotation."""
+    """Return what Mitsuba takes to be the inverse of `matrix_of`, kept beside it.
+
+    It is wrong after ``rotate`` about an axis that is not of length 1, which Mitsuba takes for a rotation.
+    """
     return _entries(own_parameters(owner)["to_world"].inverse().matrix)
 
 
@@ -93,9 +99,11 @@ def _entries(matrix) -> np.ndarray:
 
 @cache
 def _collector(variant: str):
-    """The class that collects, one per variant. (Made anew for each call it would be garbage that only the
-    cycle collector frees; until then it keeps emitters alive beyond their scene, and the next virtual call of
-    any scene crashes.)"""
+    """Return the class that collects parameters, one per variant.
+
+    A class made for each call would be garbage that only the cycle collector frees; until then it keeps
+    emitters alive beyond their scene, and the next virtual call of any scene crashes.
+    """
 
     class Collector(mi.TraversalCallback):
         def of(self, owner) -> dict:

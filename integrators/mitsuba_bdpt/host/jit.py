@@ -35,8 +35,10 @@ def _emitter(index: int):
 
 @contextlib.contextmanager
 def evaluated_mode(on=True):
-    """Loops, calls and branches of kernels are not recorded as a whole but run one after the other, which
-    calls of `timed_sunsky` need."""
+    """Run loops, calls and branches of kernels one after the other, without recording them as a whole.
+
+    Calls of `timed_sunsky` need this.
+    """
     flags = (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals)
     with contextlib.ExitStack() as stack:
         for flag in flags if on else ():
@@ -46,9 +48,12 @@ def evaluated_mode(on=True):
 
 @contextlib.contextmanager
 def gc_paused():
-    """Python's cycle collector waits: a scene that only it would free, and that goes while a kernel is being
-    recorded, leaves calls of its objects in the kernel beside those of the others, and Dr.Jit aborts the
-    process ("invalid redefinition of function")."""
+    """Pause Python's cycle collector.
+
+    A scene that only the collector would free, and that is freed while a kernel is being recorded, leaves
+    calls of its objects in the kernel beside those of the others, and Dr.Jit aborts the process ("invalid
+    redefinition of function").
+    """
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -59,8 +64,10 @@ def gc_paused():
 
 
 def make_parameters_opaque(owners):
-    """Move the numbers of ``owners`` that a kernel would hold as constants into memory: calls of objects of
-    one class then differ in data alone and are compiled once, not once per object. What is differentiated
-    stays."""
+    """Move the numbers of ``owners`` that a kernel would hold as constants into memory.
+
+    Calls of objects of one class then differ in data alone and are compiled once, not once per object. What
+    is differentiated stays.
+    """
     values = (value for owner in owners for value in own_parameters(owner).values())
     dr.make_opaque([value for value in values if not dr.grad_enabled(value)])

@@ -1,5 +1,7 @@
-"""What is remembered of scenes from render to render: warnings that were said, what pilots and looks for lost
-light have found."""
+"""State that is kept with a scene from render to render.
+
+Warnings that were logged, and the results of pilots and of estimates of lost light.
+"""
 
 from __future__ import annotations
 
@@ -49,8 +51,10 @@ def _alone() -> int:
 
 
 def remembered(scene, sensor, kind: str, key, find):
-    """What ``find()`` returned when it was last called for this ``key``, and whether it need not be called
-    now; of each ``kind`` the latest `FINDINGS` are kept."""
+    """Return what ``find()`` returned for this ``key``, and whether it is remembered from an earlier call.
+
+    Of each ``kind`` the latest `FINDINGS` are kept.
+    """
     known = notes(scene, sensor).setdefault(kind, {})
     is_known, found = key in known, known.pop(key, None)
     known[key] = found = found if is_known else find()
@@ -60,8 +64,11 @@ def remembered(scene, sensor, kind: str, key, find):
 
 
 def warn_once(scene, sensor, text: str, about=None):
-    """Log a warning, unless it was said of the ``scene`` before: the same ``text``, or one ``about`` the same
-    where it has numbers that differ from render to render."""
+    """Log a warning, unless it was logged for the ``scene`` before.
+
+    The same warning is one of the same ``text``, or one ``about`` the same where the text has numbers that
+    differ from render to render.
+    """
     said = notes(scene, sensor).setdefault("said", set())
     about = about or text
     if about not in said:

@@ -9,6 +9,7 @@ right thing for every filter, crop window and border. Putting both kinds into on
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import reduce
 
 import drjit as dr
@@ -17,6 +18,7 @@ import numpy as np
 
 from ..errors import UsageError
 from .block import Block
+from .channels import Channels
 from .layers import layer_names, strategies, strategy_count, strategy_index
 from .replicates import Replicates
 
@@ -36,7 +38,6 @@ class Accumulator:
     def __init__(self, film, colour, border: int, depth: int, variance: bool = False, features=None):
         self.film, self.colour, self.features = film, colour, features
         self.border = border
-        self.alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         self.depth = depth
         self.size = [int(x) for x in film.crop_size()]
         self.offset = [int(x) for x in film.crop_offset()]
@@ -44,12 +45,10 @@ class Accumulator:
         self.replicates = Replicates() if variance else None
         names = features.names if features else []
         colour.prepare(layer_names(depth, variance, names, colour.names))
-        self._colours = len(colour.names)
-        self._weight = self._colours + self.alpha  # where W lies among the camera samples' sums
-        self._channels = self._weight + 1 + len(names)
-        self.camera = self._block(self._channels, dr.ReduceMode.Local, mi.ArrayXf)
+        self._channels = Channels.of(film, len(colour.names), len(names))
+        self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf)
         # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
-        self.light = self._block(self._colours, dr.ReduceMode.Direct, mi.ArrayXd)
+        self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
         # One strip of rows per strategy, far enough apart for the filter.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         rows = strategy_count(depth) * self._stride
@@ -59,12 +58,16 @@ class Accumulator:
 
     def _block(self, channels: int, mode, packet, height: int | None = None):
         size = [self.size[0], height or self.size[1]]
-        return Block(size, self.offset, channels + channels % 2, self.rfilter, mode, packet)
+        return Block(size, self.offset, channels, self.rfilter, mode, packet)
+
+    @property
+    def alpha(self) -> bool:
+        """Whether the film keeps alpha."""
+        return bool(self._channels.alpha)
 
     def put_camera(self, position, colours, alpha, features, active):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
-        values = [*colours, *([alpha] if self.alpha else []), mi.Float(1), *features]
-        self.camera.put(position, values, active)
+        self.camera.put(position, self._channels.sample(colours, alpha, features), active)
 
     def put_light(self, position, colours, active):
         """Add a splat at a continuous film position."""
@@ -99,26 +102,30 @@ class Accumulator:
         for b in blocks:
             b.clear()
 
-    def store(self) -> tuple[tuple, dict, dict | None]:
-        """What a `Snapshot` needs: passes, arrays (of Dr.Jit or NumPy, none of which changes any more), and
-        numbers about the replicates, if there are any."""
+    def store(self) -> tuple[tuple, dict]:
+        """Passes and raw sums for a `Snapshot`: arrays of Dr.Jit or NumPy, none of which changes any more."""
         sums, passes = self._done
-        arrays, replicates = self.replicates.store() if self.replicates else ({}, None)
-        return passes, arrays | dict(zip(_NAMES, sums or [], strict=False)), replicates
+        last = self.replicates.store() if self.replicates else {}
+        return passes, last | dict(zip(_NAMES, sums or [], strict=False))
+
+    @property
+    def halves(self) -> tuple | None:
+        """The `Spread` of either half of the replicates, ``None`` without the variance."""
+        return self.replicates.halves if self.replicates else None
 
     def ends_replicates(self) -> bool:
         """Whether all passes belong to whole replicates."""
         return self.replicates is not None and self.replicates.spp == sum(self.passes) > 0
 
-    def restore(self, passes: tuple, arrays: dict, replicates: dict | None):
-        """Go on from what `store` gave after these ``passes``."""
+    def restore(self, passes: tuple, arrays: dict, halves: tuple | None):
+        """Go on from what `store` and `halves` gave after these ``passes``."""
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
             if len(s) != len(block.data):
                 raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
         self._done = (sums, tuple(passes))
         if self.replicates is not None:
-            self.replicates.restore(replicates, arrays)
+            self.replicates.restore(halves, arrays)
 
     def close_replicate(self):
         """Count what was added since the last call as one independent replicate of the image."""
@@ -131,19 +138,31 @@ class Accumulator:
 
     def _image(self, camera, light, spp: int):
         """Image (height, width, colours) of sums over ``spp`` samples per pixel."""
+        pixels = self._pixels(camera, light)
+        return pixels.colours / pixels.weight + pixels.light / self._splat_weight(spp)[..., None]
+
+    def _pixels(self, camera, light) -> _Pixels:
+        """The sums of an image, ordered by pixels."""
         w, h = self.size
-        camera, light = camera.reshape(h, w, -1), light.reshape(h, w, -1)
-        weight, n = camera[..., self._weight, None], self._colours
-        return camera[..., :n] / weight + light[..., :n] / self._splat_weight(spp)[..., None]
+        camera, light, channels = camera.reshape(h, w, -1), light.reshape(h, w, -1), self._channels
+        return _Pixels(
+            colours=camera[..., channels.of_colours],
+            alpha=camera[..., channels.colours : channels.weight],
+            weight=camera[..., channels.weight, None],
+            features=camera[..., channels.of_features],
+            light=light[..., channels.of_colours],
+        )
 
     def mean(self):
-        """Mean of the image so far (largest colour, each in its unit), for the scale of roulette: a
-        ``Float64`` of width 1, for which nobody has waited yet."""
-        blocks = zip(self._done[0][:2], (self.camera, self.light), strict=True)
+        """Mean of the image so far, the scale of roulette: a ``Float64`` of width 1, not yet evaluated.
+
+        Of the colours, each in its unit, the largest.
+        """
+        channels, blocks = self._channels, zip(self._done[0][:2], (self.camera, self.light), strict=True)
         camera, light = (
-            [dr.sum(sums[i :: block.channels]) for i in range(self._colours)] for sums, block in blocks
+            [dr.sum(sums[i :: block.channels]) for i in range(channels.colours)] for sums, block in blocks
         )
-        weight = dr.sum(self._done[0][0][self._weight :: self.camera.channels])
+        weight = dr.sum(self._done[0][0][channels.weight :: self.camera.channels])
         splat_weight = float(self._splat_weight(sum(self.passes)).sum())
         weight, splat_weight = dr.maximum(weight, 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
         colours = zip(camera, light, self.colour.unit, strict=True)
@@ -169,22 +188,40 @@ class Accumulator:
 
     def finish(self):
         """Store the result of the passes so far in the film."""
-        w, h = self.size
         sums, passes = self._done
         if not passes:
             return
-        camera, light = (np.array(s).reshape(h, w, -1) for s in sums[:2])
-        n, last = self._colours, self._weight + 1
-        colours, weight, features = camera[..., : last - 1], camera[..., last - 1 : last], camera[..., last:]
-        to_film = weight / self._splat_weight(sum(passes))[..., None]
-        colours[..., :n] += light[..., :n] * to_film
-        layers = [features[..., : self._channels - last]]
+        spp = sum(passes)
+        pixels = self._pixels(*(np.array(s) for s in sums[:2]))
+        to_film = pixels.weight / self._splat_weight(spp)[..., None]
+        colours = np.concatenate([pixels.colours + pixels.light * to_film, pixels.alpha], axis=-1)
+        layers = [pixels.features]
         if self.replicates is not None:
-            layers.append(self.replicates.variance(sum(passes), (h, w, n)) * weight)
+            layers.append(self.replicates.variance(spp, pixels.colours.shape) * pixels.weight)
         if self.depth:
-            tall = np.array(sums[2]).reshape(-1, self._stride, w, 6)[:, :h]
-            for index, (_, _, t) in enumerate(strategies(self.depth)):
-                layers.append(tall[index] * (to_film if t <= 1 else 1))
-        values = np.concatenate(self.colour.stored(colours, weight, layers), axis=-1).astype(np.float32)
+            layers += self._strategy_layers(sums[2], to_film)
+        parts = self.colour.stored(colours, pixels.weight, layers)
+        values = np.concatenate(parts, axis=-1).astype(np.float32)
         block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
         self.film.put_block(block)
+
+    def _strategy_layers(self, sums, to_film) -> list:
+        """The strategy images in the order of their layers; ``to_film``: what splats are multiplied by."""
+        w, h = self.size
+        tall = np.array(sums).reshape(-1, self._stride, w, 6)[:, :h]
+        order = enumerate(strategies(self.depth))
+        return [tall[index] * (to_film if t <= 1 else 1) for index, (_, _, t) in order]
+
+
+@dataclass
+class _Pixels:
+    """Sums of an image, shape (height, width, numbers of each kind).
+
+    Those of camera samples, and of ``light``, the splats.
+    """
+
+    colours: np.ndarray
+    alpha: np.ndarray
+    weight: np.ndarray
+    features: np.ndarray
+    light: np.ndarray

@@ -19,8 +19,10 @@ RESPONSE_SAMPLES = 4096
 
 
 def film_colours(sensor):
-    """The kind of colours that the film of ``sensor`` keeps; raises ``NotImplementedError`` for films
-    other than Mitsuba's."""
+    """Return the kind of colours that the film of ``sensor`` keeps.
+
+    Raises ``UnsupportedError`` for films other than Mitsuba's.
+    """
     film = sensor.film()
     if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
         return Rgb(film)

@@ -86,8 +86,11 @@ class FeatureLayers:
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
 
     def sample(self, points, stream, position, u_lens, time, active) -> tuple[list, object]:
-        """One number per layer for the camera sample at the film ``position`` (pixels), seen through
-        the point of the lens that ``u_lens`` chooses; and a mask, false where one was not finite and is 0."""
+        """Return one number per layer for a camera sample, and whether all were finite.
+
+        The sample is at the film ``position`` (pixels), seen through the point of the lens that ``u_lens``
+        chooses. A number that is not finite is 0, and the mask false.
+        """
         uv = self._region.to_uv(position)
         ray, _ = self._sensor.sample_ray_differential(time, 0.5, uv, u_lens, active)
         ray.scale_differential(self._spread)

@@ -20,9 +20,11 @@ def strategy_index(s, t):
 
 
 def layer_names(depth: int, variance: bool, features=(), colours=("R", "G", "B")) -> list[str]:
-    """Names of the film's layers, in the order in which `Accumulator` keeps them: ``features``, the
-    variance of the pixels in the film's ``colours``, and technique images of paths of up to ``depth``
-    edges."""
+    """Names of the film's layers, in the order in which `Accumulator` keeps them.
+
+    ``features``, the variance of the pixels in the film's ``colours``, and technique images of paths of up to
+    ``depth`` edges.
+    """
     names = [*features, *(f"variance.{colour}" for colour in colours if variance)]
     return names + [
         f"{kind}.s{s}t{t}.{channel}"

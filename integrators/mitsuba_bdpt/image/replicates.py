@@ -6,12 +6,17 @@ from math import inf
 
 import numpy as np
 
-from .spread import Spread, restored, stored
+from .spread import Spread
+
+# Names of the sums after the last image, in a snapshot.
+_LAST = "replicates.last."
 
 
 class Replicates:
-    """Independent images of the scene, in turn in one of two `Spread`: what one half of them says about the
-    error can be put beside what the other says about the image."""
+    """Independent images of the scene, in turn in one of two `Spread`.
+
+    What one half of them says about the error can be put beside what the other says about the image.
+    """
 
     def __init__(self):
         self.halves, self._sums = (Spread(), Spread()), None
@@ -27,30 +32,33 @@ class Replicates:
         return sum(half.spp for half in self.halves)
 
     def add(self, sums, spp: int, develop):
-        """Add an image: ``sums`` and ``spp`` are those of all images so far, ``develop(camera, light,
-        spp)`` makes an image of the difference."""
+        """Add an image.
+
+        ``sums`` and ``spp`` are those of all images so far, ``develop(camera, light, spp)`` makes an image of
+        the difference.
+        """
         new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
         n, halves = spp - self.spp, list(self.halves)
         which = self.count % 2
         halves[which] = halves[which].joined(Spread.of(develop(*new, n), n))
         self.halves, self._sums = tuple(halves), sums
 
-    def store(self) -> tuple[dict, dict]:
-        """Arrays of a `Snapshot`, and the numbers that `restore` needs beside them."""
-        arrays, progress = stored(self.halves)
-        if self.count:
-            arrays |= {f"replicates.last.{i}": sums for i, sums in enumerate(self._sums)}
-        return arrays, progress
+    def store(self) -> dict:
+        """Sums after the last image, which `restore` needs beside the halves."""
+        return {f"{_LAST}{i}": sums for i, sums in enumerate(self._sums or ())}
 
-    def restore(self, progress: dict, arrays: dict):
-        """Go on from what `store` gave."""
-        self.halves = restored(progress, arrays)
+    def restore(self, halves: tuple, arrays: dict):
+        """Go on from these ``halves`` and what `store` gave."""
+        self.halves = halves
         if self.count:
-            self._sums = [arrays[n] for n in sorted(arrays) if n.startswith("replicates.last.")]
+            self._sums = [arrays[name] for name in sorted(arrays) if name.startswith(_LAST)]
 
     def variance(self, spp: int, shape=()):
-        """Variance of the mean of ``spp`` samples per pixel (those of a replicate that was not
-        finished included); infinite, in the given shape, with fewer than two replicates."""
+        """Variance of the mean of ``spp`` samples per pixel.
+
+        Those of a replicate that was not finished are included. Infinite, in the given shape, with fewer than
+        two replicates.
+        """
         if self.count < 2:
             return np.full(shape, np.inf)
         first, second = self.halves
@@ -58,8 +66,9 @@ class Replicates:
         return both.variance() * (both.spp / spp)
 
     def error(self, spp: int, unit) -> float:
-        """Estimated relMSE of the mean of ``spp`` samples per pixel, colours in multiples of ``unit``;
-        infinite with fewer than two replicates in a half.
+        """Estimated relMSE of the mean of ``spp`` samples per pixel, colours in multiples of ``unit``.
+
+        Infinite with fewer than two replicates in a half.
 
         The variance that one half shows is divided by r^2 + 0.01 mean(image)^2 with r from the other half:
         beside a mean that has the same firefly no value could count for more than 1. The noise of r alone

@@ -2,7 +2,7 @@
 
 A sink has ``alpha``, whether the last event of a camera subpath matters, and the methods of `Image`:
 ``begin`` and ``add`` for what a camera subpath finds, ``connect`` for its inner connections, ``end`` when it
-is done, ``splat`` for contributions with t <= 1.
+is done, ``splat`` for contributions with t <= 1. The last three return `Counters`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport import connections, contribution
+from ..transport import connections
+from ..transport.counters import Counters, one
 
 
 class Image:
@@ -34,28 +35,29 @@ class Image:
             self._put_strategy(c, start.counted, shared)
         return total + c.weighted()
 
-    def connect(self, kernel, z, lane, stream, counters, total, start):
-        """Join the camera vertex ``z`` with the light vertices of its lane."""
+    def connect(self, kernel, z, lane, stream, total, start):
+        """Join the camera vertex ``z`` with the light vertices of its lane: the ``total``, and `Counters`."""
         if kernel.plan.connections == "all":
 
             def add(c, visible, total):
                 c.active = visible
                 return self.add(kernel, c, total, start, lane.shared)
 
-            return connections.connect_all(kernel, z, lane.path, counters, total, add)
-        return total + connections.connect_one(kernel, z, lane.path, stream, counters)
+            return connections.connect_all(kernel, z, lane.path, total, add)
+        found, counted = connections.connect_one(kernel, z, lane.path, stream)
+        return total + found, counted
 
-    def splat(self, kernel, c, position, shared, counters):
+    def splat(self, kernel, c, shared) -> Counters:
         """Add a contribution with t <= 1; colours that are not finite (`contribution.finite` has seen the
         contribution, not what the film makes of it) count as zero."""
         value = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
         finite = dr.all(dr.isfinite(value))
-        contribution.count(counters, "non_finite", c.active & ~finite)
-        self._film.put_light(position, value, c.active & finite)
+        self._film.put_light(c.position, value, c.active & finite)
         if kernel.strategy_images:
-            self._put_strategy(c, position, shared)
+            self._put_strategy(c, c.position, shared)
+        return Counters(non_finite=one(c.active & ~finite))
 
-    def end(self, kernel, lane, sample, total, seen, counters):
+    def end(self, kernel, lane, sample, total, seen) -> Counters:
         """Add a camera sample; colours that are not finite, sums of finite ones, count as zero."""
         film, shared, start = self._film, lane.shared, sample.start
         features, finite = [], mi.Bool(True)
@@ -67,8 +69,7 @@ class Image:
         shown = dr.all(dr.isfinite(colours))
         alpha = _alpha(kernel, seen)
         film.put_camera(start.counted, dr.select(shown, colours, 0), alpha, features, sample.covered)
-        for mask in (finite, shown):
-            contribution.count(counters, "non_finite", sample.covered & ~mask)
+        return Counters(non_finite=one(sample.covered & ~finite) + one(sample.covered & ~shown))
 
     def _put_strategy(self, c, position, shared):
         weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)

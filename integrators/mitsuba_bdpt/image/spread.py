@@ -29,8 +29,11 @@ class Spread:
         return Spread(1, spp, image, np.zeros_like(image))
 
     def joined(self, other: Spread) -> Spread:
-        """Both: squares about the common mean (T. Chan, G. Golub, R. LeVeque, "Updating formulae and a
-        pairwise algorithm for computing sample variances", 1979, eq. 2.1)."""
+        """Both: squares about the common mean.
+
+        T. Chan, G. Golub, R. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+        variances", 1979, eq. 2.1.
+        """
         if not (self.count and other.count):
             return self if self.count else other
         spp, apart = self.spp + other.spp, other.mean - self.mean
@@ -44,20 +47,3 @@ class Spread:
     def variance(self) -> np.ndarray:
         """Of the mean; there must be two images."""
         return self.squares / (self.spp * (self.count - 1))
-
-
-def stored(halves) -> tuple[dict, dict]:
-    """Several `Spread` as arrays and plain numbers of a snapshot."""
-    arrays = {}
-    for i, half in enumerate(halves):
-        if half.count:
-            arrays |= {f"replicates.{i}.mean": half.mean, f"replicates.{i}.squares": half.squares}
-    return arrays, {"halves": [[half.count, half.spp] for half in halves]}
-
-
-def restored(progress: dict, arrays: dict) -> tuple[Spread, ...]:
-    """What was `stored`."""
-    return tuple(
-        Spread(count, spp, arrays.get(f"replicates.{i}.mean"), arrays.get(f"replicates.{i}.squares"))
-        for i, (count, spp) in enumerate(progress["halves"])
-    )

@@ -17,12 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..emitters import emitters
 from ..errors import CommandError
-from ..geometry import rays
 from ..image import sink
 from ..run import rendering
-from ..transport import bsdf, connections, kernel
+from ..transport import connections, kernel
+from ..transport.counters import Counters
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -72,15 +71,15 @@ class Collector(sink.Image):
         # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
         self.kept = []
 
-    def splat(self, kernel, c, position, shared, counters):
+    def splat(self, kernel, c, shared):
         """Add a contribution with t <= 1."""
-        super().splat(kernel, c, position, shared, counters)
-        self._keep(position, c.weighted() * shared.weight, shared, (c.s, c.t), c.active)
+        self._keep(c.position, c.weighted() * shared.weight, shared, (c.s, c.t), c.active)
+        return super().splat(kernel, c, shared)
 
-    def end(self, kernel, lane, sample, total, seen, counters):
+    def end(self, kernel, lane, sample, total, seen):
         """Add a camera sample."""
-        super().end(kernel, lane, sample, total, seen, counters)
         self._keep(sample.start.counted, total * lane.shared.weight, lane.shared, (0, 0), sample.covered)
+        return super().end(kernel, lane, sample, total, seen)
 
     def _keep(self, position, value, shared, strategy, active):
         colours = mi.Color3f(*self._film.colour(value, shared.wavelengths))
@@ -209,61 +208,44 @@ class _Subpath:
         return self.visits[s - 2].p[:, i] if 2 <= s <= len(self.visits) + 1 else np.full(3, np.inf)
 
 
+@contextlib.contextmanager
+def stepwise():
+    """Dr.Jit runs loops and branches step by step, so that their state can be read."""
+    with contextlib.ExitStack() as stack:
+        for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
+            stack.enter_context(dr.scoped_set_flag(flag, False))
+        yield
+
+
 class Recorder:
-    """Sink (see `sink`) of a replay of ``count`` samples: writes down contributions, and, `watching`, the
-    vertices of the walks."""
+    """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`: writes down contributions, and
+    the vertices of the walks."""
 
     alpha = False
 
     def __init__(self, count: int):
-        self._count, self._step = count, None
+        self._count, self._drawn = count, None
         self.camera = self.light = self.pdf_w = None
         self.contributions = []
 
-    @contextlib.contextmanager
-    def watching(self):
-        """Walks are written down; Dr.Jit runs loops step by step, so that their state can be read."""
-        with contextlib.ExitStack() as stack:
-            for owner, name, watch in (
-                (kernel, "random_walk", self._watch_walk),
-                (bsdf, "sample", self._watch_step),
-                (bsdf, "sample_adjoint", self._watch_step),
-                (emitters.Emitters, "sample_emission", self._watch_emission),
-            ):
-                stack.enter_context(mock.patch.object(owner, name, watch(getattr(owner, name))))
-            for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
-                stack.enter_context(dr.scoped_set_flag(flag, False))
-            yield
+    def emitted(self, emission):
+        """The light subpath begins."""
+        start = dr.select(emission.infinite, mi.Point3f(-emission.d), mi.Point3f(emission.si.p))
+        self.light = _Subpath(self._numbers(start, 3), self._numbers(emission.infinite).astype(bool))
 
-    def _watch_emission(self, sample_emission):
-        def watched(*args):
-            e = sample_emission(*args)
-            start = self._numbers(dr.select(e.infinite, mi.Point3f(-e.d), mi.Point3f(e.si.p)), 3)
-            self.light = _Subpath(start, self._numbers(e.infinite).astype(bool))
-            return e
+    def started(self, traced, side, walk, stream):
+        """The camera subpath begins; of the light subpath `emitted` knows more."""
+        if not side.adjoint:
+            self.camera = _Subpath(self._numbers(walk.previous, 3))
 
-        return watched
+    def vertex(self, side, walk, vertex, step):
+        """A subpath has reached a vertex."""
+        subpath = self.light if side.adjoint else self.camera
+        subpath.visits.append(self._visit(side, vertex, step))
 
-    def _watch_step(self, sample):
-        def watched(*args):
-            self._step, evaluation = sample(*args)
-            return self._step, evaluation
-
-        return watched
-
-    def _watch_walk(self, random_walk):
-        def watched(traced, side, walk, stream, visit, state):
-            if not side.adjoint:
-                self.camera = _Subpath(self._numbers(walk.previous, 3))
-            subpath = self.light if side.adjoint else self.camera
-
-            def noted(vertex, state, walk):
-                subpath.visits.append(self._visit(side, vertex))
-                return visit(vertex, state, walk)
-
-            return random_walk(traced, side, walk, stream, noted, state)
-
-        return watched
+    def drawn(self, end):
+        """A connection was drawn."""
+        self._drawn = self._numbers(end, 3)
 
     @staticmethod
     def _survival(subpath, count: int, i: int) -> float:
@@ -274,17 +256,17 @@ class Recorder:
             found *= (a.throughput[:, i] * a.weight[:, i]).max() / b.throughput[:, i].max()
         return found
 
-    def _visit(self, side, vertex) -> _Visit:
+    def _visit(self, side, vertex, step) -> _Visit:
         shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
         away = mi.Point3f(-vertex.si.wi)  # of rays that have left the scene: their direction, in world space
-        delta = mi.Bool(False) if self._step is None else self._step.delta
+        delta = mi.Bool(False) if step is None else step.delta
         found = _Visit(
             self._numbers(dr.select(vertex.hit, mi.Point3f(vertex.si.p), away), 3),
             self._numbers(dr.select(vertex.hit, shape, 0)).astype(int),
             self._numbers(delta).astype(bool),
             self._numbers(vertex.hit).astype(bool),
             self._numbers(vertex.throughput, 3),
-            self._numbers(1.0 if self._step is None else self._step.weight, 3),
+            self._numbers(1.0 if step is None else step.weight, 3),
         )
         end = vertex.endpoint
         if end is not None and side.adjoint:
@@ -309,11 +291,12 @@ class Recorder:
         self._note(c, c.weighted())
         return total + c.weighted()
 
-    def splat(self, traced, c, position, shared, counters):
+    def splat(self, traced, c, shared):
         """Add a contribution with t <= 1."""
         self._note(c, c.weighted())
+        return Counters()
 
-    def connect(self, traced, z, lane, stream, counters, total, start):
+    def connect(self, traced, z, lane, stream, total, start):
         """Join the camera vertex ``z`` with the light vertices of its lane."""
         found = []
 
@@ -322,16 +305,16 @@ class Recorder:
             found.append(c)
             return total
 
-        connections.connect_all(traced, z, lane.path, dict(counters), total, add)
+        _, counted = connections.connect_all(traced, z, lane.path, total, add)
         if traced.plan.connections == "all":
             for c in found:
                 total = self.add(traced, c, total, start, lane.shared)
-            return total
-        value, end = self._draw(traced, z, lane, stream, counters)
-        drawn = np.argmin([self._distances(c, end) for c in found], axis=0) if found else None
+            return total, counted
+        value, counted = connections.connect_one(traced, z, lane.path, stream)
+        drawn = np.argmin([self._distances(c, self._drawn) for c in found], axis=0) if found else None
         for i, c in enumerate(found):
             self._note(c, dr.select(mi.Bool(drawn == i), value, 0))
-        return total + value
+        return total + value, counted
 
     def _distances(self, c, end):
         """How far the light vertex of a connection is from the ``end`` of a visibility ray, in each lane.
@@ -340,22 +323,10 @@ class Recorder:
         y = np.array([self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))])
         return np.where(self._numbers(c.active) > 0, np.linalg.norm(end.T - y, axis=1), np.inf)
 
-    def _draw(self, traced, z, lane, stream, counters):
-        """What the draw of one connection gives, and the position of the vertex drawn."""
-        ends = []
-
-        def segment_to(anchor, end, like):
-            ends.append(self._numbers(end, 3))
-            return original(anchor, end, like)
-
-        original = rays.segment_to
-        with mock.patch.object(rays, "segment_to", segment_to):
-            value = connections.connect_one(traced, z, lane.path, stream, counters)
-        return value, ends[-1]
-
-    def end(self, traced, lane, sample, total, seen, counters):
+    def end(self, traced, lane, sample, total, seen):
         """The camera sample is complete."""
         self.pdf_w = self._numbers(sample.start.pdf_w)
+        return Counters()
 
     def _note(self, c, value):
         numbers = {name: self._numbers(getattr(c, name)) for name in ("s", "t", "weight", "active")}
@@ -410,9 +381,9 @@ def replay(outliers: list[Outlier]) -> list[list[Path]]:
         slots = [outliers[i].slot for i in numbers]
         slots += slots[:1]  # Dr.Jit takes arrays of width 1 for constants
         recorder = Recorder(len(slots))
-        with rendering.gc_paused(), recorder.watching():
+        with rendering.gc_paused(), stepwise():
             drawn = launch.kernel, recorder, launch.batch, launch.points, launch.spp
-            dr.eval(kernel.retrace(*drawn, mi.UInt32(slots)))
+            dr.eval(kernel.retrace(*drawn, mi.UInt32(slots), recorder))
         for lane, i in enumerate(numbers):
             o = outliers[i]
             wanted = (lambda p, o=o: (p.s, p.t) == (o.s, o.t)) if o.s else (lambda p: p.t >= 2)

@@ -3,7 +3,7 @@
 From rows.parquet and probes.json in a folder come the plots and README.md with all tables beside them. Goals
 and explanations of what is not as one expects are read from goals.toml and notes.toml, if there are any. The
 parts of another Markdown file between the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too,
-NAME being ``goals``, ``efficiency`` or ``gallery`` (of images in docs/images/gallery).
+NAME being ``goals``, ``efficiency`` or ``gallery`` (of images in ../images/gallery).
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def gaps_table(results: Results) -> str:
     return table(["scene", *methods], rows)
 
 
-GALLERY = "docs/images/gallery"  # from the README
+GALLERY = "../images/gallery"  # from docs/reports/figures.md
 GALLERY_COLUMNS = 3
 
 

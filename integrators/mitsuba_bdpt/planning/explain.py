@@ -5,7 +5,24 @@ from __future__ import annotations
 from ..settings import Settings
 from ..transport.plan import Plan
 from .choice import LIGHT_GAIN
-from .possible import unreachable_paths
+from .possible import Rest, Start, UnreachablePaths, unreachable_paths
+
+_STARTS = {Start.DELTA_EMITTER: "delta emitter, delta surfaces", Start.BEAM: "directionalarea"}
+_RESTS = {
+    Rest.SEEN_SURFACE: ", a surface that the sensor sees",
+    Rest.SURFACES: ", two other surfaces or more, delta surfaces or none, sensor",
+    Rest.SURFACE_BETWEEN_DELTA: ", a single other surface, delta surfaces, sensor (no two neighbours can be "
+    "joined)",
+    Rest.SENSOR: ", sensor",
+    Rest.LONG: ", ... on paths longer than {longest} edges (stored_vertices)",
+}
+
+
+def words(lost: UnreachablePaths) -> str:
+    """Paths that no strategy in use can make, in words."""
+    starts = " or ".join(_STARTS[start] for start in lost.starts)
+    rest = _RESTS[lost.rest].format(longest=lost.longest)
+    return f"{starts}{rest} (needs {lost.needs})" if lost.needs else f"{starts}{rest}"
 
 
 def subpaths(count: int) -> str:
@@ -41,7 +58,7 @@ def explain(
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     if (p.splat or p.arrival or p.connections != "none") and settings.stored_vertices < settings.max_depth:
         lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
-    lines += [f"lost: {text}" for text in unreachable_paths(prepared, p, settings)]
+    lines += [f"lost: {words(lost)}" for lost in unreachable_paths(prepared, p, settings)]
     if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
@@ -63,7 +80,7 @@ def _pilot(settings: Settings, table, certainty: float) -> list[str]:
     shown = set()
     for row in table:
         candidate = row.candidate
-        key = candidate.combination, candidate.connections, candidate.camera_paths_per_light_path
+        key = candidate.weighting.combination, candidate.connections, candidate.camera_paths_per_light_path
         if key in shown:
             continue
         shown.add(key)

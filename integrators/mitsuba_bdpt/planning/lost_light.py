@@ -1,17 +1,16 @@
-"""How much of an image's light no strategy finds: light that leaves a delta emitter through glass (or another
-delta surface) and is seen through glass.
+"""How much of an image's light no strategy finds: from a delta emitter by delta events to the eye.
 
-Such a path has no two neighbours that could be joined: lamp, delta surfaces, one other surface, delta
-surfaces, sensor. `possible.unreachable_paths` says where they are possible; here they are estimated as a
-photon map does it, by a few thousand subpaths from either end that take delta events alone. Paths with
-several other surfaces, no two of which are neighbours, are left out, and so is the lamp itself, seen in a
-mirror. The other surface is taken to reflect evenly what it reflects in all, glossy ones too: of these a
-single view shows more or less.
+It leaves a delta emitter through glass (or another delta surface) and is seen through glass. Such a path has
+no two neighbours that could be joined: lamp, delta surfaces, one other surface, delta surfaces, sensor.
+`possible.unreachable_paths` says where they are possible; here they are estimated as a photon map does it, by
+a few thousand subpaths from either end that take delta events alone. Paths with several other surfaces, no
+two of which are neighbours, are left out, and so is the lamp itself, seen in a mirror. The other surface is
+taken to reflect evenly what it reflects in all, glossy ones too: of these a single view shows more or less.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -81,8 +80,12 @@ class _Ends:
     active: object
 
     def some(self):
-        """Of the active ones `COMPARED` at most, evenly chosen, their indices, and how many each stands for;
-        None in the first place where there are none."""
+        """Of the active ones `COMPARED` at most, evenly chosen.
+
+        Also their indices, and how many each stands for.
+
+        None in the first place where there are none.
+        """
         dr.eval(self)
         index = dr.compress(self.active)
         found = dr.width(index)
@@ -96,17 +99,31 @@ class _Ends:
         return ends, index, found / kept
 
 
+@dataclass
+class _Walk:
+    """A subpath on its way: its ray, what it carries, its edges, the distance that it has come; whether it
+    goes on."""
+
+    ray: object
+    weight: object
+    edges: object
+    distance: object
+    active: object
+
+
 def is_possible(prepared, plan, settings) -> bool:
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
     return not plan.arrival and bool(unreachable_paths(prepared, plan, settings))
 
 
 def lost_radiance(prepared, plan, max_depth: int) -> dict[int, float]:
-    """Mean radiance over the film that is lost, by the index of the emitter; ``max_depth`` see
-    `Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says so, as of one that
-    emits into directions that are: a render that does not make such paths may meet no such number
-    itself, and `diagnostics` is asked only if it did. Of several lamps together it is the brightest colour of
-    their sum, of which each has a part by its own brightest."""
+    """Mean radiance over the film that is lost, by the index of the emitter.
+
+    ``max_depth`` see `Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says
+    so, as of one that emits into directions that are: a render that does not make such paths may meet no such
+    number itself, and `diagnostics` is asked only if it did. Of several lamps together it is the brightest
+    colour of their sum, of which each has a part by its own brightest.
+    """
     total = np.zeros((len(prepared.scene.emitters()), len(mi.UnpolarizedSpectrum())))
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         points, _, times = _seen(prepared, plan, max_depth).some()
@@ -142,8 +159,10 @@ def _warn_of_not_finite(prepared, indices):
 
 
 def in_words(prepared, plan, shares: dict[int, float]) -> str:
-    """What is missing, and what to do, where at least `WORTH_A_WORD` of the image's light is; else empty.
-    ``shares`` of the image's light by the index of the emitter."""
+    """What is missing, and what to do, if it is `WORTH_A_WORD`; else empty.
+
+    ``shares`` of the image's light by the index of the emitter.
+    """
     lost = sum(shares.values())
     if not lost >= WORTH_A_WORD:
         return ""
@@ -196,15 +215,20 @@ def _two(generator):
 
 
 def _carried(value):
-    """What a subpath carries: the colour, or in spectral variants the mean over the wavelengths in each of
-    them, since those of the other end are others."""
+    """What a subpath carries: its colour.
+
+    In spectral variants the mean over the wavelengths in each of them, since those of the other end are
+    others.
+    """
     value = mi.unpolarized_spectrum(value)
     return dr.mean(value) + dr.zeros(mi.UnpolarizedSpectrum) if mi.is_spectral else value
 
 
 def _lit(prepared, plan, max_depth):
-    """Where light of delta emitters arrives by delta events in a way that next-event estimation does not
-    find; the emitters' indices; and the mask of subpaths whose ray is not finite, which hit nothing."""
+    """Where light of delta emitters arrives by delta events and next-event estimation does not find it.
+
+    Also the emitters' indices, and the mask of subpaths whose ray is not finite, which hit nothing.
+    """
     generator = mi.PCG32(SUBPATHS, SEED, 1)
     shared = _shared(prepared, generator)
     e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
@@ -221,8 +245,10 @@ def _lit(prepared, plan, max_depth):
 
 
 def _seen(prepared, plan, max_depth):
-    """What is seen by delta events in a way that t = 1 does not find. Weights are those of the irradiance
-    there, distances the radii of the disks that stand for these points."""
+    """What is seen by delta events in a way that t = 1 does not find.
+
+    Weights are those of the irradiance there, distances the radii of the disks that stand for these points.
+    """
     generator = mi.PCG32(SUBPATHS, SEED, 2)
     shared, camera = _shared(prepared, generator), prepared.camera
     pixels = int(camera.region.size.prod())
@@ -245,34 +271,41 @@ def _seen(prepared, plan, max_depth):
 
 
 def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) -> _Ends:
-    """Follow rays by delta events to the first surface that has another lobe (where one has both, a coin
-    decides). One kernel for both sides."""
+    """Follow rays by delta events to the first surface that has another lobe.
+
+    Where one has both, a coin decides. One kernel for both sides.
+    """
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
     last, adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
 
-    def body(ray, weight, edges, distance, active, generator, ends):
-        si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-        active = active & si.is_valid()
-        distance += dr.select(active, si.t, 0)
+    def body(walk, generator, ends):
+        ray, weight = walk.ray, walk.weight
+        si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=walk.active)
+        active = walk.active & si.is_valid()
+        distance = walk.distance + dr.select(active, si.t, 0)
         surface = si.bsdf()
         smooth, delta = (_has(surface, kind) for kind in (mi.BSDFFlags.Smooth, mi.BSDFFlags.Delta))
         both = active & smooth & delta
         here = active & smooth & (~both | (generator.next_float32() < 0.5))
         weight = dr.select(both, weight * 2, weight)
         reflectance = _reflectance(si, surface, generator, here)
-        ends = dr.select(here, _end(si, surface, ray, weight, edges, distance, reflectance, here), ends)
-        active = active & ~here & delta & (edges < last)
+        arrived = replace(walk, weight=weight, distance=distance, active=here)
+        ends = dr.select(here, _end(si, surface, arrived, reflectance), ends)
+        active = active & ~here & delta & (walk.edges < last)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
         active &= ~bsdf.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)
-        edges += dr.select(active, mi.UInt32(1), 0)
-        return rays.spawn(anchor, si.to_world(bs.wo), ray), weight, edges, distance, active, generator, ends
+        edges = walk.edges + dr.select(active, mi.UInt32(1), 0)
+        ray = rays.spawn(anchor, si.to_world(bs.wo), ray)
+        return _Walk(ray, weight, edges, distance, active), generator, ends
 
-    state = ray, weight, mi.UInt32(1), mi.Float(0), active, generator, _nowhere()
-    *_, ends = dr.while_loop(state, lambda *state: state[4], body, label="delta events")
+    walk = _Walk(ray, weight, mi.UInt32(1), mi.Float(0), active)
+    *_, ends = dr.while_loop(
+        (walk, generator, _nowhere()), lambda walk, *_: walk.active, body, label="delta events"
+    )
     dr.eval(ends)
     return ends
 
@@ -284,8 +317,10 @@ def _nowhere() -> _Ends:
 
 
 def _reflectance(si, surface, generator, active):
-    """What a surface reflects of all that arrives from where ``si`` is seen: known for diffuse ones, of
-    others one sample, whose mean it is."""
+    """What a surface reflects of all that arrives from where ``si`` is seen.
+
+    Known for diffuse ones; of others one sample, whose mean it is.
+    """
     even = surface.eval_diffuse_reflectance(si, active)
     flags = mi.BSDFFlags.Smooth
     context = mi.BSDFContext(mi.TransportMode.Radiance, +flags)
@@ -295,21 +330,21 @@ def _reflectance(si, surface, generator, active):
     return _carried(dr.select(diffuse, dr.minimum(even, 1), glossy))
 
 
-def _end(si, surface, ray, weight, edges, distance, reflectance, active) -> _Ends:
+def _end(si, surface, walk: _Walk, reflectance) -> _Ends:
     """The end of a subpath at ``si``."""
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
     seen = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, front, back)  # the other side of most BSDFs is black
-    opacity = 1 - surface.eval_null_transmission(si, active)  # `mask` answers for what is inside of it
+    opacity = 1 - surface.eval_null_transmission(si, walk.active)  # `mask` answers for what is inside of it
     return _Ends(
         p=mi.Point3f(si.p),
-        n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, ray.d))),
+        n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, walk.ray.d))),
         through=_has(surface, kinds[0]) | _has(surface, kinds[1]),
-        weight=_carried(weight),
-        edges=edges,
-        distance=distance,
+        weight=_carried(walk.weight),
+        edges=walk.edges,
+        distance=walk.distance,
         reflectance=reflectance * opacity,
-        active=active & seen,
+        active=walk.active & seen,
     )
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..transport.batch import NET, NETS
+from .rows import SAMPLE, SPLAT
 
 # Tiles of the image in each direction: of those whose brightness is known by itself, and of the larger ones
 # that stand in for them as far as it is noise. (A caustic and its shadow are smaller than the larger ones: in
@@ -37,7 +38,7 @@ OWN_GAIN = 0.3
 
 # Fields of `Moments` that have a row for each group, and all of its arrays.
 _OF_GROUPS = ("base", "rare", "light", "draw")
-ARRAYS = (*_OF_GROUPS, "gain")
+_ARRAYS = (*_OF_GROUPS, "gain")
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,12 @@ class Moments:
     lanes: int
 
     def variance(self, draw, stratified: bool = False) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, 2, weightings): what does not depend on S, ``draw``
-        (`Moments.draw`, or 0 for all connections) included, and what grows with it, that of splats; with
-        independent numbers, or with what ``stratified`` points leave of it."""
+        """Relative variance per sample, shape (`GROUPS`, 2, weightings).
+
+        First what does not depend on S, ``draw`` (`Moments.draw`, or 0 for all connections) included, then
+        what grows with it, that of splats; with independent numbers, or with what ``stratified`` points leave
+        of it.
+        """
         base = self.base
         if stratified:
             # Not of splats, which land in pixels by chance: 0.2 to 1.3 is left of these in 22 scenes. (Mean
@@ -76,10 +80,12 @@ class Moments:
         return np.stack([base + draw, self.light], axis=1)
 
     def _left_by_points(self):
-        """What the points of a pixel leave of the variance, by weighting: of what nets of `NET` leave, see
-        `OWN_GAIN`, what 64 leave. (Fitted to pilots with nets of 64 points in 32 scenes: where 8 leave 0.65
-        these leave 0.65 of it again, at 0.3 half, at 0.05 a third, at 0.01 a fifth, within a factor of 1.6 in
-        all but four.)"""
+        """What the points of a pixel leave of the variance, by weighting.
+
+        Of what nets of `NET` leave, see `OWN_GAIN`, what 64 leave. (Fitted to pilots with nets of 64 points
+        in 32 scenes: where 8 leave 0.65 these leave 0.65 of it again, at 0.3 half, at 0.05 a third, at 0.01 a
+        fifth, within a factor of 1.6 in all but four.)
+        """
         possible = np.isfinite(self.base).all(axis=0)
         common = self.gain[possible].mean() if possible.any() else 1.0
         gain = self.gain**OWN_GAIN * common ** (1 - OWN_GAIN)
@@ -97,16 +103,18 @@ class Moments:
             return share * a + (1 - share) * b
 
         rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
-        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*ARRAYS, "mean")}
+        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean")}
         return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Camera samples, one row each: the ``estimate`` of each weighting, sums of second moments (``moment``
-    without t <= 1, less the squares that are in the estimate, ``light`` by t <= 1), what drawing one
-    connection adds (``draw``), the fine ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in
-    nets each `NETS` times `NET`."""
+    """Camera samples of a pilot, one row each.
+
+    The ``estimate`` of each weighting, sums of second moments (``moment`` without t <= 1, less the squares
+    that are in the estimate, ``light`` by t <= 1), what drawing one connection adds (``draw``), the fine
+    ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in nets each `NETS` times `NET`.
+    """
 
     estimate: np.ndarray
     moment: np.ndarray
@@ -114,58 +122,61 @@ class Samples:
     draw: np.ndarray
     tile: np.ndarray
 
-    def of(self, chosen) -> Samples:
-        """Those rows that the mask ``chosen`` says."""
-        return Samples(*(getattr(self, f.name)[chosen] for f in fields(self)))
+    @staticmethod
+    def of_rows(rows: np.ndarray) -> Samples:
+        """Those of a pilot's rows of `rows.SAMPLE`."""
+        found = {f.name: SAMPLE.of(rows, f.name) for f in fields(Samples)}
+        return Samples(**found | {"tile": found["tile"][:, 0].astype(int)})
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Sums of the splats of so many ``lanes`` light subpaths, by the group of the subpath and fine tile,
-    shape (`GROUPS`, fine tiles, columns). Which columns are what: their ``size``, and second moments by
-    weighting, as in `Samples`; ``rare`` that of ``moment`` which points do not help."""
+    """Sums of the splats of so many ``lanes`` light subpaths.
+
+    By the group of the subpath and fine tile: shape (`GROUPS`, fine tiles, `rows.SPLAT`).
+    """
 
     sums: np.ndarray
     lanes: int
-    size: slice
-    moment: slice
-    rare: slice
-    light: slice
 
 
 def group(lane):
-    """The independent part to which a sample, or the light subpath of a lane, belongs. The `PER_PIXEL`
-    samples of a pixel, whose products are taken, are in the same."""
+    """The independent part to which a sample, or the light subpath of a lane, belongs.
+
+    The `PER_PIXEL` samples of a pixel, whose products are taken, are in the same.
+    """
     return lane // PER_PIXEL % GROUPS
 
 
 def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) -> Moments:
-    """The moments of a pilot of independent ``samples``, and ``nets``, with ``splats`` as if of one light
-    subpath per camera sample; ``rays`` per camera sample."""
+    """The moments of a pilot of independent ``samples``, and ``nets``.
+
+    ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample.
+    """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
-    sizes = splats.sums[:, :, splats.size].sum(axis=2) / splats.lanes
+    sizes = SPLAT.of(splats.sums, "size").sum(axis=2) / splats.lanes
     groups = group(np.arange(count))
     inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
     weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
     of_sample = inverse[groups % 2, samples.tile][:, None]
 
-    def summed(values, columns=slice(0)):
+    def summed(values, of_splats=None):
         """By group, one column per weighting: those that have no use for ``values`` come first."""
-        total = weighted[:, columns]
+        total = SPLAT.of(weighted, of_splats) if of_splats else weighted[:, :0]
         if values is not None:
             of_samples = _by_group(values * of_sample) * (GROUPS / count)
             total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
     estimate = samples.estimate
-    base = summed(estimate**2 + samples.moment - estimate * _other(estimate), splats.moment)
+    base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
     return Moments(
         base=np.where(base < RULED_OUT, base, np.inf),
-        rare=summed(None, splats.rare),
-        light=summed(samples.light, splats.light),
+        rare=summed(None, "rare"),
+        light=summed(samples.light, "light"),
         draw=summed(samples.draw),
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
@@ -188,8 +199,9 @@ def _by_group(values):
 
 
 def _norms(samples: Samples, half, splats):
-    """What squared errors are divided by, of each fine tile: the squared brightness, and a hundredth of that
-    of the image, as relMSE has it.
+    """What squared errors are divided by, of each fine tile.
+
+    The squared brightness, and a hundredth of that of the image, as relMSE has it.
 
     Shape (2, tiles): for each half of the samples, told by ``half`` (0 or 1 each), fine tiles have the
     brightness that the other half has found: an outlier would hide itself. ``splats`` of the halves, shape

@@ -1,7 +1,7 @@
 """A pilot: a few thousand bidirectional samples that tell the variance of every way to render.
 
-Whether light subpaths and inner connections pay is decided per image (`choose`), by cost times
-variance of each `Candidate`: path tracing alone, with light tracing, with inner connections, each with
+Whether light subpaths and inner connections pay is decided per image (`choice.choose`), by cost times
+variance of each candidate: path tracing alone, with light tracing, with inner connections, each with
 several numbers S of camera subpaths per light subpath and several coefficients.
 
 All variances come from the *same* samples, which use every strategy (S = 1, all inner connections, balance
@@ -27,7 +27,7 @@ All is relative to the brightness of the place: a splat in a shadow weighs as mu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -36,9 +36,12 @@ import numpy as np
 from ..sampling.points import Points
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
-from ..transport.kernel import COUNTERS, Kernel, trace
+from ..transport.counters import COUNTERS, Counters, one
+from ..transport.kernel import Kernel, trace
 from . import moments
+from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
+from .rows import SAMPLE, SPLAT, SUMS, Layout
 
 # A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
 # many as a sample of the pilot stands for: what a render is not likely to meet is missing from its image, not
@@ -64,73 +67,16 @@ LIGHT_TIMES = 4
 SELDOM = 16
 
 
-@dataclass(frozen=True)
-class Weighting:
-    """Coefficients kappa of the classes `mis.CLASSES`, relative to the densities of one sample each."""
-
-    hit: float
-    direct: float
-    light: float
-    inner: float
-
-    def of(self, kind: str) -> float:
-        """kappa of a class."""
-        return getattr(self, kind)
-
-    @property
-    def combination(self) -> str:
-        """``n0c0`` path tracing alone, ``n1c0`` with light tracing, ``n1c1`` with inner connections."""
-        return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
-
-
-# In this order: each class is in use from some weighting on.
-WEIGHTINGS = (
-    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
-    *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
-    *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
-)
-_USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
-
-
-def _slices(parts: dict) -> dict:
-    """Where the columns of each part are."""
-    ends = np.cumsum(list(parts.values())).tolist()
-    return {name: slice(end - parts[name], end) for name, end in zip(parts, ends, strict=True)}
-
-
-# Of `kernel.COUNTERS`, what light subpaths count alone.
+# Of `Counters`, what light subpaths count alone.
 _OF_LIGHT = ("light", "shadow_t1")
 
 
-def _even(n: int) -> int:
-    return n + n % 2
-
-
-# What a lane keeps: for each weighting its estimate, and the second moments of its contributions without
-# t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
-# with inner connections what drawing one adds; then the number of its vertices that were joined; its tile.
-_PARTS = {
-    "estimate": len(WEIGHTINGS),
-    "moment": len(WEIGHTINGS),
-    "light": _USERS["light"],
-    "draw": _USERS["inner"],
-}
-_COLUMNS = _even(sum(_PARTS.values()) + 2)
-# The size of splats, their second moments without t <= 1, those of them that are rare (see `SELDOM`), and
-# their second moments by t <= 1.
-_SPLAT_PARTS = {
-    "size": 1,
-    "moment": len(WEIGHTINGS),
-    "rare": len(WEIGHTINGS),
-    "light": _USERS["light"],
-}
-_SPLAT_COLUMNS = _even(sum(_SPLAT_PARTS.values()))
-
-
 class Pilot:
-    """Sink (see `sink`) of a pilot's contributions: those of a ``batch``, in which of camera samples that
-    follow one another each `PER_PIXEL` are of the same pixel, in nets each `batch.NETS` times
-    `batch.NET`."""
+    """Sink (see `sink`) of a pilot's contributions.
+
+    Those of a ``batch``, in which of camera samples that follow one another each `PER_PIXEL` are of the same
+    pixel, in nets each `batch.NETS` times `batch.NET`.
+    """
 
     alpha = False
 
@@ -138,13 +84,13 @@ class Pilot:
         self._region, self._lanes = region, batch.lanes
         self._first_net = batch.pixels * batch.samples
         self._least = dr.opaque(mi.Float64, 1 / rarest)
-        self._samples = dr.zeros(mi.Float64, batch.size * _COLUMNS)
-        self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * _SPLAT_COLUMNS)
+        self._samples = dr.zeros(mi.Float64, batch.size * SAMPLE.width)
+        self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * SPLAT.width)
         dr.make_opaque(self._samples, self._splats)
 
     def begin(self):
         """Nothing found yet."""
-        return {name: _none(n) for name, n in _PARTS.items()} | {"joined": mi.UInt32(0)}
+        return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {"joined": mi.UInt32(0)}
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2."""
@@ -152,7 +98,7 @@ class Pilot:
         new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
-    def connect(self, kernel, z, lane, stream, counters, total, start):
+    def connect(self, kernel, z, lane, stream, total, start):
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c, visible, total):
@@ -161,33 +107,34 @@ class Pilot:
             new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
             return {name: _sums(total[name], more) for name, more in new.items()}
 
-        tested = mi.UInt32(counters["shadow_inner"])  # which `connect_all` changes in place
-        found = {"unshadowed": _none(_PARTS["draw"]), "visible": _none(_PARTS["draw"])}
+        found = {name: _none(SAMPLE.parts["draw"]) for name in ("unshadowed", "visible")}
         found |= {name: total[name] for name in ("moment", "light")}
-        found = connections.connect_all(kernel, z, lane.path, counters, found, add)
+        found, counted = connections.connect_all(kernel, z, lane.path, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
-        joined = total["joined"] + dr.select(counters["shadow_inner"] > tested, mi.UInt32(1), 0)
+        joined = total["joined"] + one(counted.shadow_inner > 0)
         # In the order of `begin`, as a loop's state has to be.
-        return total | found | {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        return total | found, counted
 
-    def splat(self, kernel, c, position, shared, counters):
+    def splat(self, kernel, c, shared) -> Counters:
         """Add a contribution with t <= 1."""
         size = self._size(c)
-        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(position)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(c.position)
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
-        columns = [x for name in _SPLAT_PARTS for x in found[name]]
-        _add(self._splats, _SPLAT_COLUMNS, columns, row, size > 0)
+        _add(self._splats, SPLAT, found, row, size > 0)
+        return Counters()
 
-    def end(self, kernel, lane, sample, total, seen, counters):
+    def end(self, kernel, lane, sample, total, seen) -> Counters:
         """Add a camera sample."""
-        columns = [x for name in _PARTS for x in total[name]]
         slot = dr.arange(mi.UInt32, self._lanes)
-        columns += [mi.Float64(total["joined"]), mi.Float64(self._tile(sample.start.position))]
-        _add(self._samples, _COLUMNS, columns, slot, sample.covered)
+        others = {"joined": total["joined"], "tile": self._tile(sample.start.position)}
+        found = total | {name: [mi.Float64(value)] for name, value in others.items()}
+        _add(self._samples, SAMPLE, found, slot, sample.covered)
+        return Counters()
 
     def evaluate(self, counts):
         """Run what was recorded, and ``counts`` with it."""
@@ -195,25 +142,23 @@ class Pilot:
 
     def moments(self, counts: dict) -> Moments:
         """What was found; ``counts`` what the lanes counted."""
-        rows = np.array(self._samples).reshape(-1, _COLUMNS)
-        columns = [rows[:, part] for part in _slices(_PARTS).values()]
-        joined, tiles = rows[:, sum(_PARTS.values()) :][:, :2].T
-        columns.append(tiles.astype(int))
-        independent, nets = (
-            moments.Samples(*(column[part] for column in columns))
-            for part in (slice(self._first_net), slice(self._first_net, None))
-        )
-        sums = np.array(self._splats).reshape(GROUPS, FINE**2, _SPLAT_COLUMNS)
-        splats = moments.Splats(sums, self._lanes, **_slices(_SPLAT_PARTS))
+        rows = np.array(self._samples).reshape(-1, SAMPLE.width)
+        parts = slice(self._first_net), slice(self._first_net, None)
+        independent, nets = (moments.Samples.of_rows(rows[part]) for part in parts)
+        sums = np.array(self._splats).reshape(GROUPS, FINE**2, SPLAT.width)
+        splats = moments.Splats(sums, self._lanes)
         rays = {
             name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
         }
-        rays["joined"] = joined.mean()
+        rays["joined"] = SAMPLE.of(rows, "joined").mean()
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
     def _parts(self, size, c):
-        """A contribution ``c`` of this weighted ``size``: its estimates, of the weightings that have its
-        class, and a dictionary of what it adds to ``moment`` and ``light``, see `_PARTS`."""
+        """What a contribution ``c`` of this weighted ``size`` adds.
+
+        Its estimates, of the weightings that have its class, and a dictionary of what it adds to ``moment``
+        and ``light``, see `rows.SAMPLE`.
+        """
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
         own, squares, lights = [], [], []
@@ -237,9 +182,11 @@ class Pilot:
         return own, {"moment": squares, "light": lights}
 
     def _rare(self, size, c, squares) -> list:
-        """Of the ``squares`` that a contribution of light tracing adds to ``moment`` those of paths that
-        camera subpaths make too rarely for points to help, see `SELDOM`. (Not light that comes from a lamp
-        without a detour: every camera sample finds it with s = 1, if that can find it at all.)"""
+        """Of the ``squares`` of a contribution of light tracing, those that points do not help.
+
+        They are of paths that camera subpaths make too rarely, see `SELDOM`. (Not light that comes from a
+        lamp without a detour: every camera sample finds it with s = 1, if that can find it at all.)
+        """
         shares = _shares(size, c) | {"light": 0}
         often = (c.s == 2) & (shares["direct"] > 0)
         return [
@@ -248,8 +195,10 @@ class Pilot:
         ]
 
     def _size(self, c):
-        """Weighted size of a contribution that counts, in double precision: its square, in any unit of
-        radiance, is too large or too small for single (at 1e12 outliers are, at 1e20 all).
+        """Weighted size of a contribution that counts, in double precision.
+
+        Its square, in any unit of radiance, is too large or too small for single (at 1e12 outliers are, at
+        1e20 all).
 
         Emitters seen directly do not count: relative to what is around them their edges would outweigh all
         else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
@@ -264,8 +213,10 @@ class Pilot:
 
 
 def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
-    """Run a pilot of about ``lanes`` camera samples, spread over the image, each of which ``stands_for`` so
-    many of the render."""
+    """Run a pilot of about ``lanes`` camera samples, spread over the image.
+
+    Each of them ``stands_for`` so many of the render.
+    """
     everything = replace(
         plan,
         connections="none" if plan.connections == "none" else "all",
@@ -295,10 +246,13 @@ def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RARE
     return replace(found, rays=found.rays | known)
 
 
-def _add(target, columns: int, values, row, active):
-    """Add ``values`` to a row of ``target``; as a packet, which takes an even number of them. (`dr.scatter`
-    would evaluate what was recorded so far.)"""
-    packet = mi.ArrayXd(values + [mi.Float64(0)] * (columns - len(values)))
+def _add(target, layout: Layout, found: dict, row, active):
+    """Add what was ``found`` to a row of ``target``, as a packet.
+
+    (`dr.scatter` would evaluate what was recorded so far.)
+    """
+    values = layout.row(found)
+    packet = mi.ArrayXd(values + [mi.Float64(0)] * (layout.width - len(values)))
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
 
 
@@ -318,8 +272,10 @@ def _none(n: int) -> list:
 
 
 def _sums(total: list, more: list) -> list:
-    """``total`` with ``more``, which has an entry for the last weightings only, added to these. What gets
-    nothing is left as it is: loops do not hold it, see `walk.Walk`."""
+    """``total`` with ``more``, which has an entry for the last weightings only, added to these.
+
+    What gets nothing is left as it is: loops do not hold it, see `walk.Walk`.
+    """
     first = len(total) - len(more)
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 

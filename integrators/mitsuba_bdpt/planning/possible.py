@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import Enum
+
 from ..settings import DEFAULT_STORED, Settings
 from ..transport.plan import Plan
 
@@ -121,29 +124,56 @@ def _why_not_arrival(emitters, camera, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
-def unreachable_paths(prepared, p: Plan, settings: Settings) -> list[str]:
-    """Paths that no strategy in use can make, one text each."""
+class Start(Enum):
+    """Where paths begin that no camera subpath finds: neither by a hit nor by next-event estimation."""
+
+    DELTA_EMITTER = "a delta emitter seen through delta surfaces"
+    BEAM = "directionalarea, which emits into one direction"
+
+
+class Rest(Enum):
+    """What follows such a start on paths that only some strategies can make."""
+
+    SEEN_SURFACE = "a surface that is not delta, seen by the sensor"
+    SURFACES = "two surfaces or more that are not delta, then delta surfaces or none"
+    SURFACE_BETWEEN_DELTA = "a single surface that is not delta, then delta surfaces"
+    SENSOR = "the sensor itself"
+    LONG = "any, on paths longer than light subpaths are stored"
+
+
+@dataclass(frozen=True)
+class UnreachablePaths:
+    """Paths that no strategy in use makes: from one of the ``starts`` by the ``rest``.
+
+    ``needs`` is the strategy that would make them, empty if there is none. ``longest``, for `Rest.LONG`: the
+    number of edges beyond which they are not made.
+    """
+
+    starts: tuple[Start, ...]
+    rest: Rest
+    needs: str = ""
+    longest: int = 0
+
+
+def unreachable_paths(prepared, p: Plan, settings: Settings) -> tuple[UnreachablePaths, ...]:
+    """Paths that no strategy in use can make.
+
+    The order is always the same, so that two answers can be compared. In words: `explain.words`.
+    """
     emitters, camera = prepared.emitters, prepared.camera
     lost = []
     deltas = prepared.delta and emitters.unhittable
-    starts = ["delta emitter, delta surfaces"] * deltas + ["directionalarea"] * emitters.beams
+    starts = (Start.DELTA_EMITTER,) * deltas + (Start.BEAM,) * emitters.beams
     if not p.arrival:  # t = 0 finds all that follow
         for start in starts:
             if not p.splat:
-                lost.append(f"{start}, a surface that the sensor sees (needs t=1)")
+                lost.append(UnreachablePaths((start,), Rest.SEEN_SURFACE, "t=1"))
             if p.connections == "none":
-                lost.append(
-                    f"{start}, two other surfaces or more, delta surfaces or none, sensor "
-                    "(needs inner connections)"
-                )
+                lost.append(UnreachablePaths((start,), Rest.SURFACES, "inner connections"))
         if deltas:
-            lost.append(
-                "delta emitter, delta surfaces, a single other surface, delta surfaces, sensor (no two "
-                "neighbours can be joined)"
-            )
-        if not camera.delta and (deltas or emitters.beams):
-            lost.append(f"{' or '.join(starts)}, sensor (needs t=0)")
+            lost.append(UnreachablePaths((Start.DELTA_EMITTER,), Rest.SURFACE_BETWEEN_DELTA))
+        if not camera.delta and starts:
+            lost.append(UnreachablePaths(starts, Rest.SENSOR, "t=0"))
     if starts and p.light and settings.stored_vertices < settings.max_depth:
-        longest = settings.stored_vertices
-        lost.append(f"{' or '.join(starts)}, ... on paths longer than {longest} edges (stored_vertices)")
-    return lost
+        lost.append(UnreachablePaths(starts, Rest.LONG, longest=settings.stored_vertices))
+    return tuple(lost)

@@ -1,4 +1,4 @@
-"""Which samples are traced when: a render as a sequence of passes, a pass as one or several launches."""
+"""Schedules a render as passes and kernel launches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PASS_SAMPLES_SAMPLER = 1 << 20
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
 
-# Samples per pixel of each of the first `REPLICATES` under ``until_error``.
+# Samples per pixel of each of the first `REPLICATES` under ``target_error``.
 FIRST_REPLICATE = 4
 
 
@@ -50,8 +50,11 @@ def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) 
 
 @dataclass(frozen=True)
 class Step:
-    """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate, whose last it
-    may be; ``replicate`` counts the independent images that `variance` needs, else 0."""
+    """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate.
+
+    ``last``: whether it ends the replicate; ``replicate`` counts the independent images that `variance`
+    needs, else 0.
+    """
 
     replicate: int
     done: int
@@ -64,7 +67,7 @@ def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) ->
     """All passes of a render of ``spp`` samples per pixel; ``small_first`` see `pass_sizes`."""
     parts = [spp]
     if settings.variance:
-        parts = _replicates(spp, bool(settings.until_error))
+        parts = _replicates(spp, bool(settings.target_error))
     steps = []
     for replicate, part in enumerate(parts):
         done = 0
@@ -75,8 +78,11 @@ def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) ->
 
 
 def _replicates(spp: int, growing: bool) -> list[int]:
-    """Samples per pixel of the replicates: `REPLICATES` of them, or, if ``growing``, groups of so many, each
-    group as large as all before it, so that half of the samples lie in few long sequences."""
+    """Samples per pixel of the replicates: `REPLICATES` of them.
+
+    Or, if ``growing``, groups of so many, each group as large as all before it, so that half of the samples
+    lie in few long sequences.
+    """
     sizes = []
     while (left := spp - sum(sizes)) > 0:
         group = min(left, max(sum(sizes), REPLICATES * FIRST_REPLICATE)) if growing else left

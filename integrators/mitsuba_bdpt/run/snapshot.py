@@ -5,35 +5,57 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 
+from .._version import __version__
 from ..errors import CommandError, UsageError
-from ..image.spread import restored, stored
+from ..image.accumulator import Accumulator
+from ..settings import Settings
+from .progress import Progress
 
 # Of what a snapshot holds; another number with every change of that.
-FORMAT = 4
+FORMAT = 5
 
-# What is added up where snapshots are joined, and what is kept as the first one has it.
-_SUMMED = ("counts", "compiled", "cached", "seconds", "compile_seconds", "pilot_seconds")
+
+def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:
+    """What two renders have to have in common for one to go on from the other, as JSON holds it.
+
+    The scene is not in it.
+    """
+    film, values = accumulator.film, asdict(settings)
+    del values["timeout"]
+    values["target_error"] = bool(settings.target_error)  # the passes depend on whether there is one
+    values |= {
+        "version": __version__,
+        "format": FORMAT,
+        "variant": mi.variant(),
+        "seed": seed,
+        "spp": spp,
+        "film": [film.class_name(), *accumulator.size, *accumulator.offset],
+        "filter": str(film.rfilter()),
+        "colours": list(accumulator.colour.names),
+    }
+    return json.loads(json.dumps(values))
 
 
 @dataclass(frozen=True)
 class Snapshot:
     """The raw sums of the passes that are done, and all that the next pass depends on.
 
-    ``identity`` says of which render: variant, parameters, seed, samples per pixel, film; plain values, as
-    ``progress`` (decisions, counts, seconds, …). ``passes``: samples per pixel of each. ``arrays``, all in
-    double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums, see
-    `accumulator.Accumulator`; flat), ``inverse_threshold`` of roulette, ``moments.*`` of the pilots,
-    ``replicates.*`` of the variance. The scene is not part of it: whoever goes on has to bring the same one.
+    ``identity`` says of which render, see `identity`; ``passes``: samples per pixel of each. ``arrays``, all
+    in double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums, see
+    `accumulator.Accumulator`; flat), ``inverse_threshold`` of roulette, ``replicates.last.*``, the sums after
+    the last replicate of the variance. The scene is not part of it: whoever goes on has to bring the same
+    one.
     """
 
     identity: dict
     passes: tuple[int, ...]
-    progress: dict
+    progress: Progress
     arrays: dict
 
     @property
@@ -52,8 +74,10 @@ class Snapshot:
                 )
 
     def joined(self, other: Snapshot) -> Snapshot:
-        """Both as one render: sums and counts are added. Raises ``ValueError`` if they differ in more than
-        seed and samples per pixel, or have a seed in common."""
+        """Both as one render: sums and counts are added.
+
+        Raises `UsageError` if they differ in more than seed and samples per pixel, or have a seed in common.
+        """
         self.check(other.identity, ("seed", "spp"))
         seeds, others = _seeds(self), _seeds(other)
         if common := set(seeds) & set(others):
@@ -61,9 +85,6 @@ class Snapshot:
                 f"seed={min(common)} is in both snapshots; joined renders need seeds of their own"
             )
         spp = self.identity["spp"] + other.identity["spp"]
-        progress = self.progress | {
-            name: _added(self.progress[name], other.progress[name]) for name in _SUMMED
-        }
         arrays = {
             name: self.arrays[name] + other.arrays[name]
             for name in ("camera", "light", "strategies")
@@ -72,20 +93,21 @@ class Snapshot:
         return Snapshot(
             identity=self.identity | {"seed": seeds + others, "spp": spp},
             passes=self.passes + other.passes,
-            progress=progress | {"whole": False, "replicates": _joined_replicates(self, other, arrays)},
+            progress=self.progress.joined(other.progress),
             arrays=arrays,
         )
 
     def image_only(self) -> Snapshot:
         """What an image is made of, to be sent elsewhere and joined; a render cannot go on from it."""
-        kept = {n: a for n, a in self.arrays.items() if not n.startswith(("moments.", "replicates.last"))}
-        return replace(self, progress=self.progress | {"whole": False}, arrays=kept)
+        kept = {n: a for n, a in self.arrays.items() if not n.startswith("replicates.last.")}
+        return replace(self, progress=self.progress.image_only(), arrays=kept)
 
     def to_bytes(self) -> bytes:
         """As a file of NumPy's ``npz`` format, without pickled objects."""
-        text = json.dumps({"identity": self.identity, "passes": self.passes, "progress": self.progress})
+        progress, arrays = self.progress.stored()
+        text = json.dumps({"identity": self.identity, "passes": self.passes, "progress": progress})
         file = io.BytesIO()
-        np.savez(file, snapshot=np.array(text), **self.arrays)
+        np.savez(file, snapshot=np.array(text), **self.arrays, **arrays)
         return file.getvalue()
 
     @staticmethod
@@ -95,9 +117,16 @@ class Snapshot:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
             values = json.loads(str(arrays.pop("snapshot")))
-            return Snapshot(values["identity"], tuple(values["passes"]), values["progress"], arrays)
+            identity, passes = values["identity"], tuple(values["passes"])
+            if identity["format"] == FORMAT:
+                progress = Progress.restored(values["progress"], arrays)
+                return Snapshot(identity, passes, progress, arrays)
         except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise CommandError(f"not a snapshot: {type(error).__name__} {error}") from error
+        raise CommandError(
+            f"a snapshot of another version of mitsuba-bdpt: its format is {identity['format']!r}, here it "
+            f"is {FORMAT}; go on with the version that it was begun with, or begin anew"
+        )
 
 
 def read(path: Path) -> Snapshot:
@@ -111,18 +140,3 @@ def read(path: Path) -> Snapshot:
 def _seeds(snapshot: Snapshot) -> list:
     seed = snapshot.identity["seed"]
     return list(seed) if isinstance(seed, list) else [seed]
-
-
-def _added(a, b):
-    return {name: a[name] + b[name] for name in a} if isinstance(a, dict) else a + b
-
-
-def _joined_replicates(a: Snapshot, b: Snapshot, arrays: dict):
-    """Replicates of both, whose means and squares go to ``arrays``."""
-    first, second = a.progress["replicates"], b.progress["replicates"]
-    if first is None:
-        return None
-    halves = zip(restored(first, a.arrays), restored(second, b.arrays), strict=True)
-    found, progress = stored([mine.joined(other) for mine, other in halves])
-    arrays |= found
-    return progress

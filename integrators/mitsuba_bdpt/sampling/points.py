@@ -10,7 +10,7 @@ Every draw names its purpose and the vertex it serves, so that the point set can
 * ``sampler``: the scene's own sampler for the first dimensions, see `SAMPLER_TABLE`; more would take
   memory and gain little. A path takes each number from another pixel's sequence of the sampler:
   those of one sequence are correlated (0.92 for ``stratified`` at 4 samples, 0.25 for ``ldsampler``
-  at any number), which would bias the image. Figures: docs/samplers.md.
+  at any number), which would bias the image. Figures: docs/user/samplers.md.
 * ``independent``: hashed numbers throughout.
 
 All else is hashed: a number is a function of seed, sample, vertex and purpose, so that no
@@ -96,13 +96,15 @@ SAMPLER_TABLE = (
 
 @dataclass
 class Stream:
-    """One subpath's numbers: ``digits`` its place in the Sobol' sequence (reversed index), ``seed``
-    the sequence's, ``key`` of the hashed numbers, ``first`` the scene sampler's numbers by (purpose,
-    vertex). ``UInt32``, unchanged along the subpath."""
+    """The random numbers of one subpath; ``UInt32``, unchanged along the subpath.
 
-    digits: object
-    seed: object
-    key: object
+    ``digits`` is its place in the Sobol' sequence (reversed index), ``seed`` the sequence's, ``key`` that of
+    the hashed numbers, ``first`` the scene sampler's numbers by (purpose, vertex).
+    """
+
+    digits: mi.UInt32
+    seed: mi.UInt32
+    key: mi.UInt32
     first: dict
 
 
@@ -117,7 +119,7 @@ class Points:
         self.kind = kind
         self.seed = seed
         self._table = None
-        if kind == "sampler":
+        if sampler is not None:
             self._table = [
                 sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in SAMPLER_TABLE
             ]

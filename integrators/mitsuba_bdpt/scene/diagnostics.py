@@ -1,5 +1,7 @@
-"""Numbers among a scene's parameters that spoil images: reflectances above 1, spots that rounding changes,
-and what is not finite."""
+"""Diagnostics: parameters of a scene that spoil images.
+
+Reflectances above 1, spots that rounding changes, and values that are not finite.
+"""
 
 from __future__ import annotations
 
@@ -32,16 +34,21 @@ _QUICKLY_READ = 1 << 17
 
 @dataclass(frozen=True)
 class _Scale:
-    """A texture that scales what a BSDF scatters, the parameter ``name``; ``owners``: the texture, that BSDF
-    and the objects around it, the innermost first."""
+    """A texture that scales what a BSDF scatters, the parameter ``name``.
+
+    ``owners``: the texture, that BSDF and the objects around it, the innermost first.
+    """
 
     owners: tuple
     name: str
 
 
 def non_conserving_bsdfs(owners) -> list[str]:
-    """What returns more light than it receives among ``owners``, BSDFs or shapes with a BSDF, and the BSDFs
-    inside them, as far as their parameters tell, in words."""
+    """Return the BSDFs that are not energy-conserving, in words.
+
+    Found among ``owners``, BSDFs or shapes with a BSDF, and the BSDFs inside them, as far as their parameters
+    tell.
+    """
     scales = _scales([(owner,) for owner in owners])
     most = max(_QUICKLY_READ // max(len(scales), 1), 1)
     found = [(scale, _largest(scale.owners[0], most)) for scale in scales]
@@ -132,8 +139,10 @@ def not_finite(scene) -> list[str]:
 
 
 def _in_words(name: str, held) -> str:
-    """The ``name`` of a parameter of a scene that has ``held`` these objects: Mitsuba calls one without id by
-    its address, which tells nothing."""
+    """Return the ``name`` of a parameter of a scene in words.
+
+    ``held`` are the scene's objects: Mitsuba names one without id by its address, which identifies nothing.
+    """
     first, _, rest = name.partition(".")
     owner = held.get(first)
     return f"{rest} of an object {named(owner)}" if isinstance(owner, mi.Object) and not owner.id() else name

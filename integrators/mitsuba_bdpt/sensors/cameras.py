@@ -28,20 +28,23 @@ KINDS = ("PerspectiveCamera", "ThinLensCamera")
 
 @dataclass
 class _View:
-    """One camera, or a table of them: rows of the transforms (``Vector4f``), the affine map from (x/z, y/z)
-    to the unit square and back (four numbers each) and where it maps (0, 0), ``area`` at z = 1 of the
-    region, clip planes, ``radius`` of the lens, distance of the plane in ``focus``."""
+    """One camera, or a table of them.
+
+    Rows of the transforms (``Vector4f``), the affine map from (x/z, y/z) to the unit square and back (four
+    numbers each) and where it maps (0, 0), ``area`` at z = 1 of the region, clip planes, ``radius`` of the
+    lens, distance of the plane in ``focus``.
+    """
 
     to_camera: list
     to_world: list
     to_film: list
     from_film: list
-    origin: object
-    area: object
-    near: object
-    far: object
-    radius: object
-    focus: object
+    origin: mi.Point2f
+    area: mi.Float
+    near: mi.Float
+    far: mi.Float
+    radius: mi.Float
+    focus: mi.Float
 
     @staticmethod
     def of(values) -> _View:
@@ -161,9 +164,11 @@ class Camera(Sensor):
         )
 
     def _project(self, index, view, outward, lens):
-        """Film position of the direction ``outward`` (world) from the point ``lens`` of the lens (camera
-        coordinates: in the world's, far from the origin, rounding would move it), its depth along the axis,
-        and whether it lies in the region."""
+        """Return the film position of a direction, its depth along the axis, and whether it is in the region.
+
+        ``outward`` is the direction (world) from the point ``lens`` of the lens (camera coordinates: in the
+        world's, far from the origin, rounding would move it).
+        """
         local = _transform(view.to_camera, outward, 0)
         depth = local.z
         x, y = local.x / depth, local.y / depth
@@ -179,8 +184,10 @@ class Camera(Sensor):
         return self.region.to_position(uv), depth, inside
 
     def hit(self, walk, vertex, distant) -> SensorHit:
-        """Where the walk's ray crosses the lens, which is no shape of the scene. What lies between the lens
-        and the near plane does not hide it: camera rays start there too."""
+        """Intersect the walk's ray with the lens, which is no shape of the scene.
+
+        What lies between the lens and the near plane does not hide it: camera rays start there too.
+        """
         view = self._view(mi.UInt32(0))
         centre = _transform(view.to_world, mi.Point3f(0), 1)
         o, d = (_transform(view.to_camera, v, 0) for v in (walk.previous - centre, walk.d))
@@ -193,13 +200,13 @@ class Camera(Sensor):
         within = distant | ((o.z >= view.near) & (o.z <= view.far))
         z0 = _transform(view.to_world, local, 1)
         position, _, inside = self._project(mi.UInt32(0), view, -walk.d, local)
-        pdf_area, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
+        pdf_a, pdf_w = dr.rcp(view.lens_area()), view.density(slope)
         return SensorHit(
             dist2=dr.square(distance),
             cos=slope,
-            pdf_area=pdf_area,
+            pdf_a=pdf_a,
             pdf_w=pdf_w,
-            importance=pdf_area * pdf_w / slope,
+            importance=pdf_a * pdf_w / slope,
             position=position,
             active=towards & on_lens & unhidden & within & inside,
             # Camera rays see the surroundings behind the far plane, and whatever is there does not hide them.
@@ -216,13 +223,13 @@ class Camera(Sensor):
 def _numbers(sensor, share: float):
     """What `_View.of` takes; ``share`` see `Region`."""
     lens = sensor.class_name() == KINDS[1]
-    prepared = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-    to_film, origin = _film_map(sensor, prepared)
+    to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    to_film, origin = _film_map(sensor, to_world)
     # Area at z = 1 that one crop window covers, times the share that a border adds.
     area = 1 / abs(np.linalg.det(to_film)) * share
     values = [
-        *np.linalg.inv(prepared)[:3].ravel(),
-        *prepared[:3].ravel(),
+        *np.linalg.inv(to_world)[:3].ravel(),
+        *to_world[:3].ravel(),
         *to_film.ravel(),
         *np.linalg.inv(to_film).ravel(),
         *origin,
@@ -239,12 +246,12 @@ def _transform(rows, v, w):
     return mi.Point3f(*(dr.dot(row.xyz, mi.Vector3f(v)) + row.w * w for row in rows))
 
 
-def _film_map(sensor, prepared):
+def _film_map(sensor, to_world):
     """Affine map from (x/z, y/z) in camera space to the crop window's unit square."""
     u = mi.Point2f([0, 1, 0], [0, 0, 1])
     ray, _ = sensor.sample_ray(0, 0.5, u, mi.Point2f(0.5))
     d = np.array(ray.d, dtype=np.float64)
-    local = np.linalg.inv(prepared[:3, :3]) @ d
+    local = np.linalg.inv(to_world[:3, :3]) @ d
     xy = (local[:2] / local[2]).T
     to_film = np.linalg.inv(np.stack([xy[1] - xy[0], xy[2] - xy[0]], axis=1))
     return to_film, -to_film @ xy[0]

@@ -15,9 +15,12 @@ UNTARGETED = "target = none"
 
 
 def prepare(sensor, shape_errors, bounded=True) -> Sensor:
-    """The sensor for one render of a scene that has surfaces (``bounded``) or none. Kinds that light vertices
-    cannot be joined with take part by camera subpaths alone, and say why. Raises ``NotImplementedError`` for
-    what Mitsuba itself cannot render."""
+    """Return the sensor for one render.
+
+    Of a scene that has surfaces (``bounded``) or none. Kinds that light vertices cannot be connected to take
+    part by camera subpaths alone, and say why. Raises ``UnsupportedError`` for what Mitsuba itself cannot
+    render.
+    """
     kind = sensor.class_name()
     if kind in cameras.KINDS:
         return cameras.Camera(sensor, [sensor])

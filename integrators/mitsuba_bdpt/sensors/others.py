@@ -80,8 +80,10 @@ class Orthographic(_Parallel):
 
 
 class Distant(_Parallel):
-    """A distant sensor without target: its rays cover a disk about the scene. Its film has one pixel, and a
-    position on the film means nothing."""
+    """A distant sensor without target: its rays cover a disk about the scene.
+
+    Its film has one pixel, and a position on the film means nothing.
+    """
 
     needs_aperture_sample = True
     needs_film_sample = True
@@ -115,10 +117,11 @@ class Distant(_Parallel):
 
 
 class IrradianceMeter(Sensor):
-    """An irradiance meter with one pixel: z_0 uniform on its shape (area measure), directions by the cosine
-    with the shading normal, W_e = 1 / area * (cosine with the shading over that with the geometric normal).
+    """An irradiance meter with one pixel.
 
-    The film position chooses z_0, as in Mitsuba.
+    z_0 is uniform on its shape (area measure), directions are distributed by the cosine with the shading
+    normal, W_e = 1 / area * (cosine with the shading normal over that with the geometric normal). The film
+    position chooses z_0, as in Mitsuba.
     """
 
     needs_aperture_sample = True
@@ -195,7 +198,7 @@ class IrradianceMeter(Sensor):
         return SensorHit(
             dist2=dr.squared_norm(si.p - walk.previous),
             cos=cos,  # as in `start` and `join`: weights of all strategies have the same idea of it
-            pdf_area=self._density,
+            pdf_a=self._density,
             pdf_w=cos * dr.inv_pi,
             importance=self._density * cos / vertex.cos,
             position=self.region.to_position(mi.Point2f(0.5)),
@@ -217,16 +220,11 @@ class RayOnlySensor(Sensor):
     def _start(self, uv, u_lens, shared) -> CameraStart:
         index, x = view_at(uv.x, len(self._views))
         uv = mi.Point2f(x, uv.y)
-        chosen = None
-        for i, view in enumerate(self._views):
-            ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
-            sampled = mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.Spectrum(weight)
-            chosen = (
-                sampled
-                if i == 0
-                else tuple(dr.select(index == i, new, old) for new, old in zip(sampled, chosen, strict=True))
-            )
-        ray, weight = chosen
+        ray, weight = _sampled(self._views[0], uv, u_lens, shared)
+        for i, view in enumerate(self._views[1:], 1):
+            chosen = index == i
+            other, other_weight = _sampled(view, uv, u_lens, shared)
+            ray, weight = dr.select(chosen, other, ray), dr.select(chosen, other_weight, weight)
         # The share of the wavelengths joins when the sample is added to the film.
         weight = dr.select(shared.weight != 0, weight / shared.weight, 0)
         return CameraStart(
@@ -236,3 +234,9 @@ class RayOnlySensor(Sensor):
             weight=weight,
             arrival=mi.Float(0),
         )
+
+
+def _sampled(view, uv, u_lens, shared):
+    """Ray and weight of a sensor of which only these are known."""
+    ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
+    return mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.Spectrum(weight)

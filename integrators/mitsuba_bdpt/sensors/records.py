@@ -13,19 +13,22 @@ from ..geometry import rays
 
 @dataclass
 class CameraStart:
-    """Start of a camera subpath: ``ray`` (for cameras on the near plane), ``p`` of z_0, ``pdf_w`` density of
-    the direction given z_0 (solid angle; of a parallel sensor, whose direction is fixed, the density of z_0
-    over the area across it), ``weight`` W_e cos / all densities, ``arrival`` cos / (density of z_0 *
-    ``pdf_w``), what t = 0 begins with (0 without area), ``position`` on the film in pixels, ``counted``
-    where the filter counts it (a box filter: at the pixel's corner, as Mitsuba does)."""
+    """Start of a camera subpath.
 
-    ray: object
-    p: object
-    pdf_w: object
-    weight: object
-    arrival: object
-    position: object = None
-    counted: object = None
+    ``ray`` (for cameras on the near plane), ``p`` of z_0, ``pdf_w`` density of the direction given z_0 (solid
+    angle; of a parallel sensor, whose direction is fixed, the density of z_0 over the area across it),
+    ``weight`` W_e cos / all densities, ``arrival`` cos / (density of z_0 * ``pdf_w``), what t = 0 begins with
+    (0 without area), ``position`` on the film in pixels, ``counted`` where the filter counts it (a box
+    filter: at the pixel's corner, as Mitsuba does).
+    """
+
+    ray: mi.Ray3f
+    p: mi.Point3f
+    pdf_w: mi.Float
+    weight: mi.Float | mi.Spectrum
+    arrival: mi.Float
+    position: mi.Point2f | None = None
+    counted: mi.Point2f | None = None
 
 
 @dataclass
@@ -41,34 +44,36 @@ class CameraJoin:
     clip planes.
     """
 
-    p: object
+    p: mi.Point3f
     anchor: rays.Anchor
-    d: object
-    dist2: object
-    importance: object
-    pdf_w: object
-    arrival: object
-    position: object
-    reach: object
-    valid: object
+    d: mi.Vector3f
+    dist2: mi.Float
+    importance: mi.Float
+    pdf_w: mi.Float
+    arrival: mi.Float
+    position: mi.Point2f
+    reach: mi.Float
+    valid: mi.Bool
 
 
 @dataclass
 class SensorHit:
-    """A light subpath that hits the sensor at z_0: ``dist2`` of its last edge, ``cos`` at z_0,
-    ``pdf_area`` density of z_0 (area measure) and ``pdf_w`` (solid angle) of the way back in camera
-    subpaths, ``importance`` W_e, ``position`` on the film in pixels, ``active``. ``surroundings`` see
-    `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light comes from infinity, None where
-    the subpath's own ray has said so."""
+    """A light subpath that hits the sensor at z_0.
 
-    dist2: object
-    cos: object
-    pdf_area: object
-    pdf_w: object
-    importance: object
-    position: object
-    active: object
-    surroundings: object = None
+    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_a`` density of z_0 (area measure) and ``pdf_w``
+    (solid angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
+    ``active``. ``surroundings`` see `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light
+    comes from infinity, None where the subpath's own ray has shown it.
+    """
+
+    dist2: mi.Float
+    cos: mi.Float
+    pdf_a: mi.Float
+    pdf_w: mi.Float
+    importance: mi.Float
+    position: mi.Point2f
+    active: mi.Bool
+    surroundings: mi.Ray3f | None = None
 
 
 class Region:

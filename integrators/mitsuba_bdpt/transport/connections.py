@@ -8,15 +8,17 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _one, _roulette, _size, count, finite
-from .light_path import LightPath, read_light_vertex
+from .contribution import Contribution, _counts, _roulette, _size, finite
+from .counters import Counters, one
+from .light_path import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
 
 
-def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
+def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
     """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41).
 
-    ``active`` where the contribution is not zero.
+    ``active`` where the contribution is not zero. The throughputs of ``z`` and ``y`` contain the edges to
+    them; that of ``y`` is over its cosine of incidence, so that of its adjoint factor |n.d| alone is missing.
     """
     h = kernel.heuristic
     k = z.edges + y.edges + 1
@@ -29,8 +31,8 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
     cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
     f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active, kernel.traits)
-    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y / y.cos)
-    value = (z.throughput * f_z.value) * (f_y.value * y.throughput) * inverse
+    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y)
+    value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~bsdf.is_zero(value)
 
     light_side = mis.alternatives(
@@ -52,21 +54,20 @@ def inner(kernel, z: Vertex, y: Vertex) -> Contribution:
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
 
 
-def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
+def connect_all(kernel, z: Vertex, path: LightPath, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
     ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
-    ``visible``: it is active and nothing is in between.
+    ``visible``: it is active and nothing is in between. Returns the ``total`` and `Counters`.
     """
 
     def body(slot, total, nonzero, lost):
         y = read_light_vertex(kernel, path, slot)
-        counted = {"non_finite": lost}
-        c = finite(inner(kernel, z, y), counted)
-        nonzero = nonzero + _one(c.active)
+        c = finite(inner(kernel, z, y))
+        nonzero = nonzero + one(c.active)
         ray, own = _sight(kernel, z, y)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
-        return slot + 1, add(c, visible, total), nonzero, counted["non_finite"]
+        return slot + 1, add(c, visible, total), nonzero, lost + c.counted.non_finite
 
     candidates = candidate_count(kernel, z, path)
     _, total, nonzero, lost = dr.while_loop(
@@ -75,24 +76,21 @@ def connect_all(kernel, z: Vertex, path: LightPath, counters, total, add):
         body,
         label="inner connections",
     )
-    counters["non_finite"] += lost
-    counters["evaluated"] += candidates
-    counters["zero"] += candidates - nonzero
-    counters["shadow_inner"] += nonzero
-    return total
+    counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
+    return total, counted
 
 
-def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
+def connect_one(kernel, z: Vertex, path: LightPath, stream):
     """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
 
     The draw is a running one over all candidates; the estimate is that of all of them. One random
-    number serves the whole draw: what is left of it after each decision is uniform again.
+    number serves the whole draw: what is left of it after each decision is uniform again. Returns what it
+    adds to the sample, weighted, and `Counters`.
     """
 
     def body(slot, chosen, total, end, u, nonzero, lost):
         y = read_light_vertex(kernel, path, slot)
-        counted = {"non_finite": lost}
-        c = finite(inner(kernel, z, y), counted)
+        c = finite(inner(kernel, z, y))
         value = c.weighted()
         size = _size(value)
         before, total = total, total + size
@@ -104,7 +102,7 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         chosen = dr.select(take, value, chosen)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
-        return slot + 1, chosen, total, end, u, nonzero + _one(c.active), counted["non_finite"]
+        return slot + 1, chosen, total, end, u, nonzero + one(c.active), lost + c.counted.non_finite
 
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
@@ -116,25 +114,27 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream, counters):
         body,
         label="draw an inner connection",
     )
-    counters["evaluated"] += candidates
-    counters["zero"] += candidates - nonzero
-    counters["non_finite"] += lost
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
     value = (chosen / _size(chosen)) * total
     active = total > 0
-    active, survival = _roulette(kernel, value, u, active, counters)
-    count(counters, "shadow_inner", active)
+    active, survival, rouletted = _roulette(kernel, value, u, active)
+    counted = rouletted + Counters(
+        shadow_inner=one(active), evaluated=candidates, zero=candidates - nonzero, non_finite=lost
+    )
     own = None
     if small:
         y = read_light_vertex(kernel, path, end)
         ray, own = _sight(kernel, z, y)
+        end = y.si.p
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
+    if kernel.observer is not None:
+        kernel.observer.drawn(end)
     active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return dr.select(active, value / survival, 0)
+    return dr.select(active, value / survival, 0), counted
 
 
-def _sight(kernel, z: Vertex, y: Vertex):
+def _sight(kernel, z: Vertex, y: StoredVertex):
     """`rays.sight` from ``z`` to the light vertex ``y``."""
     return rays.sight(kernel.shape_errors, z.anchor, y.anchor, rounding.met(y.si.shape, y.si.instance), z.si)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from . import bsdf
+from .counters import Counters, one
 
 # Least probability of surviving roulette: random numbers are multiples of 2^-24.
 LEAST_SURVIVAL = 2.0**-20
@@ -15,9 +16,13 @@ LEAST_SURVIVAL = 2.0**-20
 
 @dataclass
 class Contribution:
-    """``value`` unweighted estimate (a spectrum), ``weight`` in [0, 1], numbers of light vertices
-    ``s`` and camera vertices ``t``, ``active``; ``shares`` see `mis.ByClass`,
-    ``kind`` the class among `mis.CLASSES`."""
+    """An estimate of one strategy.
+
+    ``value`` unweighted (a spectrum), ``weight`` in [0, 1], numbers of light vertices ``s`` and camera
+    vertices ``t``, ``active``; ``shares`` see `mis.ByClass`, ``kind`` the class among `mis.CLASSES`;
+    ``position`` on the film in pixels, None where it adds to the lane's own pixel (t >= 2); ``counted`` what
+    was done for it.
+    """
 
     value: object
     weight: object
@@ -26,35 +31,36 @@ class Contribution:
     active: object
     shares: object = None
     kind: str = ""
+    position: object = None
+    counted: Counters = field(default_factory=Counters)
 
     def weighted(self):
         """What the strategy adds to the image."""
         return dr.select(self.active, self.value * self.weight, 0)
 
 
-def finite(c: Contribution, counters) -> Contribution:
-    """``c``, inactive where it adds no finite value, which is counted: such a contribution counts as zero."""
+def finite(c: Contribution) -> Contribution:
+    """``c``, inactive where it adds no finite value, which is counted: such a contribution counts as zero.
+
+    All contributions pass here on their way to the sink; whatever finds a density from which no weight
+    follows makes the value NaN.
+    """
     lost = c.active & ~bsdf.is_finite(c.value * c.weight)
-    count(counters, "non_finite", lost)
-    return replace(c, active=c.active & ~lost)
+    return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))
 
 
-def count(counters, name: str, mask):
-    """Add 1 to a counter of `kernel.COUNTERS` in lanes where ``mask`` holds."""
-    counters[name] += _one(mask)
+def _roulette(kernel, value, u, active):
+    """Unbiased roulette on a weighted contribution before its visibility is tested.
 
-
-def _roulette(kernel, value, u, active, counters):
-    """Unbiased roulette on a weighted contribution before its visibility is tested."""
+    Returns where it survived, the probability of that, and `Counters`."""
     if not kernel.plan.roulette:
-        return active, mi.Float(1)
+        return active, mi.Float(1), Counters()
     size = _size(value)
     # Not below the spacing of the random numbers, which are 0 more often than that; NaN goes on.
     survival = dr.clip(size * kernel.inverse_threshold, LEAST_SURVIVAL, 1)
     survival = dr.select(dr.isfinite(size), survival, 1)
     survived = u < survival
-    count(counters, "rouletted", active & ~survived)
-    return active & survived, survival
+    return active & survived, survival, Counters(rouletted=one(active & ~survived))
 
 
 def _counts(kernel, value, weight):
@@ -66,7 +72,3 @@ def _counts(kernel, value, weight):
 def _size(value):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
     return bsdf.brightest(value)
-
-
-def _one(mask):
-    return dr.select(mask, mi.UInt32(1), mi.UInt32(0))

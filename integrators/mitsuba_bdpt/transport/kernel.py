@@ -4,172 +4,70 @@ A lane carries one light subpath, kept in its local memory, and then one after t
 subpaths that it serves, in S different pixels (see `sharing`); all strategies of a pair are evaluated by that
 lane. Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples
 or image size.
+
+What a lane does; below stand the functions in this order. Vertices: y_0 on the emitter, z_0 on the sensor; a
+path of s light and t camera vertices has k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`::
+
+    time, wavelengths <- drawn for all subpaths of the lane                 _shared
+
+    # The light subpath                                                     _light_subpath
+    y_0, direction <- an emitter, with pdf_first * pdf_second               Emitters.sample_emission
+    d_vcm, d_vc <- 1 / densities of y_0 and direction (eqs. 31-33)          _light_walk
+    (1,1):   splat y_0 seen by the sensor                                   techniques.join_endpoints
+    for y in y_1, y_2, ...:                                                 walk.random_walk
+        d_vcm, d_vc <- in the area measure at y (eqs. 31-35)                walk._vertex
+        direction of the next edge, BSDF towards the sensor <- one call     walk._interact
+        t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
+        t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
+        keep y if its BSDF is not delta                                     light_path.store_light_vertex
+        throughput, d_vcm, d_vc <- the event at y (eqs. 34, 35, 53, 54)     walk._leave
+        roulette; the next edge <- a ray
+
+    # Its camera subpaths
+    for S pixels:                                                           trace
+        z_0, direction <- the sensor, at a point of the pixel               _camera_subpath
+        d_vcm, d_vc <- 1 / density of the direction                         _camera_walk
+        total <- 0
+        for z in z_1, z_2, ...:                                             walk.random_walk
+            d_vcm, d_vc <- in the area measure at z                         walk._vertex
+            direction of the next edge, BSDF towards an emitter <- one call walk._interact
+            s = 0:  total += emission of z towards z_0 (eqs. 42, 43)        techniques.hit_emitter
+            s = 1:  total += z lit by a point of an emitter (eqs. 44, 45)   techniques.next_event
+            s >= 2: total += z joined with kept vertices y (eqs. 40, 41):
+                        each of them,                                       connections.connect_all
+                        or one, drawn by what it would add unshadowed       connections.connect_one
+            throughput, d_vcm, d_vc <- the event at z                       walk._leave
+            roulette; the next edge <- a ray
+        add the total to the pixel                                          sink.end
+
+Each strategy i of a path adds w_i f / (n_i p_i), with its number of samples n_i per camera sample (the light
+subpaths per camera subpath for t <= 1, else 1) and the weight (eq. 37)
+
+    w_i = kappa_i p_i / sum_j kappa_j p_j = 1 / (light side + 1 + camera side)
+
+whose two sums are over the strategies with fewer and with more light vertices, from the partial sums of y and
+z. Classes of strategies that the plan leaves out have kappa = 0 and are not recorded.
+
+What is not finite is stopped at two gates, and counted: the walk ends a subpath (`walk.not_finite`), and on
+the way to the sink a contribution is dropped (`contribution.finite`; the sink drops such colours).
 """
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
 from ..sampling.points import Points, Purpose
-from ..settings import MAX_STORED, UNLIMITED
 from . import bsdf, contribution, light_path, mis, techniques
 from .batch import Batch, Places
+from .counters import Counters, counted_by_camera, counted_by_light, one
+from .inputs import Kernel, Shared
+from .observer import Observer
 from .sharing import Sharing
-from .walk import Side, Walk, random_walk
-
-# Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
-STORE_SIZES = (64, MAX_STORED)
-
-
-# What lanes count (``UInt32``): rays by kind, inner connections by what became of them (``rouletted``: splats
-# too), values that count as zero because they are not finite: contributions (those of s = 1 and t <= 1 if
-# they are visible, inner ones before it is known), subpaths that end for want of a finite throughput,
-# features.
-COUNTERS = (
-    "camera",
-    "light",
-    "shadow_s1",
-    "shadow_t1",
-    "shadow_inner",
-    "evaluated",
-    "zero",
-    "rouletted",
-    "non_finite",
-)
-
-
-@dataclass
-class Coefficients:
-    """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`; the Python
-    number 0 for classes that are not in use."""
-
-    hit: object
-    direct: object
-    splat: object
-    endpoints: object
-    arrival: object
-    inner: object
-
-
-@dataclass
-class Shared:
-    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves; ``u_wavelength``
-    chose the wavelengths, ``weight`` is 1 / their density."""
-
-    time: object
-    wavelengths: object
-    weight: object
-    u_wavelength: object
-
-
-class Kernel:
-    """Everything that a pass needs besides its batch. Holds the scene for one render only."""
-
-    def __init__(self, prepared, plan, settings, heuristic):
-        self.scene, self.camera, self.emitters = prepared.scene, prepared.camera, prepared.emitters
-        self.plan, self.heuristic = plan, heuristic
-        self.shape_errors = prepared.emitters.shape_errors
-        self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
-        self.traits = prepared.traits
-        depth = min(settings.max_depth, UNLIMITED)
-        reach = min(depth, settings.stored_vertices)
-        self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
-        self.strategy_images = settings.strategy_images
-        u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
-        self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
-        self._reach = u32(reach)
-        self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)
-        self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
-        after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
-        self.last_light = u32(max(reach - after, 0))
-        self.camera_paths_per_light_path = u32(plan.camera_paths_per_light_path)
-        self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
-        self.inverse_threshold = f32(dr.inf)
-
-    def bound(self, points, count_light: float) -> Kernel:
-        """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
-        camera subpath, which the estimates of t <= 1 are divided by (weights keep the nominal one)."""
-        other = copy(self)
-        other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
-        return other
-
-    def within_store(self, k):
-        """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
-        return k <= self._reach
-
-    def set_threshold(self, size):
-        """Contributions below this size play roulette (a power of two near it, so that the order of atomic
-        sums rarely changes a decision), none if it is 0. ``size``: ``Float64`` of width 1."""
-        rounded = dr.exp2(dr.round(dr.log2(size)))
-        self.inverse_threshold = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
-        dr.eval(self.inverse_threshold)
-
-
-def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
-    """Trace one batch and put its contributions into ``sink`` (see `sink`); ``spp`` is the render's total,
-    which places the batch in the image's point sequence. Returns the sums of `COUNTERS` (``UInt64``, one
-    after the other); nothing is evaluated yet."""
-    sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(batch, sharing))
-    lane = dr.arange(mi.UInt32, sharing.lanes)
-    common, of_light = _begin(kernel, sink, Places(kernel, batch, spp), lane)
-
-    def serve(slot, counters):
-        active = slot < dr.opaque(mi.UInt32, batch.size)
-        return _camera_subpath(kernel, sink, common, slot, counters, active)
-
-    counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
-    if not kernel.plan.light:
-        counters = serve(lane, counters)
-    else:
-        seat = sharing.seat(lane)
-        _, counters = dr.while_loop(
-            (mi.UInt32(0), counters),
-            lambda served, counters: served < kernel.camera_paths_per_light_path,
-            lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
-            label="camera subpaths of one light subpath",
-        )
-    return _sum(of_light, counters)
-
-
-def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot):
-    """Trace some camera samples of a batch again, as `trace` does: those of these ``slot``s (``UInt32``) with
-    the light subpath of the lane that each is in. (For whoever looks at single samples; no render does.)"""
-    sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(batch, sharing))
-    common, of_light = _begin(kernel, sink, Places(kernel, batch, spp), sharing.lane(slot))
-    counters = _zeros("camera", "non_finite", *_counted_by_camera(kernel.plan))
-    return _sum(of_light, _camera_subpath(kernel, sink, common, slot, counters, mi.Bool(True)))
-
-
-def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
-    """Which camera samples of a batch share a light subpath. Those of a pilot do not, and some of its light
-    subpaths have none."""
-    if batch.spread:
-        return Sharing(batch.lanes, 1, 1, points.seed)
-    return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths_per_light_path, points.seed)
-
-
-def _count_light(batch: Batch, sharing: Sharing) -> float:
-    """Light subpaths per camera subpath: exact also where S does not divide the batch. A pilot's estimates
-    are those of one, whose number it divides by itself."""
-    return 1.0 if batch.spread else sharing.lanes / batch.size
-
-
-def _begin(kernel, sink, place: Places, lane):
-    """Trace the light subpaths of these ``lane``s: what their camera subpaths share, and the counters."""
-    stream = kernel.points.stream("light", place.index(lane), lane)
-    shared = _shared(kernel, stream)
-    path = light_path.allocate_light_path(kernel, dr.width(lane))
-    counters = {}
-    if kernel.plan.light:
-        path, counters = _light_subpath(kernel, sink, stream, shared, path)
-    return _Lane(place, shared, path), counters
+from .walk import Side, Walk, not_finite, random_walk
 
 
 @dataclass
@@ -191,6 +89,76 @@ class _Sample:
     covered: object
 
 
+def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
+    """Trace one batch and put its contributions into ``sink`` (see `sink`).
+
+    ``spp`` is the render's total, which places the batch in the image's point sequence. Returns
+    `Counters.summed`; nothing is evaluated yet.
+    """
+    sharing = shared_by(kernel, batch, points)
+    kernel = kernel.bound(points, _count_light(batch, sharing))
+    index = dr.arange(mi.UInt32, sharing.lanes)
+    lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
+
+    def serve(slot, counters):
+        active = slot < dr.opaque(mi.UInt32, batch.size)
+        return counters + _camera_subpath(kernel, sink, lane, slot, active)
+
+    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
+    if not kernel.plan.light:
+        counters = serve(index, counters)
+    else:
+        seat = sharing.seat(index)
+        _, counters = dr.while_loop(
+            (mi.UInt32(0), counters),
+            lambda served, counters: served < kernel.camera_paths_per_light_path,
+            lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
+            label="camera subpaths of one light subpath",
+        )
+    return (of_light + counters).summed()
+
+
+def retrace(
+    kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot, observer: Observer | None = None
+):
+    """Trace some camera samples of a batch again, as `trace` does, and show an ``observer`` how.
+
+    The samples of these ``slot``s (``UInt32``), with the light subpath of the lane that each is in. (For
+    whoever looks at single samples; no render does.)
+    """
+    sharing = shared_by(kernel, batch, points)
+    kernel = kernel.bound(points, _count_light(batch, sharing), observer)
+    lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), sharing.lane(slot))
+    return (of_light + _camera_subpath(kernel, sink, lane, slot, mi.Bool(True))).summed()
+
+
+def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
+    """Which camera samples of a batch share a light subpath.
+
+    Those of a pilot do not, and some of its light subpaths have none.
+    """
+    if batch.spread:
+        return Sharing(batch.lanes, 1, 1, points.seed)
+    return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths_per_light_path, points.seed)
+
+
+def _count_light(batch: Batch, sharing: Sharing) -> float:
+    """Light subpaths per camera subpath: exact also where S does not divide the batch. A pilot's estimates
+    are those of one, whose number it divides by itself."""
+    return 1.0 if batch.spread else sharing.lanes / batch.size
+
+
+def _begin(kernel, sink, place: Places, index) -> tuple[_Lane, Counters]:
+    """The lanes of these numbers with their light subpaths, which are traced."""
+    stream = kernel.points.stream("light", place.index(index), index)
+    shared = _shared(kernel, stream)
+    path = light_path.allocate_light_path(kernel, dr.width(index))
+    counters = Counters()
+    if kernel.plan.light:
+        path, counters = _light_subpath(kernel, sink, stream, shared, path)
+    return _Lane(place, shared, path), counters
+
+
 def _shared(kernel, stream) -> Shared:
     sensor, points = kernel.camera.sensor, kernel.points
     time = mi.Float(sensor.shutter_open())
@@ -204,138 +172,110 @@ def _shared(kernel, stream) -> Shared:
     return Shared(time, wavelengths, weight, u)
 
 
-def _zeros(*names) -> dict:
-    """Counters of these ``names``. Loops hold only those that they change, see `Walk`."""
-    return {name: mi.UInt32(0) for name in names}
+# -- the light subpath ------------------------------------------------------------------------
 
 
-def _counted_by_light(plan):
-    names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
-    return names + ["non_finite"] * (plan.splat or plan.arrival)
+def _light_subpath(kernel, sink, stream, shared, path) -> tuple[light_path.LightPath, Counters]:
+    """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections."""
+    plan = kernel.plan
+    e = _emission(kernel, stream, shared)
+    counters = Counters()
+    if plan.endpoints:
+        c = techniques.join_endpoints(kernel, e, stream, mi.Bool(True))
+        counters += _splat(kernel, sink, c, shared)
+
+    def visit(vertex, state, walk):
+        path, counters = state
+        if plan.arrival:
+            counters += _splat(kernel, sink, techniques.hit_sensor(kernel, e, vertex, walk), shared)
+        if plan.splat:
+            counters += _splat(kernel, sink, techniques.splat(kernel, vertex, stream), shared)
+        if plan.connections != "none":
+            light_path.store_light_vertex(kernel, vertex, path)
+        return path, counters
+
+    walk = _light_walk(kernel, e, shared)
+    active, side = walk.active, _light_side(kernel, e, stream, shared, walk)
+    state = path, counted_by_light(plan)
+    (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
+    counters += counted
+    return path, counters + Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
 
 
-def _counted_by_camera(plan):
-    one = plan.connections == "one"
-    names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
-    return names + ["shadow_inner", "evaluated", "zero"] * (plan.connections != "none")
-
-
-def _light_subpath(kernel, sink, stream, shared, path):
-    points, h, emitters = kernel.points, kernel.heuristic, kernel.emitters
-    e = emitters.sample_emission(
+def _emission(kernel, stream, shared):
+    """y_0 and the first direction, an `emitters.Emission`."""
+    points = kernel.points
+    e = kernel.emitters.sample_emission(
         points.draw_2d("light", stream, Purpose.EMISSION_POINT),
         points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
         shared,
         mi.Bool(True),
     )
-    counters = _zeros("shadow_t1", "light", "non_finite")
-    if kernel.plan.endpoints:
-        c, position = techniques.join_endpoints(kernel, e, stream, counters, mi.Bool(True))
-        sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
+    if kernel.observer is not None:
+        kernel.observer.emitted(e)
+    return e
+
+
+def _light_walk(kernel, e, shared) -> Walk:
+    """A light subpath on its first edge."""
+    h = kernel.heuristic
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
-    broken = active & ~bsdf.is_finite(e.weight)
-    contribution.count(counters, "non_finite", broken)
+    broken = not_finite(active, e.weight)
     active &= ~broken
-    inverse = dr.rcp(e.pdf_first * e.pdf_second)
+    inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse)), kernel.kappa.hit)
-    partial = mis.Partial(h.start(inverse), h.present(hit))
-    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
-    side = Side(
+    # s = 0 is an older alternative, that of making y_0 by a hit.
+    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
+    partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
+    return Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, broken)
+
+
+def _light_side(kernel, e, stream, shared, walk) -> Side:
+    return Side(
         "light",
         shared,
         bsdf.brightest(walk.throughput),
         True,
         kernel.last_light,
         kernel.kappa.direct,
-        complete=lambda si, first: emitters.connection_density(e, si, first),
+        complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
         join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
     )
 
-    def visit(vertex, state, walk):
-        path, counters = state
-        if kernel.plan.arrival:
-            c, position = techniques.hit_sensor(kernel, e, vertex, walk)
-            sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
-        if kernel.plan.splat:
-            c, position = techniques.splat(kernel, vertex, stream, counters)
-            sink.splat(kernel, contribution.finite(c, counters), position, shared, counters)
-        if kernel.plan.connections != "none":
-            light_path.store_light_vertex(kernel, vertex, path)
-        return path, counters
 
-    state = path, _zeros(*_counted_by_light(kernel.plan))
-    (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters = _added(counters, counted)
-    counters["light"] += dr.select(active, walk.traced(), 0)
-    contribution.count(counters, "non_finite", walk.broken)
-    return path, counters
+def _splat(kernel, sink, c, shared) -> Counters:
+    """Hand a contribution with t <= 1 to the sink."""
+    c = contribution.finite(c)
+    return c.counted + sink.splat(kernel, c, shared)
 
 
-def _added(*several) -> dict:
-    """Counters added up by name."""
-    total = {}
-    for counters in several:
-        for name, value in counters.items():
-            total[name] = total[name] + value if name in total else value
-    return total
+# -- a camera subpath -------------------------------------------------------------------------
 
 
-def _camera_subpath(kernel, sink, lane: _Lane, slot, counters, active):
-    points, plan = kernel.points, kernel.plan
-    place, shared = lane.place, lane.shared
-    stream = points.stream("camera", place.index(slot), slot)
+def _camera_subpath(kernel, sink, lane: _Lane, slot, active) -> Counters:
+    """Trace a camera subpath and join it with the lane's light subpath."""
+    sample = _camera_sample(kernel, lane, slot, active)
+    active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
+    walk = _camera_walk(kernel, sample.start, active)
+    side = _camera_side(kernel, sink, sample, lane.shared, walk)
+    visit = _camera_visit(kernel, sink, lane, sample)
+    state = sink.begin(), counted_by_camera(kernel.plan)
+    (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
+    counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
+    return counters + sink.end(kernel, lane, sample, total, walk.seen)
+
+
+def _camera_sample(kernel, lane: _Lane, slot, active) -> _Sample:
+    """z_0 and the first direction."""
+    points = kernel.points
+    stream = points.stream("camera", lane.place.index(slot), slot)
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
     u_lens = mi.Point2f(0.5)
     if kernel.camera.needs_aperture_sample:
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
-    start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
-    sample = _Sample(start, stream, u_lens, active)
-    active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
-    walk = _camera_walk(kernel, start, active)
-
-    def add_hit(z, total, lost):
-        counted = {"non_finite": lost}
-        c = contribution.finite(techniques.hit_emitter(kernel, z), counted)
-        return sink.add(kernel, c, total, start, shared), counted["non_finite"]
-
-    def visit(z, state, _):
-        total, counters = state
-        if plan.hit:
-            # A branch of its own: few lanes hit an emitter.
-            total, counters["non_finite"] = dr.if_stmt(
-                (z, total, counters["non_finite"]),
-                techniques.sees_emitter(kernel, z),
-                add_hit,
-                lambda z, total, lost: (total, lost),
-                label="s = 0",
-            )
-        if plan.direct:
-            c = contribution.finite(techniques.next_event(kernel, z, counters), counters)
-            total = sink.add(kernel, c, total, start, shared)
-        if plan.connections != "none":
-            total = sink.connect(kernel, z, lane, stream, counters, total, start)
-        return total, counters
-
-    side = Side(
-        "camera",
-        shared,
-        bsdf.brightest(walk.throughput),
-        False,
-        kernel.max_depth,
-        kernel.kappa.splat,
-        alpha=sink.alpha,
-        parallel=kernel.camera.parallel,
-        join=(lambda z: techniques.choose_emitter(kernel, z, stream)) if plan.direct else None,
-    )
-    state = (sink.begin(), _zeros(*_counted_by_camera(plan)))
-    (total, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters = _added(counters, counted)
-    counters["camera"] += dr.select(active, walk.traced(), 0)
-    contribution.count(counters, "non_finite", walk.broken)
-    sink.end(kernel, lane, sample, total, walk.seen, counters)
-    return counters
+    start = kernel.camera.start(lane.place.pixel(slot), u_film, u_lens, lane.shared)
+    return _Sample(start, stream, u_lens, active)
 
 
 def _camera_walk(kernel, start, active) -> Walk:
@@ -358,36 +298,49 @@ def _first_partial(kernel, start):
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
 
 
-def _sum(*several):
-    """The lanes' counters added up, ``UInt64`` in the order of `COUNTERS`."""
-    total = dr.zeros(mi.UInt64, len(COUNTERS))
-    for name, value in _added(*several).items():
-        index = mi.UInt32(COUNTERS.index(name))
-        dr.scatter_reduce(dr.ReduceOp.Add, total, mi.UInt64(value), index, mode=dr.ReduceMode.Expand)
-    return total
+def _camera_side(kernel, sink, sample: _Sample, shared, walk) -> Side:
+    def choose_emitter(z):
+        return techniques.choose_emitter(kernel, z, sample.stream)
 
-
-def _coefficients(plan, by_class: bool) -> Coefficients:
-    """Run-time values, or ``by_class`` those of a pilot: 1 in the place of the class, see `mis.ByClass`."""
-
-    def entry(kind, value, used):
-        if not used:
-            return 0
-        if by_class:
-            return mi.Vector4f(*(1.0 if name == kind else 0.0 for name in mis.CLASSES))
-        return dr.opaque(mi.Float, value)
-
-    count = 1 / plan.camera_paths_per_light_path if plan.light else 0.0  # nominal, see `Kernel.bound`
-    light = count * plan.kappa_light
-    return Coefficients(
-        hit=entry("hit", 1, plan.hit),
-        direct=entry("direct", plan.kappa_direct, plan.direct),
-        splat=entry("light", light, plan.splat),
-        endpoints=entry("light", light, plan.endpoints),
-        arrival=entry("light", light, plan.arrival),
-        inner=entry("inner", 1, plan.connections != "none"),
+    return Side(
+        "camera",
+        shared,
+        bsdf.brightest(walk.throughput),
+        False,
+        kernel.max_depth,
+        kernel.kappa.splat,
+        alpha=sink.alpha,
+        parallel=kernel.camera.parallel,
+        join=choose_emitter if kernel.plan.direct else None,
     )
 
 
-def _opaque(kind):
-    return lambda value: dr.opaque(kind, value)
+def _camera_visit(kernel, sink, lane: _Lane, sample: _Sample):
+    """What is done at each vertex of a camera subpath: the strategies with t >= 2."""
+    plan, start, shared = kernel.plan, sample.start, lane.shared
+
+    def add_hit(z, total, lost):
+        c = contribution.finite(techniques.hit_emitter(kernel, z))
+        return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
+
+    def visit(z, state, _):
+        total, counters = state
+        if plan.hit:
+            # A branch of its own: few lanes hit an emitter.
+            total, lost = dr.if_stmt(
+                (z, total, counters.non_finite),
+                techniques.sees_emitter(kernel, z),
+                add_hit,
+                lambda z, total, lost: (total, lost),
+                label="s = 0",
+            )
+            counters = replace(counters, non_finite=lost)
+        if plan.direct:
+            c = contribution.finite(techniques.next_event(kernel, z))
+            total, counters = sink.add(kernel, c, total, start, shared), counters + c.counted
+        if plan.connections != "none":
+            total, counted = sink.connect(kernel, z, lane, sample.stream, total, start)
+            counters += counted
+        return total, counters
+
+    return visit

@@ -13,19 +13,48 @@ from .walk import Vertex
 
 
 @dataclass
-class LightPath:
-    """Connectible vertices of a lane's light subpath in local memory, ``count`` of them.
+class StoredVertex:
+    """A light vertex y_{s-1}, s >= 2, as an inner connection needs it.
 
-    ``throughput`` is that of the vertex over its cosine of incidence (the constant part of the adjoint
-    factor); ``newest`` and ``older`` are its `mis.Partial`; ``s`` the number of light vertices up to and
-    including it.
+    ``throughput_over_cos`` f cos / pdf of all events before this vertex, the edge to it included, over the
+    geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi|;
+    ``partial`` partial sums in the area measure; ``edges`` number of edges up to it, s - 1; ``anchor`` starts
+    rays.
     """
 
     si: object
-    throughput: object
-    newest: object
-    older: object
-    anchor: object
+    bsdf: object
+    anchor: rays.Anchor
+    throughput_over_cos: object
+    partial: mis.Partial
+    edges: object
+
+    @staticmethod
+    def of(vertex: Vertex) -> StoredVertex:
+        """What is stored of a ``vertex`` that a light subpath has reached."""
+        return StoredVertex(
+            si=vertex.si,
+            bsdf=vertex.bsdf,
+            anchor=vertex.anchor,
+            throughput_over_cos=mi.Spectrum(vertex.throughput / vertex.cos),
+            partial=vertex.partial,
+            edges=vertex.edges,
+        )
+
+
+@dataclass
+class LightPath:
+    """The `StoredVertex` objects of a lane's light subpath in local memory, ``count`` of them.
+
+    ``d_vcm`` and ``d_vc`` are their ``partial``; ``rounding`` offset and curvature of their anchors, the rest
+    of which is in ``si``; ``s`` the number of light vertices up to and including each.
+    """
+
+    si: object
+    throughput_over_cos: object
+    d_vcm: object
+    d_vc: object
+    rounding: object
     s: object
     count: object
 
@@ -35,10 +64,10 @@ def allocate_light_path(kernel, lanes: int) -> LightPath:
     size = kernel.store_size
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
-        throughput=dr.alloc_local(mi.Spectrum, size),
-        newest=dr.alloc_local(mi.Float, size),
-        older=dr.alloc_local(type(kernel.heuristic.zero()), size),
-        anchor=dr.alloc_local(mi.Vector2f, size),
+        throughput_over_cos=dr.alloc_local(mi.Spectrum, size),
+        d_vcm=dr.alloc_local(mi.Float, size),
+        d_vc=dr.alloc_local(type(kernel.heuristic.zero()), size),
+        rounding=dr.alloc_local(mi.Vector2f, size),
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
@@ -48,31 +77,27 @@ def allocate_light_path(kernel, lanes: int) -> LightPath:
 def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
     """Keep a light vertex that inner connections can use."""
     keep = vertex.hit & (vertex.edges <= kernel.last_stored) & bsdf.connectible(vertex.bsdf)
-    slot = path.count
-    path.si.write(vertex.si, slot, keep)
-    path.throughput.write(mi.Spectrum(vertex.throughput / vertex.cos), slot, keep)
-    path.newest.write(vertex.partial.d_vcm, slot, keep)
-    path.older.write(vertex.partial.d_vc, slot, keep)
-    path.anchor.write(mi.Vector2f(vertex.anchor.offset, vertex.anchor.curvature), slot, keep)
-    path.s.write(vertex.edges + 1, slot, keep)
+    y, slot = StoredVertex.of(vertex), path.count
+    path.si.write(y.si, slot, keep)
+    path.throughput_over_cos.write(y.throughput_over_cos, slot, keep)
+    path.d_vcm.write(y.partial.d_vcm, slot, keep)
+    path.d_vc.write(y.partial.d_vc, slot, keep)
+    path.rounding.write(mi.Vector2f(y.anchor.offset, y.anchor.curvature), slot, keep)
+    path.s.write(y.edges + 1, slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
-def read_light_vertex(kernel, path: LightPath, slot) -> Vertex:
+def read_light_vertex(kernel, path: LightPath, slot) -> StoredVertex:
     """The stored vertex ``slot``, the same in all lanes that use it."""
     si = path.si[slot]
-    anchor = path.anchor[slot]
+    rounding = path.rounding[slot]
     s = path.s[slot]
-    return Vertex(
+    curvature = rounding.y if kernel.shape_errors.any else mi.Float(0)
+    return StoredVertex(
         si=si,
         bsdf=si.bsdf(),
-        cos=mi.Float(1),
-        anchor=rays.Anchor(si.p, si.n, anchor.x, anchor.y if kernel.shape_errors.any else mi.Float(0)),
-        throughput=path.throughput[slot],
-        partial=mis.Partial(path.newest[slot], path.older[slot]),
+        anchor=rays.Anchor(si.p, si.n, rounding.x, curvature),
+        throughput_over_cos=path.throughput_over_cos[slot],
+        partial=mis.Partial(path.d_vcm[slot], path.d_vc[slot]),
         edges=s - 1,
-        previous=None,
-        seen=None,
-        hit=mi.Bool(True),
-        active=mi.Bool(True),
     )

@@ -57,9 +57,9 @@ def choose(mask, a, b):
     return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
 
 
-def times(coefficient, density):
-    """A coefficient times a density that enter a partial sum together."""
-    return 0 if is_absent(coefficient) else coefficient * density
+def times(coefficient, pdf):
+    """A coefficient times a density (in any measure) that enter a partial sum together."""
+    return 0 if is_absent(coefficient) else coefficient * pdf
 
 
 class Heuristic:
@@ -102,11 +102,11 @@ class Heuristic:
         """A partial sum to which classes in use may be added."""
         return self.zero() if is_absent(x) else x
 
-    def start(self, inverse_density):
-        """Partial sum of one strategy whose ratio is ``inverse_density`` so far."""
+    def start(self, inverse_pdf):
+        """Partial sum of one strategy whose ratio is ``inverse_pdf`` so far: 1 / a density in any measure."""
         if self.name == "uniform":
-            return dr.select(inverse_density > 0, 1.0, 0.0)
-        return dr.minimum(inverse_density, SATURATION)
+            return dr.select(inverse_pdf > 0, 1.0, 0.0)
+        return dr.minimum(inverse_pdf, SATURATION)
 
     def weigh(self, coefficient, light_side, camera_side):
         """`weight`, and the classes' shares of it, which only `ByClass` knows."""
@@ -193,15 +193,15 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
     )
 
 
-def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev_w, density):
+def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev_w, pdf_a):
     """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40, 41, 44-47).
 
     ``coefficient`` of the newest alternative's class; ``pdf_rev_w`` solid-angle density of sampling
-    the vertex before the last from the last; ``density`` of making the last vertex from the other
-    side, in the measure in which ``d_vcm`` is stored (area, or solid angle at infinity).
+    the vertex before the last from the last; ``pdf_a`` density of making the last vertex from the other
+    side, in the measure in which ``d_vcm`` is stored (area; solid angle at infinity).
     """
     total = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),
         heuristic.scale(partial.d_vc, pdf_rev_w),
     )
-    return heuristic.scale(total, density)
+    return heuristic.scale(total, pdf_a)

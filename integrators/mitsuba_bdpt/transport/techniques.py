@@ -4,12 +4,11 @@ All return a `Contribution`: the full *unweighted* estimate f / p of the strateg
 class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone.
 Densities and cosines are geometric, throughputs contain everything up to and including the edge to
 the vertex. Equation numbers: Georgiev 2012, see `mis`.
-
-What a lane accumulates (``counters``, a dictionary, and ``path``) is changed in place: these are state of the
-loops around, and each statement binds a new array to a name.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +16,8 @@ import mitsuba as mi
 from ..geometry import rays
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _roulette, count
+from .contribution import Contribution, _counts, _roulette
+from .counters import Counters, one
 from .walk import Vertex, newest_coefficient
 
 
@@ -36,13 +36,14 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
     active = sees_emitter(kernel, z)
     radiance = emitters.emitted(z.si, active)
     active &= ~bsdf.is_zero(radiance)
-    connect, first, second = emitters.hit_densities(z.si, z.previous, active)
+    # Area measure; of what is in the surroundings solid angle, and disk area: `Emitters.hit_densities`.
+    pdf_connect, pdf_first, pdf_second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
-    endpoints = mis.times(kernel.kappa.endpoints, first)
+    endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need just this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
-    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, connect))
-    older = dr.select(kernel.within_store(z.edges), first * second, 0)
+    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, pdf_connect))
+    older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
@@ -50,15 +51,15 @@ def hit_emitter(kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vc, older),
     )
     weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
-    value = _known(z.throughput * radiance, connect, first, second)
+    value = _known(z.throughput * radiance, pdf_connect, pdf_first, pdf_second)
     return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
 
 
-def _known(value, *densities):
-    """``value``, NaN where one of the ``densities`` of other strategies is not finite: no weight follows."""
+def _known(value, *pdfs):
+    """``value``, NaN where one of the ``pdfs`` of other strategies is not finite: no weight follows."""
     finite = mi.Bool(True)
-    for density in densities:
-        finite &= dr.isfinite(density)
+    for pdf in pdfs:
+        finite &= dr.isfinite(pdf)
     return dr.select(finite, value, dr.nan)
 
 
@@ -71,7 +72,7 @@ def choose_emitter(kernel, z: Vertex, stream):
     return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
 
 
-def next_event(kernel, z: Vertex, counters) -> Contribution:
+def next_event(kernel, z: Vertex) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
@@ -95,16 +96,13 @@ def next_event(kernel, z: Vertex, counters) -> Contribution:
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    count(counters, "shadow_s1", active)
+    counted = Counters(shadow_s1=one(active))
     active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct")
+    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", counted=counted)
 
 
-def join_endpoints(kernel, emission, stream, counters, active):
-    """(1,1): a sampled emitter point seen directly by the sensor.
-
-    Returns the `Contribution` and the film position.
-    """
+def join_endpoints(kernel, emission, stream, active) -> Contribution:
+    """(1,1): a sampled emitter point seen directly by the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
     join = kernel.camera.join(emission.si.p, *u)
@@ -125,10 +123,10 @@ def join_endpoints(kernel, emission, stream, counters, active):
     light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
     camera_side = 0
     if kernel.plan.arrival:
-        towards = kernel.emitters.direction_density(emission, join.p, join.d, active)
+        pdf_second = kernel.emitters.direction_density(emission, join.p, join.d, active)
         covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
-        towards = dr.select(covered, towards, 0)
-        camera_side = h.scale(h.start(towards * join.arrival), kernel.kappa.arrival)
+        pdf_second = dr.select(covered, pdf_second, 0)
+        camera_side = h.scale(h.start(pdf_second * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
     active &= _counts(kernel, value, weight)
 
@@ -137,9 +135,10 @@ def join_endpoints(kernel, emission, stream, counters, active):
     away = rays.spawn(join.anchor, -join.d, emission.si)
     away.maxt = join.reach  # camera rays see the surroundings behind the far plane
     ray = dr.select(emission.infinite, away, ray)
-    count(counters, "shadow_t1", active)
+    counted = Counters(shadow_t1=one(active))
     active &= ~rays.occluded(kernel.scene, ray, active)
-    return Contribution(value, weight, mi.UInt32(1), mi.UInt32(1), active, shares, "light"), join.position
+    ends = mi.UInt32(1), mi.UInt32(1)
+    return Contribution(value, weight, *ends, active, shares, "light", join.position, counted)
 
 
 def look_at_sensor(kernel, y: Vertex, stream):
@@ -154,11 +153,8 @@ def look_at_sensor(kernel, y: Vertex, stream):
     return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
 
 
-def splat(kernel, y: Vertex, stream, counters):
-    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47).
-
-    Returns the `Contribution` and the film position.
-    """
+def splat(kernel, y: Vertex, stream) -> Contribution:
+    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47)."""
     h, scene, join, f = kernel.heuristic, kernel.scene, y.endpoint, y.f
     to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
@@ -174,24 +170,23 @@ def splat(kernel, y: Vertex, stream, counters):
     active &= _counts(kernel, value, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
-    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light")
-    active, survival = _roulette(kernel, c.weighted(), u, active, counters)
-    count(counters, "shadow_t1", active)
+    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
+    active, survival, rouletted = _roulette(kernel, c.weighted(), u, active)
+    counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
         pi, _ = rays.intersect_past_emitters(scene, kernel.shape_errors, ray, active, coherent=False)
         active &= ~pi.is_valid()
     else:
         active &= ~rays.occluded(scene, ray, active)
-    c.value, c.active = value / survival, active
-    return c, join.position
+    return replace(c, value=value / survival, active=active, counted=counted)
 
 
-def hit_sensor(kernel, emission, y: Vertex, walk):
+def hit_sensor(kernel, emission, y: Vertex, walk) -> Contribution:
     """t = 0: the last edge of a light subpath hits the sensor.
 
     ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
-    are those of the scene's surface behind. Returns the `Contribution` and the film position.
+    are those of the scene's surface behind.
     """
     h = kernel.heuristic
     directly = walk.edges == 1
@@ -208,13 +203,13 @@ def hit_sensor(kernel, emission, y: Vertex, walk):
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
     partial = mis.to_area(h, before, dist2, z.cos)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
-    light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_area)
+    light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= _counts(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
-    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light"), z.position
+    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light", z.position)
 
 
 def _sensor_points(kernel, stream, edges=0):

@@ -44,8 +44,8 @@ class Walk:
     active: object
 
     @staticmethod
-    def begin(kernel, pi, ray, previous, throughput, partial, active) -> Walk:
-        """A subpath on its first edge."""
+    def begin(kernel, pi, ray, previous, throughput, partial, active, broken=False) -> Walk:
+        """A subpath on its first edge; ``broken``: it has none, for want of a finite throughput."""
         return Walk(
             pi=pi,
             o=mi.Point3f(ray.o),
@@ -56,7 +56,7 @@ class Walk:
             eta=mi.Float(1) if kernel.refracts else 1,
             edges=mi.UInt32(1),
             seen=mi.Bool(False),
-            broken=mi.Bool(False),
+            broken=mi.Bool(broken),
             active=active,
         )
 
@@ -115,6 +115,17 @@ class Side:
     join: object = None
 
 
+def not_finite(active, throughput, *directions):
+    """The walk's gate. Mask: active subpaths that end because ``throughput`` or a direction is not finite.
+
+    Whatever finds a density from which no weight follows makes the throughput NaN (`bsdf._step`, `_vertex`).
+    """
+    finite = bsdf.is_finite(throughput)
+    for direction in directions:
+        finite &= dr.isfinite(dr.sum(direction))
+    return active & ~finite
+
+
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
 
@@ -124,9 +135,13 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     def body(walk, state):
         vertex = _vertex(kernel, side, walk)
         step = _interact(kernel, side, walk, vertex, stream)
+        if kernel.observer is not None:
+            kernel.observer.vertex(side, walk, vertex, step)
         state = visit(vertex, state, walk)
         return _leave(kernel, side, walk, vertex, step, stream), state
 
+    if kernel.observer is not None:
+        kernel.observer.started(kernel, side, walk, stream)
     walk, state = dr.while_loop(
         (walk, state),
         lambda walk, state: walk.active,
@@ -154,10 +169,10 @@ def _vertex(kernel, side: Side, walk: Walk) -> Vertex:
     partial, throughput = walk.partial, walk.throughput
     if side.complete is not None:
         first = hit & (walk.edges == 1)
-        density = dr.select(first, side.complete(si, first), 1)
+        pdf_connect = dr.select(first, side.complete(si, first), 1)
         # No weight follows from such a density.
-        throughput = dr.select(dr.isfinite(density), throughput, dr.nan)
-        partial = mis.Partial(h.scale(partial.d_vcm, density), partial.d_vc)
+        throughput = dr.select(dr.isfinite(pdf_connect), throughput, dr.nan)
+        partial = mis.Partial(h.scale(partial.d_vcm, pdf_connect), partial.d_vc)
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
     if side.parallel:
         dist2 = dr.select(walk.edges == 1, 1, dist2)
@@ -219,8 +234,7 @@ def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk
     eta = walk.eta * step.eta if kernel.refracts else 1
     brightest = bsdf.brightest(throughput)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
-    finite = bsdf.is_finite(throughput) & dr.isfinite(dr.sum(si.wi))
-    broken = walk.broken | (active & ~finite)
+    broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)

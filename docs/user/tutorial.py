@@ -4,8 +4,8 @@
 # Run it as a script, or cell by cell in an editor that knows `# %%`:
 #
 #     pip install mitsuba-bdpt
-#     python docs/tutorial.py            # some minutes; images in renders/tutorial
-#     python docs/tutorial.py --size 32  # a quick look
+#     python docs/user/tutorial.py            # some minutes; images in renders/tutorial
+#     python docs/user/tutorial.py --size 32  # a quick look
 #
 # It needs the scenes of the repository.
 
@@ -22,7 +22,7 @@ import mitsuba as mi  # isort: skip
 parser = argparse.ArgumentParser()
 parser.add_argument("--size", type=int, default=128, help="width of the images")
 SIZE = parser.parse_known_args()[0].size  # a notebook has arguments of its own
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 OUT = ROOT / "renders" / "tutorial"
 OUT.mkdir(parents=True, exist_ok=True)
 mi.set_variant("llvm_ad_rgb")
@@ -43,8 +43,8 @@ def rel_mse(image, reference):
 # %% [markdown]
 # ## A first render
 #
-# A point light inside cut glass. `path` needs to hit the light by chance or to join it through the glass, and can do
-# neither: black. Light subpaths leave the lamp, pass the glass, and are joined with what the camera sees.
+# A point light inside cut glass. `path` would have to hit the light by chance or to connect to it through the glass,
+# and can do neither: black. Light subpaths leave the lamp, pass the glass, and are connected to the camera subpaths.
 
 # %%
 lamp = scene("lamp_behind_glass")
@@ -60,9 +60,9 @@ assert np.array(images["bdpt"])[..., :3].mean() > 0.01
 # %% [markdown]
 # ## Reading `explain`
 #
-# What is used, what is skipped and why. With `spp` it runs the pilot of such a render too: a table of ways to render,
-# with the time that each needs for the same error over that of the best. "impossible" follows from the scene, "not
-# worth its cost here" from the pilot.
+# Which strategies are used, which are skipped and why. With `spp` it runs the pilot of such a render too: a table of
+# ways to render, with the time that each needs for the same error over that of the best. "impossible" follows from the
+# scene, "not worth its cost here" from the pilot.
 
 # %%
 print(bdpt.explain(lamp, spp=4096))
@@ -70,7 +70,7 @@ box = scene("cornell_box")
 print(bdpt.explain(box, spp=4096))
 
 # %% [markdown]
-# After a render `statistics` has the same in numbers; its decisions can be done again in another process, or by an
+# After a render `statistics` has the same in numbers; its decisions can be repeated in another process, or by an
 # artist who wants the same image tomorrow.
 
 # %%
@@ -90,10 +90,10 @@ assert again.statistics["decisions"] == decisions
 # * `light_paths=0`: path tracing with better points; for scenes without caustics, when every render is very short.
 # * `skip=none`, `light_paths=1`, `connections=all`: everything, for comparisons with other renderers.
 # * `heuristic`: `balance` is the best or nearly so; `power` helps where one strategy is nearly without noise.
-# * `variance=true`: error bars, and `until_error` to stop at one.
+# * `variance=true`: error bars, and `target_error` to stop at one.
 
 # %%
-bars = mi.load_dict({"type": "bdpt", "max_depth": 6, "variance": True, "until_error": 0.02})
+bars = mi.load_dict({"type": "bdpt", "max_depth": 6, "variance": True, "target_error": 0.02})
 image = bars.render(box, spp=4096, seed=3)
 done, error = sum(bars.statistics["passes"]), bars.statistics["error"]
 reference = mi.render(box, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=8192, seed=9)
@@ -103,8 +103,8 @@ assert error <= 0.02
 # %% [markdown]
 # ## Strategy images
 #
-# A path of k edges can be made in k + 2 ways (s, t). Each has its own image: weighted, what it adds to the result;
-# unweighted, what it would say alone. `scripts/strategies.py` makes the pyramid of all of them.
+# A path of k edges can be sampled by k + 2 strategies (s, t). Each has its own image: weighted, what it adds to the
+# result; unweighted, its estimate alone. `scripts/strategies.py` makes the pyramid of all of them.
 
 # %%
 shown = mi.load_dict({"type": "bdpt", "max_depth": 3, "strategy_images": True})
@@ -133,7 +133,7 @@ print("paths of three edges, by strategy:", {key: f"{value:.4f}" for key, value 
 #
 # In `pool` a small lamp shines over wavy water. The wall (sensor 0) gets its caustics by light tracing (t = 1), which
 # `path` does not have. The floor seen from above (sensor 2) is behind water for the lamp *and* for the camera: no vertex of
-# such a path can be joined with a neighbour, and only camera subpaths that happen to hit the lamp (s = 0) find it.
+# such a path can be connected to a neighbour, and only camera subpaths that happen to hit the lamp (s = 0) find it.
 
 # %%
 pool = scene("pool")
@@ -148,5 +148,5 @@ for sensor, view in ((0, "wall"), (2, "floor through water")):
     assert view != "wall" or errors["path"] > 3 * errors["bdpt"]
 
 # %% [markdown]
-# On the floor a few fireflies decide the relMSE of both, the long render's too: no figure there means much, and
-# that is the sign of paths that are found by chance only.
+# On the floor a few fireflies determine the relMSE of both, the long render's too: no figure there means much, which
+# is typical of paths that are found by chance only.

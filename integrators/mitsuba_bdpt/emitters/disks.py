@@ -1,4 +1,4 @@
-"""Where light subpaths from infinity start: on disks across their direction.
+"""Disks from which light subpaths of infinite emitters start, across their direction.
 
 One disk covers the scene. On a large ground few of its subpaths meet what matters, so where the scene has
 details, shapes that are small beside it and lie together, a part of the subpaths starts on a disk that covers
@@ -20,7 +20,7 @@ DETAIL = 0.25
 
 # Details are aimed at if the radius of the sphere about them is not more than this part of the scene's: else
 # there is little to gain.
-NARROW = 0.5
+LOCAL = 0.5
 
 # Details smaller than this, over the scene's size and distance from the origin, are not aimed at: which
 # disk's subpaths pass a point is known up to rounding (6e-8 of these).
@@ -34,17 +34,18 @@ AIMED = 0.5
 
 
 @dataclass
-class Sphere:
-    """``center`` and ``radius``, which Dr.Jit may exchange without compiling anew."""
+class BoundingSphere:
+    """A sphere whose outline is a disk: ``center`` and ``radius``, which Dr.Jit may exchange without
+    compiling anew."""
 
     center: object
     radius: object
 
     @staticmethod
-    def about(sphere) -> Sphere:
+    def about(sphere) -> BoundingSphere:
         """A sphere of Mitsuba's, a little larger, as Mitsuba makes it."""
         radius = max(float(sphere.radius) * (1 + MARGIN), 1e-30)
-        made = Sphere(mi.Point3f(sphere.center), mi.Float(radius))
+        made = BoundingSphere(mi.Point3f(sphere.center), mi.Float(radius))
         dr.make_opaque(made)
         return made
 
@@ -53,26 +54,26 @@ class Sphere:
         offset = p - self.center
         return dr.squared_norm(offset - dr.dot(offset, d) * d) <= dr.square(self.radius)
 
-    def density(self):
-        """Of a uniform point on its disk across any direction."""
+    def pdf_a(self):
+        """Density of a uniform point on its disk across any direction (area)."""
         return dr.rcp(dr.pi * dr.square(self.radius))
 
 
 class Disks:
-    """Disks of a scene: ``scene`` the `Sphere` about all shapes (a unit sphere if no shape has a finite box),
-    ``details`` that about its details, or None if it has none."""
+    """Disks of a scene: ``scene`` the `BoundingSphere` about all shapes (a unit sphere if no shape has a
+    finite box), ``details`` that about its details, or None if it has none."""
 
     def __init__(self, scene):
         each, box = boxes(scene), mi.ScalarBoundingBox3f()
         for one in each:
             box.expand(one)
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
-        self.scene = Sphere.about(sphere)
+        self.scene = BoundingSphere.about(sphere)
         found = details(each, box) if box.valid() else None
-        self.details = Sphere.about(found) if found is not None else None
+        self.details = BoundingSphere.about(found) if found is not None else None
 
     def start(self, d, u):
-        """A point from which a subpath along ``d`` starts, and its density (per area)."""
+        """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
         center, radius, aimed = self.scene.center, self.scene.radius, None
         if self.details is not None:
             aimed = u.x < AIMED
@@ -83,21 +84,21 @@ class Disks:
         disk = mi.warp.square_to_uniform_disk_concentric(u)
         frame = mi.Frame3f(d)
         p = center + radius * (frame.s * disk.x + frame.t * disk.y) - self.scene.radius * d
-        return p, self._density(p, d, aimed)
+        return p, self._pdf_a(p, d, aimed)
 
-    def density(self, p, d):
-        """With which a subpath along ``d`` passes ``p``, per area across ``d``. Without details ``p`` is
+    def pdf_a(self, p, d):
+        """Density with which a subpath along ``d`` passes ``p`` (area across ``d``). Without details ``p`` is
         taken to be a point of the scene, else it may be anywhere."""
-        return self._density(p, d, None)
+        return self._pdf_a(p, d, None)
 
-    def _density(self, p, d, aimed):
+    def _pdf_a(self, p, d, aimed):
         if self.details is None:
-            return self.scene.density()
+            return self.scene.pdf_a()
         in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
         if aimed is not None:  # on the rim of its disk a point may be outside by rounding
             in_scene, in_details = in_scene | ~aimed, in_details | aimed
-        return dr.select(in_scene, (1 - AIMED) * self.scene.density(), 0) + dr.select(
-            in_details, AIMED * self.details.density(), 0
+        return dr.select(in_scene, (1 - AIMED) * self.scene.pdf_a(), 0) + dr.select(
+            in_details, AIMED * self.details.pdf_a(), 0
         )
 
     def covers(self, p, d):
@@ -139,4 +140,4 @@ def details(found: list, whole):
         return None
     sphere, radius = small.bounding_sphere(), whole.bounding_sphere().radius
     far = radius + float(np.abs([whole.min, whole.max]).max())
-    return sphere if TINY * far <= sphere.radius <= NARROW * radius else None
+    return sphere if TINY * far <= sphere.radius <= LOCAL * radius else None

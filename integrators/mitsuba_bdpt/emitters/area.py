@@ -1,0 +1,292 @@
+"""Area lights: diffuse emission from shapes whose points Mitsuba samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import UnsupportedError, UsageError
+from ..geometry.agreement import (
+    TEXTURE_SAMPLED,
+    check_densities,
+    is_sampled_by_direction,
+    is_sampled_by_texture,
+    is_textured,
+)
+from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
+from ..host.introspection import children, named, number
+from .group import Context, Group, weight_over
+from .hit_only import HitOnlyEmitters
+from .records import Chosen, Direct, Emission, Hit
+from .surfaces import CURVES, Surfaces, refuse_curves, spheres_of
+from .tables import Mask, look_up, table
+
+_SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
+
+
+@dataclass
+class _Sphere:
+    """How next-event estimation samples a sphere at ``center``: by area from within ``inner_radius``
+    (`quadrics.Sphere.inner_radius`); with the density of `quadrics.cone_pdf_w` if it has a ``cone_radius``,
+    the radius of one that may be so small that Mitsuba's own is wrong. 0 where that does not concern an
+    emitter."""
+
+    center: object = (0, 0, 0)
+    inner_radius: object = 0.0
+    cone_radius: object = 0.0
+
+    @staticmethod
+    def of(emitter, sphere, extent) -> _Sphere:
+        """That of an emitter in a scene of the diameter ``extent``."""
+        if sphere is None or not is_sampled_by_direction(emitter):
+            return _Sphere()
+        return _Sphere(
+            center=sphere.center,
+            inner_radius=sphere.inner_radius,
+            cone_radius=sphere.radius if is_small(sphere, extent) else 0.0,
+        )
+
+
+class AreaEmitters(Group):
+    """Area lights.
+
+    Emission: y_0 uniform on the shape, or by the texture where Mitsuba samples that rightly (area measure),
+    the direction by the cosine with the shading normal (solid angle). Next-event estimation is Mitsuba's, but
+    for textured lights that are sampled by shape and for spheres.
+    """
+
+    hittable = True
+
+    @classmethod
+    def of(cls, emitter) -> type[Group]:
+        return cls if _tells_its_points(emitter) else HitOnlyEmitters
+
+    def __init__(self, emitters, context: Context):
+        spheres = spheres_of(emitters)
+        pairs = list(zip(emitters, spheres, strict=True))
+        by_texture = [e and not context.ask_shapes and is_sampled_by_texture(e, s) for e, s in pairs]
+        by_shape = [e and is_textured(e) and not b for (e, _), b in zip(pairs, by_texture, strict=True)]
+        self.by_texture, self._by_shape = Mask(by_texture), Mask(by_shape)
+        if self._by_shape.any:
+            emitter = emitters[by_shape.index(True)]
+            refuse_curves(context.scene, emitter, "has a textured radiance on such a shape")
+        self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
+        self._surfaces = Surfaces(emitters, context, spheres, self._by_shape)
+        extent = 2 * context.scene.bbox().bounding_sphere().radius
+        found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
+        self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
+        self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
+        self._spheres = table(found)
+        for index, (emitter, _) in enumerate(pairs):
+            if by_texture[index] or found[index].inner_radius > 0:
+                check_densities(self, emitter, index)
+
+    # -- densities of points ----------------------------------------------------------------
+
+    def pdf_a(self, emitter, index, at, n, active):
+        """Density of emission's y_0 (area), without the selection. ``at`` has ``p``, ``uv``; ``n`` its
+        normal."""
+        density = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
+        if not self.by_texture.any:
+            return density
+        # A textured emitter samples its texture. It tells the area density only to a reference point
+        # at unit distance straight above.
+        textured = self.by_texture.at(index, active)
+        it = dr.zeros(mi.Interaction3f)
+        it.p = at.p + n
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p, ds.n, ds.uv, ds.d, ds.dist = at.p, n, at.uv, -mi.Vector3f(n), mi.Float(1)
+        return dr.select(textured, emitter.pdf_direction(it, ds, textured), density)
+
+    def direct_pdf_w(self, emitter, index, it, ds, active):
+        """Density with which next-event estimation at ``it`` samples ``ds`` (solid angle), without the
+        selection. Turns ``ds.n``, which callers build for this call alone.
+
+        A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon,
+        but its pdf_direction only up to the radius: wrong for points of the sphere itself.
+        """
+        # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
+        ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
+        pdf_w = emitter.pdf_direction(it, ds, active)
+        by_area = mi.Bool(False)
+        if self.any_inner:
+            sphere = look_up(self._spheres, index, active)
+            by_area |= active & (dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius))
+        if self._by_shape.any:
+            by_area |= self._by_shape.at(index, active)
+        inv_area = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
+        cos = dr.abs(dr.dot(ds.d, ds.n))
+        pdf_w = dr.select(by_area, inv_area * dr.square(ds.dist) / cos, pdf_w)
+        if self._any_cone:
+            narrow = self._cone_pdf_w(index, it.p, active)
+            pdf_w = dr.select(narrow > 0, narrow, pdf_w)
+        return pdf_w
+
+    def _cone_pdf_w(self, index, p, active):
+        """`quadrics.cone_pdf_w` of the emitter ``index``; 0 for one that is no small sphere."""
+        sphere = look_up(self._spheres, index, active)
+        return dr.select(active, cone_pdf_w(sphere.center, sphere.cone_radius, p), 0)
+
+    def upright(self, ps, index, active):
+        """`Surfaces.upright`."""
+        return self._surfaces.upright(ps, index, active)
+
+    # -- emission ---------------------------------------------------------------------------
+
+    def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
+        ps, n = self._surfaces.sample(chosen, u_point, shared, active)
+        local = mi.warp.square_to_cosine_hemisphere(u_direction)
+        si = mi.SurfaceInteraction3f(ps, shared.wavelengths)
+        si.t = mi.Float(0)
+        si.shape = chosen.emitter.get_shape()
+        si.wi = local
+        d = si.to_world(local)
+        pdf_a, pdf_w = ps.pdf, mi.warp.square_to_cosine_hemisphere_pdf(local)
+        cos = dr.abs(dr.dot(n, d))
+        radiance = chosen.emitter.eval(si, active)
+        return Emission(
+            # A density that is NaN leaves the weight NaN, to be counted.
+            weight=dr.select(pdf_a * pdf_w == 0, 0, radiance * (cos / (pdf_a * pdf_w))),
+            d=d,
+            anchor=self._surfaces.anchor(chosen, ps.p, n, ps.p, active),
+            cos=cos,
+            pdf_first=pdf_a,
+            pdf_second=pdf_w,
+            infinite=mi.Bool(False),
+            delta=mi.Bool(False),
+            beam=mi.Bool(False),
+            index=chosen.index,
+            si=si,
+        )
+
+    def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
+        return dr.maximum(dr.dot(emission.si.sh_frame.n, d), 0) * dr.inv_pi
+
+    def connection_density(self, chosen: Chosen, emission: Emission, si, active):
+        # In area measure: the solid-angle density at the hit times the geometric cosine at y_0.
+        ds = dr.zeros(mi.DirectionSample3f)
+        ds.p, ds.n, ds.uv = emission.si.p, emission.anchor.n, emission.si.uv
+        ds.time, ds.d, ds.emitter = emission.si.time, -emission.d, chosen.emitter
+        ds.dist = dr.norm(emission.si.p - si.p)
+        pdf_w = self.direct_pdf_w(chosen.emitter, chosen.index, mi.Interaction3f(si), ds, active)
+        return chosen.pmf * pdf_w * emission.cos
+
+    def radiance_towards(self, chosen: Chosen, emission: Emission, d, active):
+        si = mi.SurfaceInteraction3f(emission.si)
+        si.wi = si.to_local(d)
+        return chosen.emitter.eval(si, active)
+
+    # -- next-event estimation and hits -----------------------------------------------------
+
+    def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
+        ds, shading_pdf_w, weight = self._corrected(chosen, ds, weight, si, u, active)
+        n = self._surfaces.geometric_normal(ds, chosen.index, u, active)
+        cos_shading, pmf = dr.dot(ds.n, -ds.d), chosen.pmf
+        cos = dr.abs(dr.dot(n, ds.d))
+        to_geometric = mi.Float(1)
+        if self._surfaces.smooth:  # Mitsuba divides by the shading normal's cosine; the measure is geometric
+            to_geometric = dr.select(cos != dr.abs(cos_shading), dr.abs(cos_shading) / cos, 1)
+        pdf_w = shading_pdf_w * to_geometric * pmf
+        pdf_a = self.pdf_a(chosen.emitter, chosen.index, ds, n, active)
+        emitted = pmf * pdf_a * dr.maximum(cos_shading, 0) * dr.inv_pi
+        return Direct(
+            weight=weight_over(to_geometric * pmf, weight, shading_pdf_w),
+            pdf_w=pdf_w,
+            d=ds.d,
+            anchor=self._surfaces.anchor(chosen, ds.p, n, si.p, active),
+            infinite=mi.Bool(False),
+            delta=mi.Bool(False),
+            emission_ratio=emitted / (pdf_w * cos),
+        )
+
+    def _corrected(self, chosen, ds, weight, si, u, active):
+        """Mitsuba's sample, its density (solid angle, over the cosine with the shading normal) and weight,
+        where they are right; others elsewhere."""
+        emitter, index = chosen.emitter, chosen.index
+        if self._by_shape.any:
+            mask = self._by_shape.at(index, active)
+            ps = self._surfaces.sample_shape(chosen, u, si.time, mask)
+            by_shape, its_weight = _sample_shape(emitter, ps, si, mask)
+            ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
+        pdf_w = ds.pdf
+        if self._any_cone:
+            in_cone = self._cone_pdf_w(index, si.p, active)
+            narrow = in_cone > 0
+            pdf_w = dr.select(narrow, in_cone, pdf_w)
+            weight = dr.select(narrow, _radiance_over_density(emitter, ds, pdf_w, si, narrow), weight)
+        if self._lights_itself.any:
+            own = self._lights_itself.at(index, active) & (si.shape == emitter.get_shape())
+            weight = dr.select(own, 0, weight)
+        return ds, pdf_w, weight
+
+    def hit_densities(self, chosen: Chosen, hit: Hit, active):
+        si, ds = hit.si, hit.direction()
+        ds.n = mi.Normal3f(si.n)
+        pdf_w = chosen.pmf * self.direct_pdf_w(chosen.emitter, chosen.index, hit.previous, ds, active)
+        pdf_a = self.pdf_a(chosen.emitter, chosen.index, si, si.n, active)
+        direction = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
+        return pdf_w * hit.to_area(ds), chosen.pmf * pdf_a, direction
+
+
+def _sample_shape(emitter, ps, si, active):
+    """Next-event estimation by the uniform point ``ps`` of the emitter's shape, in Mitsuba's conventions: the
+    density is over the cosine with the shading normal, the weight is radiance over density."""
+    ds = dr.zeros(mi.DirectionSample3f)
+    ds.p, ds.n, ds.uv, ds.time, ds.emitter = ps.p, ps.n, ps.uv, si.time, emitter
+    between = ps.p - si.p
+    ds.dist = dr.norm(between)
+    ds.d = between / ds.dist
+    cos = dr.abs(dr.dot(ds.n, ds.d))
+    ds.pdf = dr.select(active & (cos > 0), ps.pdf * dr.square(ds.dist) / cos, 0)
+    return ds, _radiance_over_density(emitter, ds, ds.pdf, si, active)
+
+
+def _radiance_over_density(emitter, ds, pdf_w, si, active):
+    """Radiance of the point ``ds`` of an emitter on a surface towards ``si``, over its density ``pdf_w``."""
+    there = mi.SurfaceInteraction3f(ds, si.wavelengths)
+    there.wi = there.to_local(-ds.d)
+    return dr.select(pdf_w == 0, 0, emitter.eval(there, active) / pdf_w)
+
+
+# -- which area lights there are --------------------------------------------------------------
+
+
+def _tells_its_points(emitter) -> bool:
+    """Whether the points that the shape of an area light samples have a density and a radiance."""
+    shape = emitter.get_shape()
+    if shape is None:
+        raise UnsupportedError(
+            f"emitter {named(emitter)} is on a shape that Mitsuba does not tell (an ellipsoidsmesh); "
+            "use shape type ellipsoids, or a mesh"
+        )
+    if shape.shape_type() in CURVES:
+        raise UnsupportedError(
+            f"emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "
+            "sample; use a cylinder or a mesh"
+        )
+    sampled = shape.shape_type() in _SAMPLED
+    if not sampled and number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
+        return False
+    if is_textured(emitter):
+        _check_coordinates(emitter)
+    return not _reads_attributes(children(emitter)["radiance"])
+
+
+def _reads_attributes(texture) -> bool:
+    """Whether a texture reads a mesh's attributes, which need the number of a face; a sample has none."""
+    if texture.class_name() == "MeshAttribute":
+        return True
+    inner = (value for value in children(texture).values() if isinstance(value, mi.Texture))
+    return any(_reads_attributes(value) for value in inner)
+
+
+def _check_coordinates(emitter):
+    """Raise ``UsageError`` for a texture on a mesh that has no texture coordinates."""
+    shape = emitter.get_shape()
+    if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
+        raise UsageError(
+            f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
+            f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"
+        )

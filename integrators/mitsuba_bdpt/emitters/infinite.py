@@ -1,0 +1,123 @@
+"""Emitters at infinity: environments and directional emitters."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..geometry import rays
+from ..geometry.to_world import check_rotation
+from ..host.introspection import own_parameters
+from .disks import Disks
+from .group import Context, Group, emitting_point, free_emission, weight_over
+from .records import Chosen, Direct, Emission, Hit
+from .tables import Mask, rows
+
+# Numbers of an environment map that are looked at for its contrast, at most: 4 ms.
+_QUICKLY_READ = 1 << 20
+
+
+class InfiniteEmitters(Group):
+    """Environments and directional emitters.
+
+    Emission: the direction as Mitsuba's next-event estimation samples it (solid angle; fixed for a
+    directional one), then a point on `Disks` across it (area). So both densities of the direction are the
+    same, whatever the lit vertex. ``disks``: where light subpaths start.
+    """
+
+    hittable = at_infinity = True
+
+    @classmethod
+    def of(cls, emitter) -> type[Group]:
+        if not _is_directional(emitter) and "to_world" in own_parameters(emitter):
+            check_rotation(emitter)
+        return cls
+
+    @classmethod
+    def is_hittable(cls, emitter) -> bool:
+        return not _is_directional(emitter)
+
+    def __init__(self, emitters, context: Context):
+        self.disks = Disks(context.scene)
+        self._directional = Mask(rows(emitters, None, _is_directional))
+
+    # -- emission ---------------------------------------------------------------------------
+
+    def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
+        it = dr.zeros(mi.Interaction3f)
+        it.p, it.time, it.wavelengths = mi.Point3f(self.disks.scene.center), shared.time, shared.wavelengths
+        ds, weight = chosen.emitter.sample_direction(it, u_direction, active)
+        directional = self._directional.at(chosen.index, active)
+        d = -ds.d
+        p, pdf_a = self.disks.start(d, u_point)
+        weight = dr.select(ds.pdf == 0, 0, weight / pdf_a)
+        pdf_w = dr.select(directional, 1, ds.pdf)
+        si = emitting_point(p, shared)
+        si.wi = d
+        emission = free_emission(chosen.index, weight, d, pdf_w, pdf_a, directional, si)
+        emission.infinite = mi.Bool(True)
+        return emission
+
+    def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
+        return self.disks.pdf_a(p, d)
+
+    def connection_density(self, chosen: Chosen, emission: Emission, si, active):
+        return mi.Float(emission.pdf_first)
+
+    def radiance_towards(self, chosen: Chosen, emission: Emission, d, active):
+        value = dr.zeros(mi.Spectrum)
+        directional = self._directional.at(chosen.index, active)
+        if not self._directional.all:
+            si = mi.SurfaceInteraction3f(emission.si)
+            si.t = mi.Float(dr.inf)
+            value = chosen.emitter.eval(si, active & ~directional)
+        if self._directional.any:
+            # weight = E / (pdf_first pdf_second) with the selection
+            density = emission.pdf_first * emission.pdf_second
+            value = dr.select(directional, emission.weight * density, value)
+        return value
+
+    # -- next-event estimation and hits -----------------------------------------------------
+
+    def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
+        directional = self._directional.at(chosen.index, active)
+        return Direct(
+            weight=weight_over(chosen.pmf, weight, ds.pdf),
+            pdf_w=dr.select(directional, 1, ds.pdf) * chosen.pmf,
+            d=ds.d,
+            anchor=rays.free_anchor(ds.p),
+            infinite=mi.Bool(True),
+            delta=directional,
+            emission_ratio=self.disks.pdf_a(si.p, ds.d),
+        )
+
+    def hit_densities(self, chosen: Chosen, hit: Hit, active):
+        ds = hit.direction()
+        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
+        return pdf_w, mi.Float(pdf_w), self.disks.pdf_a(hit.previous.p, ds.d)
+
+
+def _is_directional(emitter) -> bool:
+    return emitter.class_name() == "DirectionalEmitter"
+
+
+def contrast(emitter) -> float:
+    """The largest radiance of an environment over its mean; infinite for other emitters, and where that would
+    take long to find out, where the numbers of an ``envmap`` are not radiances, or none that has a ratio."""
+    kind = emitter.class_name()
+    if kind == "ConstantBackgroundEmitter":
+        return 1.0
+    if kind != "EnvironmentMapEmitter" or mi.is_spectral:
+        return math.inf
+    data = own_parameters(emitter)["data"]
+    if dr.width(data) > _QUICKLY_READ:
+        return math.inf
+    pixels = np.array(data).max(axis=-1)
+    rings = np.sin(np.pi * (np.arange(len(pixels)) + 0.5) / len(pixels))
+    mean = float((pixels.mean(axis=1) @ rings) / rings.sum())
+    if not pixels.any():  # black everywhere
+        return 1.0
+    return float(pixels.max()) / mean if 0 < mean < math.inf else math.inf

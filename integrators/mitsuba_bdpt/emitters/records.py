@@ -1,0 +1,87 @@
+"""What every group of emitters tells a kernel: emissions and samples of next-event estimation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+
+
+@dataclass
+class Chosen:
+    """The emitters of the lanes: ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` the
+    probability of the selection."""
+
+    emitter: object
+    index: object
+    pmf: object
+
+
+@dataclass
+class Emission:
+    """Start of a light subpath; all fields have the width of the lanes.
+
+    ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start
+    of the ray, with position and geometric normal of y_0 (zero unless on a surface);
+    ``cos`` geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the room's head;
+    ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``beam`` mask: ``d`` is the only
+    direction that leaves y_0, so that nothing can be joined with y_0; ``index`` of the emitter; ``si`` the
+    emitting point for Mitsuba's calls.
+    """
+
+    weight: object
+    d: object
+    anchor: rays.Anchor
+    cos: object
+    pdf_first: object
+    pdf_second: object
+    infinite: object
+    delta: object
+    beam: object
+    index: object
+    si: object
+
+
+@dataclass
+class Direct:
+    """A sample of next-event estimation: y_0 for a given camera vertex.
+
+    ``weight`` radiance / ``pdf_w``; ``pdf_w`` solid angle at the camera vertex with the selection, or
+    the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
+    the visibility ray (unused where ``infinite``), ``met`` the number of its shape (None if the scene has
+    none so small that the ray asks for it, see `rounding.SMALL`); ``emission_ratio`` is
+    pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
+    geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
+    """
+
+    weight: object
+    pdf_w: object
+    d: object
+    anchor: rays.Anchor
+    infinite: object
+    delta: object
+    emission_ratio: object
+    met: object = None
+
+
+@dataclass
+class Hit:
+    """An emitter point ``si`` that a camera subpath has hit, or missed into, from its vertex ``previous``
+    (both as Mitsuba's calls take them), in the ``scene``."""
+
+    scene: object
+    si: object
+    previous: object
+
+    def direction(self) -> mi.DirectionSample3f:
+        """The hit as a sample of next-event estimation from ``previous``."""
+        ds = mi.DirectionSample3f(self.scene, self.si, self.previous)
+        ds.time = mi.Float(self.si.time)
+        return ds
+
+    def to_area(self, ds):
+        """What turns the density of ``ds`` from solid angle into area."""
+        return dr.abs(dr.dot(self.si.n, ds.d)) / dr.square(ds.dist)

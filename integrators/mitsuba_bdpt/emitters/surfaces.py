@@ -1,0 +1,124 @@
+"""Points on the shapes of emitters, and their normals, which Mitsuba does not give everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import UnsupportedError, UsageError
+from ..geometry import rays
+from ..geometry.quadrics import Sphere, sphere_normal
+from ..geometry.smooth_meshes import SmoothMeshes
+from ..geometry.to_world import check_to_world
+from ..host.introspection import all_shapes, named
+from .group import Context
+from .tables import Mask, look_up, rows, table
+
+CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
+
+
+@dataclass
+class _Turned:
+    """A sphere whose sampled normals are turned with its points: ``outward`` see `Sphere`, 0 where normals
+    are right as they are."""
+
+    center: object = (0, 0, 0)
+    outward: object = 0.0
+
+
+class Surfaces:
+    """The shapes of a group of emitters.
+
+    Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
+    are (`Sphere` or None), and ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
+    their shape here. ``inv_area`` of each shape, by its emitter's index; ``smooth``: whether one has
+    interpolated normals. Raises ``UsageError`` and ``UnsupportedError`` for shapes that Mitsuba samples
+    wrongly or not at all.
+    """
+
+    def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
+        for emitter in filter(None, emitters):
+            _check(emitter, context)
+        areas = rows(emitters, 1.0, lambda emitter: dr.slice(emitter.get_shape().surface_area()))
+        if 0 in areas:
+            emitter = emitters[areas.index(0)]
+            raise UsageError(
+                f"emitter {named(emitter)} is on a shape without area ({named(emitter.get_shape())}); "
+                "remove it, or give it some"
+            )
+        self.inv_area = dr.rcp(mi.Float(areas))
+        dr.make_opaque(self.inv_area)
+        self._by_shape, self._context = by_shape, context
+        self._smooth_meshes = SmoothMeshes.of(emitters)
+        self.smooth = self._smooth_meshes is not None
+        turned = [s is not None and s.turned for s in spheres]
+        self._turned = None
+        if any(turned):
+            pairs = zip(spheres, turned, strict=True)
+            self._turned = table([_Turned(s.center, s.outward) if t else _Turned() for s, t in pairs])
+
+    def sample(self, chosen, u, shared, active):
+        """A point on the shape of each emitter (``PositionSample3f``, density over area), and its geometric
+        normal up to the sign."""
+        emitter, index = chosen.emitter, chosen.index
+        if self._context.ask_shapes:
+            ps = emitter.get_shape().sample_position(shared.time, u, active)
+        else:
+            # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
+            ps, _ = emitter.sample_position(shared.time, u, active)
+            if self._by_shape is not None and self._by_shape.any:
+                mask = self._by_shape.at(index, active)
+                ps = dr.select(mask, emitter.get_shape().sample_position(shared.time, u, mask), ps)
+        ps = self.upright(ps, index, active)
+        return ps, self.geometric_normal(ps, index, u, active)
+
+    def sample_shape(self, chosen, u, time, active):
+        """A point that the shape of each emitter samples, whatever the emitter would."""
+        ps = chosen.emitter.get_shape().sample_position(time, u, active)
+        return self.upright(ps, chosen.index, active)
+
+    def upright(self, ps, index, active):
+        """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
+        if self._turned is not None:
+            sphere = look_up(self._turned, index, active)
+            n = sphere_normal(ps.p, sphere.center, sphere.outward)
+            ps.n = dr.select(sphere.outward != 0, n, ps.n)
+        return ps
+
+    def geometric_normal(self, ps, index, u, active):
+        """Geometric normal, up to its sign, at the point that a shape sampled from ``u``.
+
+        Meshes report the interpolated vertex normal there; all other shapes the geometric one.
+        """
+        if self._smooth_meshes is None:
+            return ps.n
+        return self._smooth_meshes.normal(ps.n, index, u.y, active)
+
+    def anchor(self, chosen, p, n, reference, active) -> rays.Anchor:
+        """Where rays to or from ``reference`` end or start at the point ``p`` with the normal ``n``."""
+        errors = self._context.shape_errors.at(chosen.emitter.get_shape(), active)
+        return rays.sampled_anchor(p, n, reference, errors)
+
+
+def spheres_of(emitters) -> list[Sphere | None]:
+    """The shapes of ``emitters`` that are spheres."""
+    return rows(emitters, None, lambda emitter: Sphere.of(emitter.get_shape()))
+
+
+def _check(emitter, context: Context):
+    check_to_world(emitter.get_shape(), f"emitter {named(emitter)}")
+    if context.ask_shapes:
+        refuse_curves(context.scene, emitter, "lives with a class that has no sample_position")
+
+
+def refuse_curves(scene, emitter, why: str):
+    """Raise ``UnsupportedError`` if a call on shapes, which ``emitter`` needs, would meet curves: they have
+    no ``sample_position``."""
+    for shape in all_shapes(scene):
+        if shape.shape_type() in CURVES:
+            raise UnsupportedError(
+                f"emitter {named(emitter)} {why}, which is not supported beside curves "
+                f"({named(shape)}); remove one of them, or use integrator type 'path'"
+            )

@@ -1,0 +1,52 @@
+"""Emitters whose class is not Mitsuba's."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from .group import Context, Group, weight_over
+from .records import Chosen, Direct, Hit
+
+
+class ThirdPartyEmitters(Group):
+    """Emitters of users' own classes: only the calls that camera subpaths need are used.
+
+    No light subpath starts from them. Their density has its own idea of a normal: it gets that of Mitsuba's
+    ``DirectionSample3f``, not the geometric one.
+    """
+
+    supports_emission = connectible_to_sensor = False
+    limits = "its class is not Mitsuba's: only the calls that camera subpaths need are used"
+
+    @classmethod
+    def is_hittable(cls, emitter) -> bool:
+        return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+
+    def __init__(self, emitters, context: Context):
+        on_shapes = any(emitter.get_shape() is not None for emitter in filter(None, emitters))
+        self._shape_errors = context.shape_errors if on_shapes else None
+
+    def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
+        flags = chosen.emitter.flags()
+        delta = mi.has_flag(flags, mi.EmitterFlags.Delta) | ds.delta
+        n = dr.select(mi.has_flag(flags, mi.EmitterFlags.Surface), ds.n, 0)
+        errors = None
+        if self._shape_errors is not None:
+            errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
+        return Direct(
+            weight=weight_over(chosen.pmf, weight, ds.pdf),
+            pdf_w=dr.select(delta, 1, ds.pdf) * chosen.pmf,
+            d=ds.d,
+            anchor=rays.sampled_anchor(ds.p, n, si.p, errors),
+            infinite=mi.has_flag(flags, mi.EmitterFlags.Infinite),
+            delta=delta,
+            emission_ratio=mi.Float(0),
+        )
+
+    def hit_densities(self, chosen: Chosen, hit: Hit, active):
+        ds = hit.direction()
+        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
+        connect = dr.select(hit.si.is_valid(), pdf_w * hit.to_area(ds), pdf_w)
+        return connect, mi.Float(0), mi.Float(0)

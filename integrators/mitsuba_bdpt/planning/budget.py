@@ -1,0 +1,76 @@
+"""Which renders can afford a pilot, and of how many samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from ..settings import Settings
+from ..transport.plan import Plan
+
+# Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
+# `LEAST_SAMPLES` has none. A pilot's sample takes several times as long as one of path tracing alone,
+# and recording it longer than all of a short pilot's samples (scripts/overhead.py): 2 % of a render of
+# `CHEAP_SAMPLES` of path tracing alone. In between a pilot is asked where the scene alone does not tell what
+# pays: it is asked once for all renders of a scene, and what it decides is faster than a guess even in the
+# first (docs/method/skipping.md).
+PILOT_SHARE = 1 / 1024
+LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
+LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
+
+# The least number in scenes of many BSDFs (`bsdf.MANY`), where the pilot's kernel takes 1.5 seconds to
+# compile: a preview of 256^2 pixels at 32 samples each takes no longer. (In a room of 27 materials a pilot
+# changed the efficiency of 2^17 samples by 1.06 and of 2^19 by 0.88, once nothing had to be compiled.)
+LEAST_OF_MANY = 1 << 22
+
+# What a render is taken for whose number of samples is only a bound, see `expected_samples`.
+PROVISIONAL_SAMPLES = 1 << 20
+
+# Films of fewer pixels ask no pilot, which takes splats for as noisy as those of an image of many pixels, and
+# have a light subpath for each camera subpath, since those that share one are correlated.
+FEW_PIXELS = 64
+
+
+def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
+    """Samples still to come of a render with ``left`` more at most.
+
+    Under ``timeout`` and ``target_error`` nobody knows: as many as are ``done``, or `PROVISIONAL_SAMPLES`. (A
+    pilot that takes half of the render would be as bad as one that sees rare paths which the render does not
+    meet.)
+    """
+    open_end = settings.target_error > 0 or 0 <= settings.timeout < math.inf
+    return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
+
+
+def least_samples(traits) -> int:
+    """How many samples a render needs for a pilot; `bsdf.Traits` of its scene."""
+    return LEAST_OF_MANY if traits.asked.many else LEAST_SAMPLES
+
+
+def lanes(samples: int) -> int:
+    """Samples of the pilot of a render of so many, which are enough for one."""
+    return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
+
+
+def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
+    """What a render begins with: ``full``, unless its film has few pixels.
+
+    Then there is a light subpath for each camera subpath, unless parameters say how many.
+    """
+    return (
+        replace(full, camera_paths_per_light_path=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
+    )
+
+
+def is_open(full: Plan, settings: Settings) -> bool:
+    """Whether there is something to choose: nothing is given by hand, and light subpaths are possible."""
+    return full.light and not is_by_hand(settings)
+
+
+def is_by_hand(settings: Settings) -> bool:
+    """Whether parameters say what is done. (Strategy images want all strategies.)"""
+    return not _is_auto(settings) or settings.decisions is not None or settings.strategy_images
+
+
+def _is_auto(settings: Settings) -> bool:
+    return settings.skip == settings.light_paths == settings.connections == "auto"

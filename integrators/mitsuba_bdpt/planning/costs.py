@@ -1,0 +1,49 @@
+"""What a sample costs, counted from what the pilot's subpaths did."""
+
+from __future__ import annotations
+
+import math
+
+from .configuration import Configuration
+
+# What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
+# it). Fitted to candidates in 29 scenes on two cores (docs/reports/choices.json): off by 6 % (root mean
+# square) for the ratios of their times.
+COSTS = {
+    "light_path": 1.7,  # to start a light subpath
+    "far": 2.0,  # beside it, to start one from infinity
+    "light": 0.76,  # each of its rays
+    "inner": 0.55,  # to look for connections at all, per sample
+    "joined": 0.65,  # a connection that is drawn and tested
+    "shadow_inner": 0.65,  # each that is tested, where all are
+    "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
+}
+
+# What a render takes besides its samples, most of it to record its kernel, in the same unit: with path
+# tracing alone, for light subpaths beside it, for connections. (Renders of 2 samples of 16^2 pixels in seven
+# scenes: 8 to 13 ms, 8 to 17 ms, 0 to 2 ms, where a ray takes 34 to 53 ns on two cores.) Previews of 128^2 at
+# 4 samples per pixel have 200,000 to 500,000 rays.
+FIXED = {"start": 180e3, "light": 250e3, "inner": 20e3}
+
+# Numbers of BSDFs from which on, and up to which, the lanes of a packet take turns in evaluating theirs.
+FEW_BSDFS, MANY_BSDFS = 4, 16
+
+
+def cost(candidate: Configuration, rays: dict, samples: float = math.inf) -> float:
+    """Cost of a sample in a render of so many ``samples``; that of path tracing alone is 1.
+
+    What is `FIXED` is included. ``rays`` per sample of the pilot, see `moments.Moments`.
+    """
+    total = camera = rays["camera"] + rays["shadow_s1"] + FIXED["start"] / samples
+    if candidate.light_paths:
+        total += FIXED["light"] / samples
+        light = COSTS["light_path"] + COSTS["far"] * rays["far"]
+        light += COSTS["light"] * (rays["light"] + rays["shadow_t1"])
+        total += light * candidate.light_paths
+    if candidate.connections != "none":
+        total += FIXED["inner"] / samples
+        kind = "joined" if candidate.connections == "one" else "shadow_inner"
+        total += COSTS["inner"] + COSTS[kind] * rays[kind]
+        part = (rays["bsdfs"] - FEW_BSDFS) / (MANY_BSDFS - FEW_BSDFS)
+        total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
+    return total / camera

@@ -1,0 +1,126 @@
+"""Decisions: the configurations that a render adopts, and their JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from ..errors import UsageError
+from ..settings import CONNECTIONS, LIGHT_PATHS
+from .configuration import Configuration
+
+# Contributions below a share of the image's mean play roulette before their ray is traced: below this one,
+# and below this multiple of a sample's relative variance. It adds at most the share to the variance, in most
+# scenes a tenth of that, but all of it in a furnace, where hardly anything else is noisy.
+MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
+
+# Of a recorded number: what single precision still holds when it is multiplied.
+LARGEST = 1e30
+
+# Entries of a record, see `Decision.record`.
+ENTRIES = ("pass", "light_paths", "connections", "coefficients", "cost", "variance", "mean")
+
+
+@dataclass(frozen=True)
+class Decision(Configuration):
+    """The configuration of a render from the pass number ``first_pass`` on, and what was predicted of it.
+
+    ``cost`` of a sample (path tracing alone: 1), its ``variance`` as in `choice.Prediction`, and the
+    image's ``mean``, the scale of roulette."""
+
+    first_pass: int
+    cost: float
+    variance: float
+    mean: float
+
+    @classmethod
+    def of(cls, chosen: Configuration, first_pass: int, **predicted: float) -> Decision:
+        """The decision for a configuration of which ``cost``, ``variance`` and ``mean`` are predicted.
+
+        They have six digits: further ones depend on the order in which a pilot's lanes were added up.
+        """
+        predicted = {name: float(f"{number:.6g}") for name, number in predicted.items()}
+        return cls(**asdict(chosen), first_pass=first_pass, **predicted)
+
+    @property
+    def threshold(self) -> float:
+        """The size below which contributions play roulette."""
+        return self.mean * min(MOST_ROULETTE, ROULETTE_PER_VARIANCE * self.variance)
+
+    def record(self) -> dict:
+        """As in ``statistics["decisions"]``."""
+        return {
+            "pass": self.first_pass,
+            "light_paths": self.light_paths,
+            "connections": self.connections,
+            "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
+            "cost": self.cost,
+            "variance": self.variance,
+            "mean": self.mean,
+        }
+
+
+def read_decisions(text: str) -> tuple[Decision, ...]:
+    """The parameter ``decisions``: JSON as in ``statistics``.
+
+    An empty list means a render without a pilot. Raises `UsageError` saying what is wrong, and in which
+    entry.
+    """
+    where, made = "", []
+    try:
+        entries = json.loads(text)
+        if not isinstance(entries, list):
+            raise TypeError("a list of decisions is needed")
+        for number, entry in enumerate(entries):
+            where = f"entry {number}"
+            made.append(_read_decision(entry))
+        where = ""
+        passes = [decision.first_pass for decision in made]
+        if passes != sorted(set(passes)):
+            raise ValueError(f"passes {passes} must rise")
+        return tuple(made)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        says = f"{where}: {error}" if where else error
+        what = f"{where} lacks {error}" if isinstance(error, KeyError) else says
+        raise UsageError(
+            f"decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: {what}"
+        ) from error
+
+
+def _read_decision(entry: dict) -> Decision:
+    if not isinstance(entry, dict) or not isinstance(entry.get("coefficients", {}), dict):
+        raise TypeError(f"{entry!r} is no decision")
+    light_paths, connections = _number(entry, "light_paths"), entry["connections"]
+    if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
+        raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
+    if not light_paths and connections != "none":
+        raise ValueError(f"connections={connections!r} without light paths")
+    if unknown := set(entry) - set(ENTRIES):
+        raise ValueError(f"{sorted(unknown)[0]} is no part of a decision")
+    if isinstance(entry["pass"], bool) or not isinstance(entry["pass"], int):
+        raise TypeError(f"pass={entry['pass']!r}")
+    numbers = {
+        "first_pass": entry["pass"],
+        "kappa_light": _number(entry["coefficients"], "t<=1"),
+        "kappa_direct": _number(entry["coefficients"], "s=1"),
+        **{name: _number(entry, name) for name in ("cost", "variance", "mean")},
+    }
+    for name, value in numbers.items():
+        least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
+        if not least <= value <= LARGEST:
+            raise ValueError(f"{name}={value!r}")
+    return Decision(light_paths=light_paths, connections=connections, **numbers)
+
+
+def _number(entry: dict, name: str) -> float:
+    """A number of JSON: neither a boolean, which Python takes for one, nor text that holds one."""
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}={value!r} must be a number")
+    return float(value)
+
+
+def replayed(decision: Decision) -> list[dict]:
+    """What a replayed decision leaves out, as in ``statistics["skipped"]``."""
+    names = ["t<=1"] * (not decision.light_paths) + ["inner"] * (decision.connections == "none")
+    return [{"class": name, "level": "by hand", "why": "decisions"} for name in names]

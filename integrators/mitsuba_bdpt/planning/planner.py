@@ -1,0 +1,215 @@
+"""Decides how a render goes on: by parameters, by the scene alone, or by pilots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from ..host.jit import evaluated_mode, gc_paused
+from ..sampling.sequences import PILOT, sequence_seed
+from ..settings import Settings
+from ..transport.plan import Plan
+from . import budget, choice, even_sky, pilot
+from .candidates import candidates
+from .decision import Decision, replayed
+from .explain import words
+from .findings import Findings
+from .moments import Moments
+from .possible import plan, unreachable_paths
+
+# Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
+FIRST_REPEAT = 32
+
+# Share of a render after which none is asked any more: what is left has to pay for it.
+LATEST_REPEAT = 1 / 4
+
+# Why a pilot that was asked decides nothing.
+SAW_NOTHING = "it saw nothing, or no finite value"
+
+
+class Pilots(NamedTuple):
+    """How many pilots were ``asked``, and when the next one is due.
+
+    Of so many of them the findings were ``remembered``; ``repeat``: samples per pixel after which the next
+    one is due.
+    """
+
+    asked: int = 0
+    remembered: int = 0
+    repeat: int = FIRST_REPEAT
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What a render has decided so far; a part of its progress.
+
+    ``left_out``: what the last of the ``decisions`` does without, as in ``statistics["skipped"]``;
+    ``no_pilot``: why the first pilot was not asked, or decided nothing; ``moments`` of all pilots."""
+
+    decisions: tuple[Decision, ...] = ()
+    left_out: tuple[dict, ...] = ()
+    no_pilot: str = ""
+    moments: Moments | None = None
+    pilots: Pilots = Pilots()
+
+
+class Planner:
+    """The ``plan`` of one render of ``spp`` samples per pixel, and who decides it.
+
+    ``full``: the plan before any decision; ``threshold`` of roulette, in units of the image, or ``None``
+    before a decision; ``changes``: how often a decision made another plan of it; ``decided``: what goes on
+    with the render. All methods take ``passes``, the samples per pixel of each pass that is done."""
+
+    # What pilots draw is the same in renders of all seeds, so that all decide alike. (Of 32 the one
+    # whose choices have the least time times error in the scenes of docs/reports/choices.json.)
+    pilot_seed = 30
+
+    def __init__(self, prepared, settings: Settings, spp: int, findings: Findings):
+        self._prepared, self._settings, self._spp, self._findings = prepared, settings, spp, findings
+        self._pixels = int(prepared.camera.region.size.prod())
+        self.full = self.plan = budget.first_plan(plan(prepared, settings), settings, self._pixels)
+        self.threshold, self.changes, self.decided = None, 0, Decided()
+
+    def begin(self, passes: tuple) -> bool:
+        """Adopt what the scene alone decides, before the first pass.
+
+        Returns whether a pilot is to be asked about what is still to come.
+        """
+        settled, decision = self._settled(passes)
+        if not passes and self._settings.decisions is None:
+            self.decided = replace(self.decided, no_pilot=settled)
+        if decision and not passes:
+            self.adopt(decision, even_sky.LEFT_OUT)
+        return not settled
+
+    def is_repeat_due(self, passes: tuple) -> bool:
+        """Whether it is time for another pilot, early in a long render; true once for each time."""
+        pilots, done = self.decided.pilots, sum(passes)
+        if not passes or done < pilots.repeat or self._settings.variance or self._settings.decisions:
+            return False
+        repeat = pilots.repeat
+        while repeat <= done:
+            repeat *= 4
+        self.decided = replace(self.decided, pilots=pilots._replace(repeat=repeat))
+        # A scene's sampler cannot start again in the middle of its samples.
+        return done <= LATEST_REPEAT * self._spp and self._settings.points != "sampler"
+
+    def ask(self, passes: tuple) -> list[choice.Prediction]:
+        """Ask a pilot and adopt what it says; returns its predictions, the best first."""
+        samples = self._expected(passes)
+        moments = self._measured(budget.lanes(samples), samples)
+        self.decided = replace(self.decided, moments=moments)
+        table = choice.choose(moments, self._alternatives(samples))
+        if not moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
+            table = []
+        if table:
+            self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table))
+        self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
+        return table
+
+    def _measured(self, count: int, samples: int) -> Moments:
+        """What a pilot of ``count`` samples finds (see `pilot.measure`), joined with those before.
+
+        Where the same one was traced in an earlier render, and nothing was edited since, that is remembered:
+        it would find the same.
+        """
+        pilots, before = self.decided.pilots, self.decided.moments
+        pilots = pilots._replace(asked=pilots.asked + 1)
+        self.decided = replace(self.decided, pilots=pilots)
+        stands_for = samples / count
+
+        def trace() -> Moments:
+            seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.asked)
+            flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
+            with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
+                return pilot.measure(self._prepared, self.full, self._settings, seed, count, stands_for)
+
+        key = self._settings, self.pilot_seed, pilots.asked, count, stands_for
+        found, is_known = self._findings.find("pilots", key, trace)
+        pilots = pilots._replace(remembered=pilots.remembered + is_known)
+        self.decided = replace(self.decided, pilots=pilots)
+        return found if before is None else before.joined(found)
+
+    def replay(self, passes: tuple):
+        """Adopt the decision that the parameters give for the next pass, if there is one."""
+        for decision in self._settings.decisions or ():
+            if decision.first_pass == len(passes):
+                self.adopt(decision, replayed(decision))
+                before = self._lost(self.full)
+                for lost in self._lost(self.plan):
+                    if lost not in before:
+                        mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {words(lost)}")
+
+    def _lost(self, p: Plan):
+        return unreachable_paths(self._prepared, p, self._settings)
+
+    def adopt(self, decision: Decision, left_out):
+        """Plan as decided from now on.
+
+        If that differs from before, with points of their own: lanes serve other samples, and what was half
+        done of the old sequence would not be finished.
+        """
+        adopted = replace(decision.plan(self.full), skipped=(*self.full.skipped, *left_out))
+        begun = self.decided.decisions or decision.first_pass
+        if begun and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
+            self.changes += 1
+        decisions = (*self.decided.decisions, decision)
+        self.decided = replace(self.decided, decisions=decisions, left_out=tuple(left_out))
+        self.threshold, self.plan = decision.threshold, adopted
+
+    def restore(self, decided: Decided):
+        """Go on from what was decided in an earlier part of the render."""
+        for decision in decided.decisions:
+            self.adopt(decision, decided.left_out)
+        self.decided = decided
+
+    def certainty(self, passes: tuple) -> float:
+        """`choice.certainty` of what the pilots decided."""
+        return choice.certainty(self.decided.moments, self._alternatives(self._expected(passes)))
+
+    def lost_by_pilots(self) -> int:
+        """Values of the pilots that were not finite, and counted as zero."""
+        moments = self.decided.moments
+        return 0 if moments is None else round(moments.rays["non_finite"] * moments.lanes)
+
+    def why_no_pilot(self, passes: tuple = ()) -> str:
+        """Why there is no table of a pilot's, as a sentence."""
+        return f"no pilot: {self._settled(passes)[0] or SAW_NOTHING}"
+
+    def _settled(self, passes: tuple) -> tuple[str, Decision | None]:
+        """Why no pilot is asked about the rest of the render, and what is decided without one.
+
+        The reason is empty if one is asked; the decision is ``None`` if there is none.
+        """
+        if not budget.is_open(self.full, self._settings):
+            by_hand = budget.is_by_hand(self._settings)
+            why = "chosen by hand" if by_hand else "light subpaths cannot add anything"
+            return f"there is nothing to choose: {why}", None
+        if self._pixels < budget.FEW_PIXELS:
+            return f"it says nothing about films of fewer than {budget.FEW_PIXELS} pixels", None
+        samples = self._expected(passes)
+        whole = sum(passes) * self._pixels + samples
+        if decision := even_sky.decision(self._prepared, self.full, self._settings, whole):
+            return "the scene alone decides in a render as short as this", decision
+        if samples < (least := budget.least_samples(self._prepared.traits)):
+            return f"{samples} samples are too few, it takes {least}", None
+        return "", None
+
+    def _alternatives(self, samples: int) -> choice.Alternatives:
+        """What may be done with so many ``samples`` that are still to come."""
+        possible = candidates(self._prepared, self.full, self._settings)
+        return choice.Alternatives(possible, self._has_stratified_points(), samples)
+
+    def _expected(self, passes: tuple) -> int:
+        """Samples still to come, as far as that is known."""
+        done = sum(passes)
+        left = (self._spp - done) * self._pixels
+        return budget.expected_samples(self._settings, left, done * self._pixels)
+
+    def _has_stratified_points(self) -> bool:
+        if self._settings.points == "sampler":
+            return self._prepared.camera.sensor.sampler().class_name() != "IndependentSampler"
+        return self._settings.points == "sobol"

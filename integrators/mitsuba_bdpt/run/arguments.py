@@ -1,0 +1,85 @@
+"""The arguments of a render, checked."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from ..errors import UsageError, UsageTypeError
+from ..host.introspection import named
+from ..parameters import integer, is_index
+from .schedule import REPLICATES
+from .snapshot import Snapshot
+
+
+def check_made_for(integrator, scene):
+    """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
+    for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
+        if not isinstance(thing, kind):
+            raise UsageTypeError(
+                f"{name}={type(thing).__name__} was not loaded under the present variant "
+                f"{mi.variant()}; load it again after mi.set_variant"
+            )
+
+
+def check_resumable(start, settings):
+    """Raise `UsageError` or `UsageTypeError` if a render cannot go on from ``start``."""
+    if not isinstance(start, Snapshot):
+        raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
+    if not start.progress.whole:
+        raise UsageError("start=... was joined or reduced for joining; only assemble() can use it")
+    if settings.points == "sampler":
+        raise UsageError(
+            "start with points=sampler is not possible: a scene's sampler cannot start in the middle "
+            "of its samples; use points=sobol"
+        )
+
+
+def resolve_sensor(scene, sensor):
+    """The sensor that the argument ``sensor`` means, an index or the sensor itself.
+
+    Raises `UsageError` and `UsageTypeError`.
+    """
+    if isinstance(sensor, mi.Sensor):
+        return sensor
+    if not is_index(sensor):
+        raise UsageTypeError(f"sensor={sensor!r} must be an index or one of scene.sensors()")
+    sensors = scene.sensors()
+    if not sensors:
+        raise UsageError("the scene has no sensor; add one, for example of type perspective")
+    if not 0 <= sensor < len(sensors):
+        raise UsageError(f"sensor={sensor} does not exist; the scene has {len(sensors)} sensor(s)")
+    return sensors[int(sensor)]
+
+
+def samples_per_pixel(sensor, spp, settings) -> int:
+    """Samples per pixel of a render that was asked for ``spp``."""
+    spp = integer(spp, "spp", 0) or int(sensor.sampler().sample_count())
+    if not spp:
+        raise UsageError(
+            f"spp=0 stands for the sample_count of the sampler of sensor {named(sensor)}, which is 0 "
+            "too; set one of them to 1 or more"
+        )
+    if settings.variance and spp < REPLICATES:
+        raise UsageError(
+            f"variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
+            "samples per pixel, one for each independent part of the render"
+        )
+    if settings.points == "sampler":
+        return _whole_sets(sensor.sampler().clone(), spp, REPLICATES if settings.variance else 1)
+    return spp
+
+
+def _whole_sets(sampler, spp: int, parts: int) -> int:
+    """``spp``, rounded up to what the sampler makes: stratified samplers do not make any number.
+
+    Each of ``parts`` (see `schedule.schedule`) is such a number.
+    """
+
+    def made(count):
+        sampler.set_sample_count(count)
+        return int(sampler.sample_count())
+
+    most = -(-spp // parts)
+    if all(made(count) == count for count in {spp // parts, most}):
+        return spp
+    return parts * made(most)

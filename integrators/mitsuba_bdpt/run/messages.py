@@ -1,0 +1,94 @@
+"""What is logged of a render: its statistics, and warnings about parameters that spoil images."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import mitsuba as mi
+
+from ..host.introspection import all_shapes, is_instance
+from ..host.notices import warn_once
+from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
+
+# Culprits that a message names, at most.
+NAMED = 5
+
+
+def log(statistics: dict):
+    """Log what a render did, and warn if its error is not known."""
+    seconds = statistics["seconds"]
+    mi.Log(
+        mi.LogLevel.Info,
+        f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
+        f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
+    )
+    if statistics["no_pilot"]:
+        mi.Log(mi.LogLevel.Info, f"bdpt: no pilot: {statistics['no_pilot']}")
+    for made in statistics["decisions"]:
+        mi.Log(mi.LogLevel.Info, f"bdpt: decided: {json.dumps(made)}")
+    for left_out in statistics["skipped"]:
+        mi.Log(mi.LogLevel.Info, f"bdpt: skipped: {json.dumps(left_out)}")
+    if statistics.get("error") == math.inf:
+        mi.Log(
+            mi.LogLevel.Warn,
+            "bdpt: the render ended before four of the parts that the error follows from were whole; ask "
+            "for no more samples per pixel than timeout allows",
+        )
+
+
+def warn_of_parameters(scene, sensor):
+    """Say once what in the ``scene`` spoils images."""
+    bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
+    narrow = narrow_spots(scene)
+    if bright:
+        warn_once(
+            scene,
+            sensor,
+            f"bdpt: {_some(bright)}: more light returns than arrives, and where it cannot "
+            "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
+        )
+    if narrow:
+        warn_once(
+            scene,
+            sensor,
+            f"bdpt: {_some(narrow)}: Mitsuba rounds how the light falls off across so narrow a cone, with "
+            "every integrator, and strategies do not agree about it; make it 0.2 degrees or more",
+        )
+
+
+def _some(found: list[str]) -> str:
+    """The first `NAMED` of them, and how many more there are."""
+    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    return ", ".join(found[:NAMED]) + more
+
+
+def warn_of_late_decisions(decisions, passes: int):
+    """Warn of ``decisions`` for passes that the render of so many did not have."""
+    late = [decision.first_pass for decision in decisions or () if decision.first_pass >= passes]
+    if late:
+        mi.Log(
+            mi.LogLevel.Warn,
+            f"bdpt: decisions from pass {', '.join(map(str, late))} on never began: the render had passes "
+            f"0 to {passes - 1}",
+        )
+
+
+def warn_of_non_finite(statistics: dict, scene):
+    """Warn of values that were not finite, and name the parameters in which to look for the cause.
+
+    Of each render, since it is about its image.
+    """
+    lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
+    if not (lost or in_pilot):
+        return
+    parts = [f"{lost} values were not finite and count as zero"]
+    if in_pilot:
+        parts.append(f"so did {in_pilot} of the pilot, which decided from the rest")
+    named = not_finite(scene)
+    parts.append(
+        f"NaN or infinity is in {_some(named)}"
+        if named
+        else "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
+    )
+    mi.Log(mi.LogLevel.Warn, f"bdpt: {'; '.join(parts)}")

@@ -1,0 +1,74 @@
+"""What the lanes of a kernel count."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Counters:
+    """Numbers (``UInt32``) of what a lane has done; None for what is not counted, which costs nothing.
+
+    Rays by kind: closest hits of ``camera`` and ``light`` subpaths, shadow rays of s = 1, t = 1 (with (1,1))
+    and inner connections. Inner connections by what became of them: ``evaluated``, of these ``zero``;
+    ``rouletted`` (splats too) have no ray. ``non_finite``: values that count as zero because they are not
+    finite: contributions (those of s = 1 and t <= 1 if they are visible, inner ones before it is known),
+    subpaths that end for want of a finite throughput, colours, features.
+
+    Records are added up, never changed: Dr.Jit's loops would not see it.
+    """
+
+    camera: object = None
+    light: object = None
+    shadow_s1: object = None
+    shadow_t1: object = None
+    shadow_inner: object = None
+    evaluated: object = None
+    zero: object = None
+    rouletted: object = None
+    non_finite: object = None
+
+    @staticmethod
+    def zeros(*names: str) -> Counters:
+        """Counters of these ``names`` at 0. Loops hold only those that they change, see `Walk`."""
+        return Counters(**{name: mi.UInt32(0) for name in names})
+
+    def __add__(self, other: Counters) -> Counters:
+        def added(a, b):
+            return b if a is None else a if b is None else a + b
+
+        return Counters(*(added(getattr(self, name), getattr(other, name)) for name in COUNTERS))
+
+    def summed(self):
+        """The lanes' counters added up: ``UInt64``, in the order of `COUNTERS`."""
+        total = dr.zeros(mi.UInt64, len(COUNTERS))
+        for i, name in enumerate(COUNTERS):
+            if (value := getattr(self, name)) is not None:
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add, total, mi.UInt64(value), mi.UInt32(i), mode=dr.ReduceMode.Expand
+                )
+        return total
+
+
+COUNTERS = tuple(field.name for field in fields(Counters))
+
+
+def one(mask):
+    """1 in lanes where ``mask`` holds, else 0."""
+    return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
+
+
+def counted_by_light(plan) -> Counters:
+    """What the vertices of light subpaths count."""
+    names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
+    return Counters.zeros(*names, *["non_finite"] * (plan.splat or plan.arrival))
+
+
+def counted_by_camera(plan) -> Counters:
+    """What the vertices of camera subpaths count."""
+    one = plan.connections == "one"
+    names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
+    return Counters.zeros(*names, *["shadow_inner", "evaluated", "zero"] * (plan.connections != "none"))

@@ -1,0 +1,111 @@
+"""What a kernel is given besides its batch: scene, strategies in use, their coefficients, limits."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..settings import MAX_STORED, UNLIMITED
+from . import mis
+from .observer import Observer
+
+# Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
+STORE_SIZES = (64, MAX_STORED)
+
+
+@dataclass
+class Coefficients:
+    """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`; the Python
+    number 0 for classes that are not in use."""
+
+    hit: object
+    direct: object
+    splat: object
+    endpoints: object
+    arrival: object
+    inner: object
+
+
+@dataclass
+class Shared:
+    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves; ``u_wavelength``
+    chose the wavelengths, ``weight`` is 1 / their density."""
+
+    time: object
+    wavelengths: object
+    weight: object
+    u_wavelength: object
+
+
+class Kernel:
+    """Everything that a pass needs besides its batch. Holds the scene for one render only."""
+
+    def __init__(self, prepared, plan, settings, heuristic):
+        self.scene, self.camera, self.emitters = prepared.scene, prepared.camera, prepared.emitters
+        self.plan, self.heuristic = plan, heuristic
+        self.shape_errors = prepared.emitters.shape_errors
+        self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
+        self.traits = prepared.traits
+        depth = min(settings.max_depth, UNLIMITED)
+        reach = min(depth, settings.stored_vertices)
+        self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
+        self.strategy_images = settings.strategy_images
+        u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
+        self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
+        self._reach = u32(reach)
+        self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)
+        self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
+        after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
+        self.last_light = u32(max(reach - after, 0))
+        self.camera_paths_per_light_path = u32(plan.camera_paths_per_light_path)
+        self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
+        self.inverse_threshold = f32(dr.inf)
+        self.observer = None
+
+    def bound(self, points, count_light: float, observer: Observer | None = None) -> Kernel:
+        """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
+        camera subpath, which the estimates of t <= 1 are divided by (weights keep the nominal one)."""
+        other = copy(self)
+        other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
+        other.observer = observer
+        return other
+
+    def within_store(self, k):
+        """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
+        return k <= self._reach
+
+    def set_threshold(self, size):
+        """Contributions below this size play roulette (a power of two near it, so that the order of atomic
+        sums rarely changes a decision), none if it is 0. ``size``: ``Float64`` of width 1."""
+        rounded = dr.exp2(dr.round(dr.log2(size)))
+        self.inverse_threshold = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
+        dr.eval(self.inverse_threshold)
+
+
+def _coefficients(plan, by_class: bool) -> Coefficients:
+    """Run-time values, or ``by_class`` those of a pilot: 1 in the place of the class, see `mis.ByClass`."""
+
+    def entry(kind, value, used):
+        if not used:
+            return 0
+        if by_class:
+            return mi.Vector4f(*(1.0 if name == kind else 0.0 for name in mis.CLASSES))
+        return dr.opaque(mi.Float, value)
+
+    count = 1 / plan.camera_paths_per_light_path if plan.light else 0.0  # nominal, see `Kernel.bound`
+    light = count * plan.kappa_light
+    return Coefficients(
+        hit=entry("hit", 1, plan.hit),
+        direct=entry("direct", plan.kappa_direct, plan.direct),
+        splat=entry("light", light, plan.splat),
+        endpoints=entry("light", light, plan.endpoints),
+        arrival=entry("light", light, plan.arrival),
+        inner=entry("inner", 1, plan.connections != "none"),
+    )
+
+
+def _opaque(kind):
+    return lambda value: dr.opaque(kind, value)
