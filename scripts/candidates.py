@@ -17,20 +17,19 @@ import statistics
 import sys
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
-from tables import table
+from mitsuba_bdpt.measure.tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr
-import metrics
-import reference
-from mistakes import answered
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import metrics
+from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.planning import moments, pilot
 from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Weighting
 from mitsuba_bdpt.planning.costs import cost
 from mitsuba_bdpt.planning.decision import Decision
 from mitsuba_bdpt.run import rendering
-from reference import RESOLUTION, benchmark_depth
-from timing import timed
+from repository import RESOLUTION, benchmark_depth, load_reference, load_scene
 
 SPP, LANES, ROUNDS = 64, 1 << 15, 4
 
@@ -80,8 +79,8 @@ def rendered(scene, depth: int, made: Decision, expected) -> tuple[float, float]
 
 def lines(name: str, depth: int) -> list:
     """Rows of a scene's table."""
-    scene = reference.load_scene(name, resolution=RESOLUTION)
-    expected = reference.load_reference(name, RESOLUTION, depth).image
+    scene = load_scene(name, resolution=RESOLUTION)
+    expected = load_reference(name, RESOLUTION, depth).image
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     moments = predicted(scene, settings)
     rows, alone = [], None

@@ -30,15 +30,16 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-import reference
-from metrics import TRIM, rel_mse
-from mistakes import answered
+import repository
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.files.texts import write_json
+from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.planning import pilot
 from mitsuba_bdpt.planning.candidates import candidates
 from mitsuba_bdpt.planning.configuration import Configuration
 from mitsuba_bdpt.planning.decision import Decision
 from mitsuba_bdpt.run import rendering
-from tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
@@ -57,10 +58,10 @@ SMALL = "small_casters"
 def loaded(name: str):
     """A scene, its ``max_depth`` and its reference."""
     if not name.startswith(SMALL):
-        depth = reference.benchmark_depth(name)
-        stored = reference.load_reference(name, reference.RESOLUTION, depth)
-        return reference.load_scene(name, resolution=reference.RESOLUTION), depth, stored.image
-    scene = mi.load_file(str(reference.SCENES / f"{name}.xml"))
+        depth = repository.benchmark_depth(name)
+        stored = repository.load_reference(name, repository.RESOLUTION, depth)
+        return repository.load_scene(name, resolution=repository.RESOLUTION), depth, stored.image
+    scene = mi.load_file(str(repository.SCENES / f"{name}.xml"))
     depth = scene.integrator().max_depth
     made = mi.load_dict({"type": "bdpt", "max_depth": depth, "light_paths": 1, "connections": "one"})
     halves = [np.array(made.render(scene, seed=REFERENCE_SEED + i, spp=REFERENCE_SPP)) for i in (0, 1)]
@@ -204,8 +205,8 @@ def main(arguments=None) -> int:
     options = parser.parse_args(arguments)
     names = list(options.scenes)
     if options.all:
-        small = sorted(path.stem for path in (reference.SCENES / SMALL).glob("*.xml"))
-        names += reference.read_toml(reference.BENCHMARK)["scenes"]
+        small = sorted(path.stem for path in (repository.SCENES / SMALL).glob("*.xml"))
+        names += repository.benchmark_scenes()
         names += [f"{SMALL}/{name}" for name in small if name != "common"]
     if not names:
         parser.error("name scenes, or --all")
@@ -219,7 +220,7 @@ def main(arguments=None) -> int:
             rows[name] = measure(name, rows[name]["fixed"] if kept else {})
             print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
         if options.output:
-            reference.write_json(options.output, list(rows.values()))
+            write_json(options.output, list(rows.values()))
     head = [
         "scene",
         "raw: default, worst pilot",

@@ -30,19 +30,21 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
-import reference
-from mistakes import answered
-from mitsuba_bdpt.cli import arguments as command
+import repository
+from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.render import INTERRUPTED
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.files.texts import write_json, write_text
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.report import replace_part
+from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.settings import HEURISTICS
-from report import replace_part, write_text
-from tables import table
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
-RECORD = reference.ROOT / "docs" / "reports" / "endurance.json"
-PAGE = reference.ROOT / "docs" / "reports" / "endurance.md"
+RECORD = repository.ROOT / "docs" / "reports" / "endurance.json"
+PAGE = repository.ROOT / "docs" / "reports" / "endurance.md"
 
 # Camera samples of all scenes together.
 TARGET = 10**10
@@ -143,7 +145,7 @@ def rendered(name: str, number: int, samples: int, timeout: float, interruption:
     started = time.perf_counter()
     statistics = {}
     try:
-        scene = reference.load_scene(name, resolution=width)
+        scene = repository.load_scene(name, resolution=width)
         film = scene.sensors()[0].film()
         pixels = math.prod(int(n) for n in film.crop_size())
         depth = scene.integrator().max_depth
@@ -194,7 +196,7 @@ def add(path: Path, name: str, found: dict, source: str) -> dict:
     sources = record.setdefault("samples_by_source", {})
     sources[source] = sources.get(source, 0) + found["samples"]
     record["scenes"] = dict(sorted(record["scenes"].items()))
-    reference.write_json(path, record)
+    write_json(path, record)
     return record
 
 
@@ -298,14 +300,14 @@ def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    known = reference.scene_names()
+    known = repository.PROJECT.scene_names()
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; default: all")
     text_ = "default: until there are --samples"
-    parser.add_argument("--seconds", type=command.number(float, 0), default=math.inf, help=text_)
+    parser.add_argument("--seconds", type=number(float, 0), default=math.inf, help=text_)
     text_ = "of all; default: %(default).0e"
-    parser.add_argument("--samples", type=command.number(float, 1), default=TARGET, help=text_)
+    parser.add_argument("--samples", type=number(float, 1), default=TARGET, help=text_)
     text_ = "camera samples of one render; default: %(default)s"
-    whole = command.number(int, 1)
+    whole = number(int, 1)
     parser.add_argument("--render-samples", type=whole, default=RENDER_SAMPLES, metavar="N", help=text_)
     parser.add_argument("--record", type=Path, default=RECORD, help="default: docs/reports/endurance.json")
     parser.add_argument("--show", action="store_true", help="print the record only")

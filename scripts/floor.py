@@ -1,125 +1,21 @@
-"""Kernel time over its floor: the very rays of a pass, replayed by themselves.
+"""Kernel time over that of its rays alone, see `mitsuba_bdpt.measure.floor`.
 
-    python scripts/floor.py cornell_box uplight_room veach_mis
-
-The loops of a pass are run step by step, and every call that traces rays is kept: one per kind and bounce
-(and camera subpath of a light subpath), with the lanes' masks. Each is then replayed as a kernel of its own,
-closest hits with ``compute_surface_interaction``. The floor is the time of these kernels; the pass is
-measured as it is, one kernel, with the same plan and seed. Both sides alternate.
+python scripts/floor.py cornell_box uplight_room veach_mis
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import gc
 import statistics
 import sys
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.measure import floor
+from repository import PROJECT
 
 import mitsuba as mi  # isort: skip
-import drjit as dr
-import reference
-from mistakes import answered
-from mitsuba_bdpt.cli.arguments import number
-from mitsuba_bdpt.host.jit import evaluated_mode
-from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.run import rendering, schedule
-from mitsuba_bdpt.sampling import points
-from mitsuba_bdpt.transport.kernel import trace
-
-SPP = 16
-
-
-@contextlib.contextmanager
-def recorded(calls: list):
-    """Scenes note in ``calls`` what they are asked to trace: (ray, active, coherent), the last None for
-    shadow rays."""
-    closest, shadow = mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test
-
-    def note(ray, active, coherent):
-        ray, active = mi.Ray3f(ray), mi.Bool(active)
-        dr.eval(ray, active)
-        calls.append((ray, active, coherent))
-
-    def ray_intersect_preliminary(scene, ray, coherent=False, active=True):
-        note(ray, active, coherent)
-        return closest(scene, ray, coherent=coherent, active=active)
-
-    def ray_test(scene, ray, active=True):
-        note(ray, active, None)
-        return shadow(scene, ray, active=active)
-
-    mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test = ray_intersect_preliminary, ray_test
-    try:
-        yield
-    finally:
-        mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test = closest, shadow
-
-
-def kernel_seconds(work) -> float:
-    """Execution time of the kernels that ``work`` runs."""
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        work()
-        dr.sync_thread()
-        history = dr.kernel_history()
-    return sum(e["execution_time"] for e in history if e["type"] == dr.KernelType.JIT) / 1000
-
-
-class Pass:
-    """One pass of a scene at 128^2, as a render of 64 samples per pixel decides it."""
-
-    def __init__(self, name: str, parameters: dict):
-        self._scene = reference.load_scene(name, resolution=reference.RESOLUTION)
-        depth = reference.default_depth(name)
-        integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, **parameters})
-        self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
-        self._render.decide()
-        self._batch = schedule.batches(self._render.prepared.camera, 0, SPP, integrator.settings)[0]
-
-    def trace(self):
-        """Trace the pass as one kernel."""
-        render = self._render
-        seed = dr.opaque(mi.UInt32, 1)
-        drawn = points.Points(render.settings.points, seed)
-        counts = trace(render.kernel, sink.Image(render.accumulator), self._batch, drawn, SPP)
-        render.accumulator.evaluate(counts)
-
-    def rays(self) -> list:
-        """All calls that trace rays, with their rays."""
-        calls = []
-        with recorded(calls), evaluated_mode():
-            self.trace()
-        return calls
-
-    def replay(self, calls):
-        """Trace the recorded rays, a kernel for each call."""
-        for ray, active, coherent in calls:
-            if coherent is None:
-                dr.eval(self._scene.ray_test(ray, active=active))
-                continue
-            pi = self._scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
-            # A sum of what a path needs, so that nothing is left out and little is written.
-            dr.eval(si.p.x + si.p.y + si.p.z + si.n.x + si.sh_frame.n.x + si.uv.x + si.wi.x + si.t)
-
-
-def measure(name: str, rounds: int, parameters=None) -> list[float]:
-    """Kernel time over the floor, a value per round."""
-    # Kernels cannot be recorded as a whole any more where loops were run step by step.
-    calls = Pass(name, parameters or {}).rays()
-    gc.collect()
-    subject = Pass(name, parameters or {})
-    subject.trace()
-    subject.replay(calls)
-    ratios = []
-    for _ in range(rounds):
-        whole = kernel_seconds(subject.trace)
-        floor = kernel_seconds(lambda: subject.replay(calls))
-        ratios.append(whole / floor)
-    return ratios
 
 
 def main(arguments=None) -> int:
@@ -130,7 +26,7 @@ def main(arguments=None) -> int:
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     for name in options.scene:
-        ratios = measure(name, options.rounds)
+        ratios = floor.measure(PROJECT.scene(name), options.rounds)
         middle = statistics.median(ratios)
         print(f"{name}: {middle:.2f}x the floor ({min(ratios):.2f}-{max(ratios):.2f})", flush=True)
     return 0

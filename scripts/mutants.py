@@ -23,7 +23,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from mistakes import answered
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.errors import CommandError
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
@@ -481,7 +482,7 @@ def planted(folder: Path, mutant: Mutant | None) -> Path:
         file = package / mutant.file
         text = file.read_text()
         if (count := text.count(mutant.old)) != 1:
-            raise ValueError(
+            raise CommandError(
                 f"mutant {mutant.name}: {mutant.old!r} stands {count} times in {mutant.file}, not once; "
                 "plant it anew"
             )
@@ -512,7 +513,7 @@ def chosen(words: list[str]) -> list[Mutant]:
     """Mutants with one of these words in their name, all of them if there is no word."""
     for word in words:
         if not any(word in mutant.name for mutant in MUTANTS):
-            raise ValueError(
+            raise CommandError(
                 f"no mutant has {word!r} in its name; there are {'; '.join(m.name for m in MUTANTS)}"
             )
     return [mutant for mutant in MUTANTS if not words or any(word in mutant.name for word in words)]

@@ -23,11 +23,11 @@ import sys
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import reference
-from mistakes import answered
-from reference import benchmark_depth
-from tables import table
-from timing import timed
+import repository
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.timing import timed
+from repository import benchmark_depth
 
 ROUNDS, SHORT, LONG = 7, 4, 64
 
@@ -52,7 +52,7 @@ def measure(name: str) -> list[str]:
     """A row of the table."""
     depth = benchmark_depth(name)
     scenes = {
-        s: reference.load_scene(name, resolution=reference.RESOLUTION, sampler=s)
+        s: repository.load_scene(name, resolution=repository.RESOLUTION, sampler=s)
         for s in ("independent", "multijitter")
     }
     made = {k: (mi.load_dict(d | {"max_depth": depth}), scenes[s]) for k, (d, s) in METHODS.items()}
@@ -66,7 +66,7 @@ def measure(name: str) -> list[str]:
             cost[k].append((long - short) / (LONG - SHORT))
         first.append(timed(scenes["independent"], made["path tracing alone"][0], 1, seed)[1])
         for spp, found in pilot.items():
-            anew = reference.load_scene(name, resolution=reference.RESOLUTION)  # nothing is remembered of it
+            anew = repository.load_scene(name, resolution=repository.RESOLUTION)  # forgotten
             chosen.render(anew, seed=seed, spp=spp)
             spent = chosen.statistics["seconds"]
             found.append((1e3 * spent["pilot"], 100 * spent["pilot"] / spent["total"]))
@@ -84,8 +84,8 @@ def measure(name: str) -> list[str]:
 def measure_short(name: str) -> list[list[str]]:
     """The rows of the table of short renders."""
     depth = benchmark_depth(name)
-    scene = reference.load_scene(name, resolution=reference.RESOLUTION, sampler="independent")
-    stronger = reference.load_scene(name, resolution=reference.RESOLUTION, sampler="multijitter")
+    scene = repository.load_scene(name, resolution=repository.RESOLUTION, sampler="independent")
+    stronger = repository.load_scene(name, resolution=repository.RESOLUTION, sampler="multijitter")
     made = [
         (mi.load_dict({"type": "path", "max_depth": depth}), stronger),
         (mi.load_dict(ALONE | {"max_depth": depth}), scene),
@@ -95,7 +95,7 @@ def measure_short(name: str) -> list[list[str]]:
     for spp in BUDGETS:
         spent = []
         for seed in range(SHORT_ROUNDS + 1):
-            anew = reference.load_scene(name, resolution=reference.RESOLUTION)
+            anew = repository.load_scene(name, resolution=repository.RESOLUTION)
             turn = [*made, (made[-1][0], anew)]
             spent.append([1e3 * timed(s, integrator, spp, seed)[1] for integrator, s in turn])
         cells = [f"{statistics.median(column):.0f} ms" for column in zip(*spent[1:], strict=True)]

@@ -16,12 +16,11 @@ import sys
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import metrics
 import numpy as np
-import reference
-from mistakes import answered
-from reference import RESOLUTION, benchmark_depth
-from tables import table
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure import metrics
+from mitsuba_bdpt.measure.tables import table
+from repository import RESOLUTION, benchmark_depth, load_reference, load_scene
 
 BUDGETS, SEEDS = (16, 64), 5
 
@@ -32,9 +31,9 @@ KINDS = [("independent", "independent"), ("sobol", "independent"), *(("sampler",
 
 def error(name: str, parameters: dict, points: str, sampler: str, spp: int) -> float:
     """Trimmed relMSE times samples per pixel."""
-    scene = reference.load_scene(name, resolution=RESOLUTION, sampler=sampler, spp=spp)
+    scene = load_scene(name, resolution=RESOLUTION, sampler=sampler, spp=spp)
     depth = benchmark_depth(name)
-    expected = reference.load_reference(name, RESOLUTION, depth).image
+    expected = load_reference(name, RESOLUTION, depth).image
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "points": points, **parameters})
     found = []
     for seed in range(SEEDS):

@@ -22,9 +22,9 @@ import sys
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
-from metrics import TRIM, rel_mse
-from mistakes import answered
-from reference import RESOLUTION, load_reference, load_scene
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from repository import RESOLUTION, load_reference, load_scene
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip

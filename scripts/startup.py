@@ -17,12 +17,13 @@ import os
 import statistics
 import sys
 import tempfile
+from pathlib import Path
 
-from mistakes import answered
-from mitsuba_bdpt.cli import arguments as command
-from probes import numbers
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.measure.probes import numbers
+from mitsuba_bdpt.measure.tables import table
 from room import MOST
-from tables import table
 
 COUNTS = ((1, 1), (30, 1), (300, 1), (1, 10), (1, 100))
 
@@ -82,9 +83,9 @@ print(taken[0][0], taken[0][1] - taken[1][1])
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    materials = command.number(int, 0, MOST)
+    materials = number(int, 0, MOST)
     parser.add_argument("--rooms", type=materials, nargs="+", help="numbers of materials; 0: the Cornell box")
-    count = command.number(int, 1)
+    count = number(int, 1)
     parser.add_argument("--spp", type=count, nargs="+", help="samples per pixel, of rooms; default: 8")
     parser.add_argument("--rounds", type=count, help="renders of each room; default: 3")
     asked = parser.parse_args(arguments)
@@ -129,7 +130,7 @@ def _cold(code, *arguments) -> list[float]:
     """The last two numbers that a process with an empty kernel cache prints."""
     with tempfile.TemporaryDirectory() as cache:
         empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
-        return numbers(code, *arguments, environment=empty)[-2:]
+        return numbers(code, *arguments, environment=empty, folder=Path(__file__).parent)[-2:]
 
 
 if __name__ == "__main__":

@@ -13,11 +13,11 @@ import argparse
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-import reference
-from metrics import rel_mse
-from mistakes import answered
-from mitsuba_bdpt.cli.arguments import number
-from reference import RESOLUTION, benchmark_depth
+import repository
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.measure.metrics import rel_mse
+from repository import RESOLUTION, benchmark_depth
 
 import mitsuba as mi  # isort: skip
 
@@ -27,8 +27,8 @@ MOST_SPP = 1 << 12
 def line(name: str, error: float, renders: int) -> str:
     """The line of a scene, as Markdown."""
     depth = benchmark_depth(name)
-    target = reference.load_reference(name, RESOLUTION, depth).image
-    scene = reference.load_scene(name, resolution=RESOLUTION)
+    target = repository.load_reference(name, RESOLUTION, depth).image
+    scene = repository.load_scene(name, resolution=RESOLUTION)
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "variance": True, "until_error": error})
     spp, estimates, found, means = [], [], [], []
     for seed in range(renders):

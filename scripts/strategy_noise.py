@@ -14,14 +14,14 @@ import sys
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-from metrics import TRIM
-from mistakes import answered
-from reference import benchmark_depth
-from tables import table
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.measure.metrics import TRIM
+from mitsuba_bdpt.measure.tables import table
+from repository import benchmark_depth
 
 import mitsuba as mi  # isort: skip
-import reference
-from strategies import technique_images
+import repository
+from mitsuba_bdpt.measure.pyramid import technique_images
 
 RESOLUTION, SPP, RENDERS, SHOWN = 64, 8, 24, 6
 
@@ -34,7 +34,7 @@ def noise(values, norm) -> tuple[float, float]:
 
 def lines(name: str) -> list:
     """Rows of a scene: the image, all strategies together, and those with most noise."""
-    scene = reference.load_scene(name, resolution=RESOLUTION)
+    scene = repository.load_scene(name, resolution=RESOLUTION)
     parameters = {"type": "bdpt", "max_depth": benchmark_depth(name), "skip": "none"}
     integrator = mi.load_dict(parameters | {"strategy_images": True})
     renders = np.array(

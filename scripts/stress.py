@@ -21,16 +21,18 @@ import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 
-import reference
-from mitsuba_bdpt.cli.arguments import number
-from report import replace_part, table, write_text
+import repository
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.files.texts import write_text
+from mitsuba_bdpt.measure import reference
+from mitsuba_bdpt.measure.report import replace_part, table
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
 
 import mitsuba as mi  # isort: skip
 
-RECORD = reference.ROOT / "docs" / "reports" / "stress.json"
-PAGE = reference.ROOT / "docs" / "reports" / "stress.md"
+RECORD = repository.ROOT / "docs" / "reports" / "stress.json"
+PAGE = repository.ROOT / "docs" / "reports" / "stress.md"
 TABLES = PAGE.with_name("stress_cases.md")
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,

@@ -26,11 +26,13 @@ from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-import reference
-from metrics import TRIM, rel_mse
-from mistakes import answered
-from mitsuba_bdpt.cli.arguments import number
-from tables import table
+import repository
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.cli.values import number, property_
+from mitsuba_bdpt.errors import CommandError
+from mitsuba_bdpt.files.loading import in_proportion
+from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from mitsuba_bdpt.measure.tables import table
 
 import mitsuba as mi  # isort: skip
 
@@ -70,7 +72,9 @@ class Checkout:
     def __init__(self, folder: Path, images: Path):
         sources = folder / "integrators"
         if not (sources / "mitsuba_bdpt" / "__init__.py").exists():
-            raise ValueError(f"checkout={folder} has no integrators/mitsuba_bdpt; give a clone or a worktree")
+            raise CommandError(
+                f"checkout={folder} has no integrators/mitsuba_bdpt; give a clone or a worktree"
+            )
         self._image, self._sources = images / f"{len(list(images.iterdir()))}.npy", sources.resolve()
         self._image.touch()
         environment = os.environ | {"PYTHONPATH": str(self._sources)}
@@ -89,8 +93,8 @@ class Checkout:
 
     def load(self, name: str, integrator: dict, spp: int):
         """Load a scene and compile."""
-        scene = reference.scene_file(name)
-        definitions = reference.in_proportion(scene, {"resolution": reference.RESOLUTION})
+        scene = repository.scene_file(name)
+        definitions = in_proportion(scene, {"resolution": repository.RESOLUTION})
         found = self._ask(scene=str(scene), definitions=definitions, integrator=integrator, spp=spp)
         if not Path(found).is_relative_to(self._sources):
             raise RuntimeError(f"{found} was imported in place of {self._sources}")
@@ -107,8 +111,8 @@ class Checkout:
 
 def line(name: str, sides: list[Checkout], parameters: dict, spp: int, pairs: int) -> tuple[list[str], bool]:
     """A scene's line of the table, and whether both checkouts made the same."""
-    depth = reference.benchmark_depth(name)
-    expected = reference.load_reference(name, reference.RESOLUTION, depth).image
+    depth = repository.benchmark_depth(name)
+    expected = repository.load_reference(name, repository.RESOLUTION, depth).image
     for side in sides:
         side.load(name, {"type": "bdpt", "max_depth": depth} | parameters, spp)
     apart, rows, same = 0.0, [], True
@@ -149,11 +153,11 @@ def main(arguments=None) -> int:
     parser.add_argument("--same", action="store_true", help="fail unless images and decisions are the same")
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
-    reference.integrator_of(" ".join(["bdpt", *options.parameters]), 1)  # checks the parameters
-    parameters = dict(map(reference.property_, options.parameters))
-    names = options.scenes or reference.read_toml(reference.BENCHMARK)["scenes"]
+    parameters = dict(map(property_, options.parameters))
+    mi.load_dict({"type": "bdpt"} | parameters)  # checks them
+    names = options.scenes or repository.benchmark_scenes()
     for name in names:
-        reference.benchmark_depth(name)  # known before anything is rendered
+        repository.benchmark_depth(name)  # known before anything is rendered
     head = ["scene", "apart", "time", "error", "raw error", "time · error", "time · raw error", "decided"]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         sides = [

@@ -6,18 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
-import analysis
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
-import reference
-import report
-from analysis import Biased, Refused, Results
-from metrics import Means
-from preset import read_preset
-from reference import Reference
+from mitsuba_bdpt.cli.arguments import build_parser
+from mitsuba_bdpt.measure import analysis, reference, report
+from mitsuba_bdpt.measure.agreement import Means
+from mitsuba_bdpt.measure.analysis import Biased, Refused, Results
+from mitsuba_bdpt.measure.preset import read_preset
+from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.reference import Reference
+from mitsuba_bdpt.measure.scenes import digest
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUE = np.full(51, 2.0)
@@ -342,7 +343,7 @@ def test_what_a_biased_integrator_lacks_is_said():
 
 def test_names_are_those_of_the_preset():
     """Expected: every integrator that the report looks for is one of presets/benchmark.toml."""
-    names = {m.name for m in read_preset(ROOT / "presets" / "benchmark.toml").methods}
+    names = {m.name for m in read_preset(ROOT / "presets" / "benchmark.toml", Project(ROOT)).methods}
     assert names >= {
         *analysis.RIVALS,
         analysis.NONE,
@@ -368,16 +369,14 @@ def test_parts_of_the_readme_are_replaced():
         report.replace_part(text, "z", "")
 
 
-def test_a_report_is_written(results, tmp_path, monkeypatch):
+def test_a_report_is_written(results, tmp_path):
     """Expected: from the data of a folder the page, the plots, and the project's README's parts."""
     only = [r for r in results.rows if r["scene"] == "box"]
-    monkeypatch.setattr(reference, "REFERENCES", tmp_path)
-    monkeypatch.setattr(reference, "scene_digest", lambda name: "the scene")
     provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096, "scene_sha256": "the scene"}
     kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), KNOWN, provenance)
-    file = reference.reference_path("box", 8, 3)
+    file = reference.reference_path(Project(tmp_path), "box", 8, 3)
     reference.write(file, kept)
-    table = [r | {"reference_sha256": reference.digest(file)} for r in only]
+    table = [r | {"reference_sha256": digest(file)} for r in only]
     pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
     (tmp_path / "probes.json").write_text(json.dumps(results.probes))
     (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = "1x"\n')
@@ -386,8 +385,9 @@ def test_a_report_is_written(results, tmp_path, monkeypatch):
     readme.write_text(
         "".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("goals", "efficiency", "gallery"))
     )
-    monkeypatch.setattr("sys.argv", ["report.py", str(tmp_path), "--readme", str(readme)])
-    report.main()
+    words = ["report", str(tmp_path), "--readme", str(readme), "--project", str(tmp_path)]
+    options = build_parser().parse_args(words)
+    assert report.run(options) == 0
     page = (tmp_path / "README.md").read_text()
     assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet"]
     assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
@@ -397,8 +397,10 @@ def test_a_report_is_written(results, tmp_path, monkeypatch):
         assert f"({name}.png)" in page
     assert not list(tmp_path.glob(".*"))
     reference.write(file, replace(kept, image=kept.image * 2))
-    with pytest.raises(ValueError, match="in box were taken against another reference; run scripts/sweep.py"):
-        report.main()
+    with pytest.raises(
+        ValueError, match="in box were taken against another reference; run mitsuba-bdpt sweep"
+    ):
+        report.run(options)
     (tmp_path / "notes.toml").write_text('nowhere = "why"\n')
     with pytest.raises(ValueError, match="'nowhere' is not among the scenes"):
         report.page(results, {}, [], {"nowhere": "why"})

@@ -4,8 +4,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from metrics import sidak
 from mitsuba_bdpt.image.features import FeatureLayers
+from mitsuba_bdpt.measure.agreement import sidak
 from welch import LEVEL, Comparisons, assert_agree, compare_images
 
 T = mi.ScalarTransform4f

@@ -17,6 +17,7 @@ import pytest
 from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.planning.planner import Planner
+from mitsuba_bdpt.workers import results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
@@ -172,7 +173,7 @@ def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
             return self.futures.pop(1)
 
     monkeypatch.setattr(distributed, "as_completed", Completed)
-    found = list(cluster.results(Client(), None, [(seed,) for seed in range(4)]))
+    found = list(results(Client(), None, [(seed,) for seed in range(4)]))
     assert sorted(found) == [(i, i) for i in range(4)] and released.is_set()
     assert Client.submitted == [0, 1, 2, 3, 0]
 
@@ -189,7 +190,7 @@ def test_a_failing_part_is_named(workers):
     """Expected: what a worker raises ends the render with one message, not with silence."""
     with distributed.Client(workers.scheduler_address) as client:
         with pytest.raises(RuntimeError, match="part 0 failed on the cluster: math domain error"):
-            list(cluster.results(client, math.sqrt, [(-1.0,)]))
+            list(results(client, math.sqrt, [(-1.0,)]))
 
 
 def test_an_edited_scene_is_loaded_anew(workers, tmp_path):

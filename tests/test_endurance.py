@@ -12,7 +12,8 @@ import endurance
 import mitsuba as mi
 import numpy as np
 import pytest
-import reference
+import repository
+from mitsuba_bdpt.measure import reference
 
 SCRIPT = Path(endurance.__file__)
 TINY = ["--render-samples", "2048"]
@@ -122,7 +123,7 @@ def test_what_is_wrong_is_kept(tmp_path, monkeypatch):
     and in the exit status."""
     path = tmp_path / "record.json"
 
-    load = reference.load_scene
+    load = repository.load_scene
 
     def poisoned(name, **definitions):
         scene = load(name, **definitions)
@@ -133,7 +134,7 @@ def test_what_is_wrong_is_kept(tmp_path, monkeypatch):
         return scene
 
     with monkeypatch.context() as patch:
-        patch.setattr(reference, "load_scene", poisoned)
+        patch.setattr(repository, "load_scene", poisoned)
         record, status = run(path, "--samples", 1000)
         # Two samples for each of the 256^2 pixels of a first render: enough for a pilot.
         other = tmp_path / "other.json"
@@ -155,7 +156,7 @@ def test_a_scene_that_fails_is_left_out_until_the_source_is_mended(tmp_path, mon
     """Expected: after three failures a scene is left out, which each run and the table say; the run ends;
     with another source of the plugin, or a record that does not tell the source, it is tried again."""
     path = tmp_path / "record.json"
-    monkeypatch.setattr(reference, "load_scene", no_scene)
+    monkeypatch.setattr(repository, "load_scene", no_scene)
     for _ in range(2):
         record, status = run(path, "--samples", 1000)
         assert status == 1 and failures(record) == [3, 3]
@@ -193,7 +194,7 @@ def test_a_run_ends_with_its_table_on_the_page(tmp_path, monkeypatch):
     shutil.copy(endurance.PAGE, page)
     assert page.read_text().count(marker) == 1
     monkeypatch.setattr(endurance, "PAGE", page)
-    monkeypatch.setattr(reference, "load_scene", no_scene)
+    monkeypatch.setattr(repository, "load_scene", no_scene)
     before = page.read_text().split(marker)
     run(tmp_path / "other.json", "--samples", 1000)
     assert page.read_text().split(marker) == before

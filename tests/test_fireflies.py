@@ -1,14 +1,12 @@
-"""The paths behind the worst values: scripts/fireflies.py, with recording.py and reconstruct.py."""
+"""The paths behind the worst values: the command `fireflies`, its recording and its reconstruction."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
-import fireflies
 import mitsuba as mi
 import numpy as np
 import pytest
-import reconstruct
-import recording
+from mitsuba_bdpt.measure import fireflies, reconstruct, recording
 from scene_parts import T, grey
 
 

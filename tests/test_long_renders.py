@@ -12,6 +12,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.files.named import named_files
 from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.run import work
 from mitsuba_bdpt.run.snapshot import read
@@ -146,7 +147,7 @@ def test_many_files_of_a_scene(monkeypatch):
     compared, original = [], PurePath.__eq__
     with monkeypatch.context() as patch:
         patch.setattr(PurePath, "__eq__", lambda a, b: compared.append(a) or original(a, b))
-        found = checkpoints.named_files(Path("scene.xml"))
+        found = named_files(Path("scene.xml"))
     assert [path.name for path in found] == names
     assert len(compared) < 2 * 2 * len(names)
 
@@ -163,7 +164,7 @@ def test_encodings_of_a_scene_file(encoding):
     shape = f'<shape type="ply"><string name="filename" value="{name}"/></shape>'
     text = f'<?xml version="1.0" encoding="{encoding}"?>\n<scene version="3.0.0"><!-- a -- b -->{{}}</scene>'
     Path("names.xml").write_bytes(text.format(shape).encode(encoding))
-    assert [path.name for path in checkpoints.named_files(Path("names.xml"))] == [name]
+    assert [path.name for path in named_files(Path("names.xml"))] == [name]
     box = SCENE.read_text().partition("<scene")[2].partition(">")[2].rpartition("</scene>")[0]
     Path("box.xml").write_bytes(text.format(box).encode(encoding))
     command = [ARGUMENTS[0], "box.xml", *ARGUMENTS[2:]]

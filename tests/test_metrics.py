@@ -3,17 +3,18 @@
 Each docstring or comment has the arithmetic. Where a bound is statistical it is named; seeds are fixed.
 """
 
-import os
 import subprocess
 import sys
 
-import metrics
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from metrics import Estimate, Measurement, Sample
+from mitsuba_bdpt.measure import agreement, efficiency, metrics
+from mitsuba_bdpt.measure.agreement import Sample
+from mitsuba_bdpt.measure.checks import Estimate
+from mitsuba_bdpt.measure.efficiency import Measurement
 from scipy import stats
 
 quick = settings(deadline=None, max_examples=40, derandomize=True)
@@ -204,7 +205,8 @@ def test_hdr_flip_refuses_what_ends_the_process():
     In a process of its own: the output of C++ does not pass through Python.
     """
     code = """
-import numpy as np, metrics
+import numpy as np
+from mitsuba_bdpt.measure import metrics
 dark, gray = np.zeros((4, 4, 3)), np.ones((4, 4, 3))
 for image, reference in ((gray, dark), (gray, 2.3e-7 * gray), (-gray, gray), (1e39 * gray, gray)):
     try:
@@ -215,10 +217,7 @@ for image, reference in ((gray, dark), (gray, 2.3e-7 * gray), (-gray, gray), (1e
 metrics.hdr_flip(gray, 2.5e-7 * gray)
 metrics.hdr_flip(dark, gray)
 """
-    path = os.path.dirname(metrics.__file__)
-    found = [path, *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(found)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
@@ -290,10 +289,10 @@ def test_tile_means():
     """Values 0 to 15 in 4 x 4: the upper left tile holds 0, 1, 4, 5, mean 2.5; then 4.5, 10.5, 12.5."""
     image = np.arange(16.0).reshape(4, 4)[..., None] * [1, 2, 3]
     expected = np.array([2.5, 4.5, 10.5, 12.5])[:, None] * [1, 2, 3]
-    assert metrics.tile_means(image, 2) == pytest.approx(expected)
+    assert agreement.tile_means(image, 2) == pytest.approx(expected)
     for tiles in (3, 0, 2.0):
         with pytest.raises(ValueError, match=f"tiles={tiles}.*divides height 4 and width 4"):
-            metrics.tile_means(image, tiles)
+            agreement.tile_means(image, tiles)
 
 
 def test_welch():
@@ -301,32 +300,32 @@ def test_welch():
     (4/3)^2 / ((1/3)^2 / 2 + 1^2 / 3) = 1.7777 / 0.38889 = 4.5714. SciPy's `ttest_ind` gives p."""
     a, b = np.array([1.0, 2, 3]), np.array([3.0, 4, 5, 8])
     b = 5 + (b - 5) * np.sqrt(4 / np.var(b, ddof=1))
-    found = metrics.welch(Sample.of(a[:, None]), Sample.of(b[:, None]))
+    found = agreement.welch(Sample.of(a[:, None]), Sample.of(b[:, None]))
     assert found.value[0] == pytest.approx(-3)
     assert found.error[0] == pytest.approx(np.sqrt(4 / 3))
     assert found.freedom[0] == pytest.approx(4.5714, abs=1e-4)
     assert found.p[0] == pytest.approx(stats.ttest_ind(a, b, equal_var=False).pvalue, rel=1e-3)
     # Against a known value it is Student's test: freedom 2.
-    found = metrics.welch(Sample.of(a[:, None]), Sample.known([5.0]))
+    found = agreement.welch(Sample.of(a[:, None]), Sample.known([5.0]))
     assert found.freedom[0] == pytest.approx(2)
     assert found.p[0] == pytest.approx(stats.ttest_1samp(a, 5).pvalue, rel=1e-3)
 
 
 def test_welch_leaves_out_rounding_and_lumps():
     """Without noise only differences above 2e-5 count; tiles nonzero in 8 of 10 renders do not."""
-    exact = metrics.welch(Sample.known([1.0, 1.0]), Sample.known([1 + 1e-5, 1 + 3e-5]))
+    exact = agreement.welch(Sample.known([1.0, 1.0]), Sample.known([1 + 1e-5, 1 + 3e-5]))
     assert exact.p.tolist() == [1, 0] and not exact.continuous.any()
     lumps = np.zeros((10, 2))
     lumps[:8, 0] = lumps[:9, 1] = 1 + np.arange(9)[:, None][:8, 0].mean()
     noise = np.random.default_rng(0).normal(0, 0.1, lumps.shape) * (lumps > 0)
-    found = metrics.welch(Sample.of(lumps + noise), Sample.of(0 * lumps))
+    found = agreement.welch(Sample.of(lumps + noise), Sample.of(0 * lumps))
     assert found.p[0] == 1 and found.p[1] < 1e-3
     assert found.continuous.tolist() == [False, True]
 
 
 def test_sidak():
     """1 - (1 - 0.01)^3 = 0.029701."""
-    assert metrics.sidak([0.01, 0.5, 0.7]) == pytest.approx(0.029701, abs=1e-9)
+    assert agreement.sidak([0.01, 0.5, 0.7]) == pytest.approx(0.029701, abs=1e-9)
 
 
 def renders(seed, count=16, shape=(8, 8, 3), mean=1.0):
@@ -336,7 +335,7 @@ def renders(seed, count=16, shape=(8, 8, 3), mean=1.0):
 
 def test_bias_check_passes_what_agrees():
     """No bias: passes; 4 * 4 * 3 tiles and 3 channels of the image make 51 comparisons."""
-    check = metrics.bias_check(renders(1), renders(2, 32))
+    check = agreement.bias_check(renders(1), renders(2, 32))
     assert check.passed and check.comparisons == 51
     assert check.family_p == pytest.approx(1 - (1 - check.p) ** 51)
     assert check.difference.low < 0 < check.difference.high
@@ -350,7 +349,7 @@ def test_bias_check_finds_a_tile():
     0.3 / (16 tiles * 3 channels) = 0.6 %. Its p is that of SciPy's test of the tile's means."""
     images, references = renders(1), renders(2)
     images[:, 4:6, 2:4, 1] *= 0.7
-    check = metrics.bias_check(images, references)
+    check = agreement.bias_check(images, references)
     assert not check.passed and (check.tile, check.channel) == ((2, 1), 1)
     means = [x[:, 4:6, 2:4, 1].mean((1, 2)) for x in (images, references)]
     test = stats.ttest_ind(*means, equal_var=False)
@@ -367,14 +366,14 @@ def test_bias_check_finds_what_is_common_to_all_tiles():
     """2 % everywhere: in a tile of 4 pixels it is 0.02 / sqrt(2 / 12 / 4 / 16) = 0.4 standard errors,
     in the image of 1024 pixels 6.3. The missing energy is 2 % within its interval."""
     shape = (32, 32, 3)
-    check = metrics.bias_check(renders(3, shape=shape, mean=0.98), renders(4, shape=shape), tiles=16)
+    check = agreement.bias_check(renders(3, shape=shape, mean=0.98), renders(4, shape=shape), tiles=16)
     assert not check.passed and check.tile is None
     assert check.missing.low < 0.02 < check.missing.high and check.missing.low > 0.01
 
 
 def test_bias_check_of_a_black_image():
     """`path` where it finds nothing: all energy is missing, without doubt."""
-    check = metrics.bias_check(np.zeros((8, 8, 8, 3)), renders(1))
+    check = agreement.bias_check(np.zeros((8, 8, 8, 3)), renders(1))
     assert not check.passed and check.p < 1e-12
     assert (check.missing.value, check.missing.low, check.missing.high) == (1, 1, 1)
 
@@ -383,7 +382,7 @@ def test_bias_check_names_the_largest_of_certain_differences():
     """Without noise every difference has p = 0: the tile that is off by 0.5 is named, not the first."""
     image = np.ones((4, 4, 3))
     image[0, 0], image[2:, 2:, 2] = 1.125, 1.5
-    check = metrics.bias_check([image] * 8, np.ones((4, 4, 3)), 2, standard_error=np.zeros((4, 4, 3)))
+    check = agreement.bias_check([image] * 8, np.ones((4, 4, 3)), 2, standard_error=np.zeros((4, 4, 3)))
     assert check.p == 0 and (check.tile, check.channel) == ((1, 1), 2)
     assert check.difference == Estimate(0.5, 0.5, 0.5)
 
@@ -396,14 +395,14 @@ def test_bias_check_against_one_reference():
     """
     images, references = renders(1, 32), renders(2, 16)
     images[:, :2, :2, 0] *= 0.7
-    runs = metrics.bias_check(images, references)
+    runs = agreement.bias_check(images, references)
     error = references.std(0, ddof=1) / 4
-    single = metrics.bias_check(images, references.mean(0), standard_error=error)
+    single = agreement.bias_check(images, references.mean(0), standard_error=error)
     assert (single.tile, single.channel, single.passed) == ((0, 0), 0, False)
     assert single.difference.value == pytest.approx(runs.difference.value)
     widths = [x.difference.high - x.difference.low for x in (single, runs)]
     assert widths[0] == pytest.approx(widths[1], rel=0.25)
-    exact = metrics.bias_check(images, references.mean(0), standard_error=0 * error)
+    exact = agreement.bias_check(images, references.mean(0), standard_error=0 * error)
     means = images[:, :2, :2, 0].mean((1, 2))
     expected = stats.ttest_1samp(means, references[:, :2, :2, 0].mean()).pvalue
     assert exact.p == pytest.approx(expected, rel=1e-2)
@@ -414,16 +413,16 @@ def test_what_was_kept_of_renders_serves_as_they_do():
     reference is the one without error."""
     images, references = renders(1), renders(2)
     images[:, 4:6, 2:4, 1] *= 0.7
-    means = [metrics.Means.of([metrics.tile_columns(x) for x in runs]) for runs in (images, references)]
+    means = [agreement.Means.of([agreement.tile_columns(x) for x in runs]) for runs in (images, references)]
     assert means[0].tiles == 4
-    assert metrics.compare_means(*means) == metrics.bias_check(images, references)
+    assert agreement.compare_means(*means) == agreement.bias_check(images, references)
     exact = np.ones((8, 8, 3))
-    kept = metrics.compare_means(means[0], metrics.Means.known(exact))
-    assert kept == metrics.bias_check(images, exact, standard_error=0 * exact)
+    kept = agreement.compare_means(means[0], agreement.Means.known(exact))
+    assert kept == agreement.bias_check(images, exact, standard_error=0 * exact)
     with pytest.raises(ValueError, match="columns has 7 renders"):
-        metrics.Means.of(np.ones((7, 51)))
+        agreement.Means.of(np.ones((7, 51)))
     with pytest.raises(ValueError, match="ours has 4 tiles along an edge and theirs 2"):
-        metrics.compare_means(means[0], metrics.Means.known(exact, 2))
+        agreement.compare_means(means[0], agreement.Means.known(exact, 2))
 
 
 def test_error_of_a_tile_follows_from_its_pixels():
@@ -431,7 +430,7 @@ def test_error_of_a_tile_follows_from_its_pixels():
     12 others with 0: sqrt(12) / 16; the mean of equal channels has that too, as if fully correlated."""
     error = np.zeros((4, 4, 3))
     error[:2, :2] = np.array([[1, 1], [3, 1]])[..., None]
-    means, _ = metrics._means_of_reference(np.ones((4, 4, 3)), error, 2)
+    means, _ = agreement._means_of_reference(np.ones((4, 4, 3)), error, 2)
     columns, whole = means.columns, means.whole
     assert columns.error[:3] == pytest.approx([np.sqrt(12) / 4] * 3)
     assert columns.error[3:12] == pytest.approx(0)
@@ -444,7 +443,7 @@ def test_missing_energy():
     (3 * 0.2 / 16)^2 = 0.00140625, freedom 0.00203125^2 / (0.000625^2 / 8 + 0.00140625^2 / 10) = 16.740,
     t at 97.5 % 2.1124, so +- 2.1124 * 0.0450694 = 0.095205."""
     one = np.ones(1)
-    found = metrics.missing_energy(Sample(3 * one, 0.1 * one, 8, one), Sample(4 * one, 0.2 * one, 10, one))
+    found = agreement.missing_energy(Sample(3 * one, 0.1 * one, 8, one), Sample(4 * one, 0.2 * one, 10, one))
     assert found.value == pytest.approx(0.25)
     assert (found.low, found.high) == pytest.approx((0.25 - 0.095205, 0.25 + 0.095205), abs=2e-5)
 
@@ -458,7 +457,7 @@ def test_bias_check_keeps_its_level():
     failed = 0
     for seed in range(300):
         runs = renders(seed, 32, (4, 4, 3))
-        failed += not metrics.bias_check(runs[:16], runs[16:], 2, 0.05).passed
+        failed += not agreement.bias_check(runs[:16], runs[16:], 2, 0.05).passed
     assert 4 <= failed <= 40
 
 
@@ -466,42 +465,42 @@ def test_bias_check_refuses():
     """Wrong shapes, too few renders, a reference without or with too much of an error, a black one."""
     good, one = renders(1), np.ones((8, 8, 3))
     with pytest.raises(ValueError, match=r"images has shape \(8, 8, 3\) and must have \(seeds,"):
-        metrics.bias_check(one, good)
+        agreement.bias_check(one, good)
     with pytest.raises(ValueError, match="references has 7 renders, too few.*give 8 or more"):
-        metrics.bias_check(good, good[:7])
+        agreement.bias_check(good, good[:7])
     with pytest.raises(ValueError, match="standard_error=None: with one reference"):
-        metrics.bias_check(good, one)
+        agreement.bias_check(good, one)
     with pytest.raises(ValueError, match="standard_error must be None"):
-        metrics.bias_check(good, good, standard_error=one)
+        agreement.bias_check(good, good, standard_error=one)
     with pytest.raises(ValueError, match="standard_error has shape .* from -1"):
-        metrics.bias_check(good, one, standard_error=-one)
+        agreement.bias_check(good, one, standard_error=-one)
     with pytest.raises(ValueError, match=r"images have shape \(8, 8, 3\) and references \(4, 8, 3\)"):
-        metrics.bias_check(good, good[:, :4])
+        agreement.bias_check(good, good[:, :4])
     with pytest.raises(ValueError, match="references have mean 0"):
-        metrics.bias_check(good, 0 * good)
+        agreement.bias_check(good, 0 * good)
     with pytest.raises(ValueError, match="significance=1 must be"):
-        metrics.bias_check(good, good, significance=1)
+        agreement.bias_check(good, good, significance=1)
     with pytest.raises(ValueError, match="tiles=5"):
-        metrics.bias_check(good, good, 5)
+        agreement.bias_check(good, good, 5)
 
 
 def test_efficiency():
     """1 / (4 s * 0.05) = 5."""
-    assert metrics.efficiency(4, 0.05) == pytest.approx(5)
+    assert efficiency.efficiency(4, 0.05) == pytest.approx(5)
     for seconds, error in ((0, 1), (1, 0), (1, np.nan), (-1, 1)):
         with pytest.raises(ValueError, match="must be finite and above 0"):
-            metrics.efficiency(seconds, error)
+            efficiency.efficiency(seconds, error)
 
 
 def test_speedups():
     """Ours 2 s and 0.01, the other 3 s and 0.04. In 2 s the other reaches 0.04 * 3 / 2 = 0.06, 6 times our
     error; for 0.01 it needs 3 * 4 = 12 s, 6 times ours."""
     ours, other = Measurement(2, 0.01), (3, 0.04)
-    assert metrics.equal_time_speedup(ours, other) == pytest.approx(6)
-    assert metrics.equal_error_speedup(ours, other) == pytest.approx(6)
-    assert metrics.equal_time_speedup(other, ours) == pytest.approx(1 / 6)
-    assert metrics.equal_error_speedup(other, ours) == pytest.approx(1 / 6)
-    for speedup in (metrics.equal_time_speedup, metrics.equal_error_speedup):
+    assert efficiency.equal_time_speedup(ours, other) == pytest.approx(6)
+    assert efficiency.equal_error_speedup(ours, other) == pytest.approx(6)
+    assert efficiency.equal_time_speedup(other, ours) == pytest.approx(1 / 6)
+    assert efficiency.equal_error_speedup(other, ours) == pytest.approx(1 / 6)
+    for speedup in (efficiency.equal_time_speedup, efficiency.equal_error_speedup):
         with pytest.raises(TypeError, match=r"other=3 must be a pair \(seconds, error\)"):
             speedup(ours, 3)
         with pytest.raises(ValueError, match="ours.error=0 must be"):
@@ -512,9 +511,9 @@ def test_speedups():
 @given(st.tuples(factors, factors), st.tuples(factors, factors))
 def test_speedup_is_the_ratio_of_efficiencies(ours, other):
     """With error ~ 1 / time both speed-ups are efficiency(ours) / efficiency(other)."""
-    expected = metrics.efficiency(*ours) / metrics.efficiency(*other)
-    assert metrics.equal_time_speedup(ours, other) == pytest.approx(expected)
-    assert metrics.equal_error_speedup(ours, other) == pytest.approx(expected)
+    expected = efficiency.efficiency(*ours) / efficiency.efficiency(*other)
+    assert efficiency.equal_time_speedup(ours, other) == pytest.approx(expected)
+    assert efficiency.equal_error_speedup(ours, other) == pytest.approx(expected)
 
 
 def test_slope():
@@ -525,12 +524,12 @@ def test_slope():
     (2 * 0 + 4 * 0.25 * 2 - 2 * 1.75 * 3) / 9.5 = -8.5 / 9.5.
     """
     errors = {1: [0.5, 2], 2: [0.25, 0.25, 0.125, 0.5], 8: [0.125, 0.125]}
-    found = metrics.slope(errors.keys(), errors.values())
+    found = efficiency.slope(errors.keys(), errors.values())
     assert found.value == pytest.approx(-8.5 / 9.5, rel=1e-12)
     assert found.low < found.value < found.high
-    assert metrics.slope(errors.keys(), errors.values(), 0.5).low > found.low
+    assert efficiency.slope(errors.keys(), errors.values(), 0.5).low > found.low
     scattered = np.random.default_rng(0).uniform(1, 2, (3, 6))
-    a, again, b = (metrics.slope([1, 2, 4], scattered, seed=seed) for seed in (0, 0, 1))
+    a, again, b = (efficiency.slope([1, 2, 4], scattered, seed=seed) for seed in (0, 0, 1))
     assert a == again and a.low != b.low and a.low == pytest.approx(b.low, abs=0.05 * (b.high - b.low))
 
 
@@ -539,7 +538,7 @@ def test_slope():
 def test_slope_of_a_power_law(exponent, constant, factor):
     """Errors c n^a have slope a and no spread, whatever the units of samples and errors."""
     samples = np.array([1, 4, 16]) * factor
-    found = metrics.slope(samples, [[constant * n**exponent] * 3 for n in samples])
+    found = efficiency.slope(samples, [[constant * n**exponent] * 3 for n in samples])
     expected = (found.value, found.low, found.high)
     assert expected == pytest.approx([exponent] * 3, abs=1e-9)
 
@@ -555,7 +554,7 @@ def test_slope_interval_covers():
     hits, widths = 0, []
     for seed in range(200):
         errors = np.exp(rng.normal(0, 0.3, (4, 5))) / samples[:, None]
-        found = metrics.slope(samples, errors, seed=seed)
+        found = efficiency.slope(samples, errors, seed=seed)
         hits += found.low <= -1 <= found.high
         widths.append((found.high - found.low) ** 2)
     offsets = np.log(samples) - np.log(samples).mean()
@@ -568,67 +567,67 @@ def test_slope_refuses():
     """Too few counts or runs, equal counts, errors of 0, rows that do not match."""
     rows = [[1.0, 2.0], [0.5, 0.6]]
     with pytest.raises(ValueError, match=r"samples has shape \(1,\); give at least 2"):
-        metrics.slope([4], rows[:1])
+        efficiency.slope([4], rows[:1])
     with pytest.raises(ValueError, match="errors has 2 rows for 3 samples"):
-        metrics.slope([1, 2, 4], rows)
+        efficiency.slope([1, 2, 4], rows)
     with pytest.raises(ValueError, match=r"errors\[1\] has shape \(1,\); give at least 2"):
-        metrics.slope([1, 2], [[1, 2], [1]])
+        efficiency.slope([1, 2], [[1, 2], [1]])
     with pytest.raises(ValueError, match=r"errors\[0\]=.* must be finite and above 0"):
-        metrics.slope([1, 2], [[0, 1], [1, 2]])
+        efficiency.slope([1, 2], [[0, 1], [1, 2]])
     with pytest.raises(ValueError, match="samples are all the same"):
-        metrics.slope([2, 2], rows)
+        efficiency.slope([2, 2], rows)
     with pytest.raises(TypeError, match=r"errors\[0\]=1 must be a row of numbers"):
-        metrics.slope([1, 2], {1: rows[0], 2: rows[1]})
+        efficiency.slope([1, 2], {1: rows[0], 2: rows[1]})
 
 
 def test_bootstrap_median():
     """Of 3, 1, 2 the median of a resample is 1 if two or three of it are 1: 3 * (1/9) * (2/3) + 1/27 =
     7/27 = 26 %. So with tails of 25 % the interval is [1, 3], with tails of 30 % [2, 2]."""
-    assert metrics.bootstrap_median([3, 1, 2], 0.5) == Estimate(2, 1, 3)
-    assert metrics.bootstrap_median([3, 1, 2], 0.4) == Estimate(2, 2, 2)
+    assert efficiency.bootstrap_median([3, 1, 2], 0.5) == Estimate(2, 1, 3)
+    assert efficiency.bootstrap_median([3, 1, 2], 0.4) == Estimate(2, 2, 2)
     # An even number of values: the mean of the two in the middle.
-    assert metrics.bootstrap_median([1, 2, 4, 50]).value == 3
+    assert efficiency.bootstrap_median([1, 2, 4, 50]).value == 3
     values = np.random.default_rng(0).normal(10, 1, 25)
-    found = metrics.bootstrap_median(values)
-    assert found == metrics.bootstrap_median(values)
+    found = efficiency.bootstrap_median(values)
+    assert found == efficiency.bootstrap_median(values)
     # The median's standard error is 1.2533 sigma / sqrt(n) = 0.25, so the interval is about 1 wide.
     assert 0.5 < found.high - found.low < 1.5 and found.low < found.value < found.high
     for bad in ([1.0], [1, np.nan], [[1, 2]]):
         with pytest.raises(ValueError, match="values"):
-            metrics.bootstrap_median(bad)
+            efficiency.bootstrap_median(bad)
     with pytest.raises(ValueError, match="confidence=95 must be finite and between 0 and 1"):
-        metrics.bootstrap_median([1, 2, 3], 95)
+        efficiency.bootstrap_median([1, 2, 3], 95)
 
 
 @quick
 @given(st.lists(st.integers(-100, 100), min_size=2, max_size=12), st.integers(-100, 100))
 def test_bootstrap_median_moves_with_its_values(values, shift):
     """The interval is within the values' range, holds the median, and moves with the values."""
-    found = metrics.bootstrap_median(values)
+    found = efficiency.bootstrap_median(values)
     assert min(values) <= found.low <= found.value <= found.high <= max(values)
-    moved = metrics.bootstrap_median([v + shift for v in values])
+    moved = efficiency.bootstrap_median([v + shift for v in values])
     expected = (found.low + shift, found.value + shift, found.high + shift)
     assert (moved.low, moved.value, moved.high) == pytest.approx(expected)
 
 
 def test_reference_good_enough():
     """At most 1 %: 0.001 of 0.1 is, 0.0011 is not."""
-    assert metrics.reference_good_enough(0.001, 0.1)
-    assert metrics.reference_good_enough(0, 0.1)
-    assert not metrics.reference_good_enough(0.0011, 0.1)
+    assert efficiency.reference_good_enough(0.001, 0.1)
+    assert efficiency.reference_good_enough(0, 0.1)
+    assert not efficiency.reference_good_enough(0.0011, 0.1)
     with pytest.raises(ValueError, match="measured_error=0 must be"):
-        metrics.reference_good_enough(0, 0)
+        efficiency.reference_good_enough(0, 0)
     with pytest.raises(ValueError, match="own_error=-1 must be"):
-        metrics.reference_good_enough(-1, 1)
+        efficiency.reference_good_enough(-1, 1)
 
 
 def test_reference_refusal():
     """0.0023 of 0.1 is 2.3 %, so 2.3 times the samples bring it to 1 %; 2.31 % needs 2.4 times."""
-    assert metrics.reference_refusal(0.0023, 0.1) == (
+    assert efficiency.reference_refusal(0.0023, 0.1) == (
         "The reference carries 2.3 % of the error measured with it (2.30e-03 of 1.00e-01) and may carry 1 %: "
         "render it with at least 2.3 times the samples."
     )
-    assert "carries 2.31 %" in metrics.reference_refusal(0.00231, 0.1)
-    assert "at least 2.4 times" in metrics.reference_refusal(0.00231, 0.1)
+    assert "carries 2.31 %" in efficiency.reference_refusal(0.00231, 0.1)
+    assert "at least 2.4 times" in efficiency.reference_refusal(0.00231, 0.1)
     with pytest.raises(ValueError, match="own_error=0.001 is good enough"):
-        metrics.reference_refusal(0.001, 0.1)
+        efficiency.reference_refusal(0.001, 0.1)

@@ -25,17 +25,17 @@ from types import SimpleNamespace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import oracle
 import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.emitters import emitters
 from mitsuba_bdpt.geometry import rays, rounding
 from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.measure import oracle
+from mitsuba_bdpt.measure.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
 from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, light_path, mis, techniques
 from mitsuba_bdpt.transport.counters import Counters
-from oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------

@@ -8,9 +8,9 @@ import subprocess
 from types import SimpleNamespace
 
 import numpy as np
-import page
 import pytest
-from analysis import Biased, NotJudged, Summary
+from mitsuba_bdpt.measure import page
+from mitsuba_bdpt.measure.analysis import Biased, NotJudged, Summary
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian's package chromium)")

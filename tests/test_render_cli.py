@@ -20,7 +20,8 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import render
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.cli.loading import in_proportion, load
+from mitsuba_bdpt.files import images
+from mitsuba_bdpt.files.loading import in_proportion, load
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
 
@@ -611,14 +612,14 @@ def test_a_full_disk_leaves_the_former_image(tmp_path, monkeypatch, missing):
     image as it was and nothing beside it."""
     pixels = (np.random.default_rng(1).random((64, 64, 3)) * 255).astype(np.uint8)
     image, png, path = mi.Bitmap(pixels), mi.Bitmap.FileFormat.PNG, tmp_path / "a.png"
-    render.write_whole(image, path, png)
+    images.write_whole(image, path, png)
     size = path.stat().st_size
     path.write_bytes(b"former")
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size - missing, before[1]))
     try:
         with pytest.raises(OSError):
-            render.write_whole(image, path, png)
+            images.write_whole(image, path, png)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"] and path.read_bytes() == b"former"
@@ -645,7 +646,7 @@ def test_a_failing_write_leaves_the_former_image(scene, tmp_path):
     path = tmp_path / "a.exr"
     path.write_bytes(b"former")
     with pytest.raises(RuntimeError):
-        render.write_whole(image, path, mi.Bitmap.FileFormat.Unknown)
+        images.write_whole(image, path, mi.Bitmap.FileFormat.Unknown)
     assert path.read_bytes() == b"former"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "plain.xml"]
 

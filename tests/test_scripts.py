@@ -7,16 +7,18 @@ import shutil
 import sys
 from pathlib import Path
 
-import compare
-import equal_time
 import matplotlib.image
-import mistakes
 import mitsuba as mi
 import mutants
 import numpy as np
 import pytest
-import reference
 import versus
+from mitsuba_bdpt.cli import mistakes
+from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.errors import CommandError, UnsupportedError, UsageError
+from mitsuba_bdpt.files.images import write_layers
+from mitsuba_bdpt.measure import compare, equal_time
+from mitsuba_bdpt.measure.scenes import depth_of
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -35,7 +37,6 @@ ROOM = """<scene version="3.0.0">
 def here(tmp_path, monkeypatch):
     """An empty working directory with a scene, text that is neither TOML nor a scene, and no references."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(reference, "REFERENCES", tmp_path)
     Path("room.xml").write_text(ROOM)
     Path("words.toml").write_text("scenes = [")
     Path("broken").mkdir()
@@ -54,47 +55,51 @@ def by_user(monkeypatch, script, *arguments):
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("candidates.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("compare.py bdpt path --scenes nowhere", "scene='nowhere' is not in scenes/"),
+        ("candidates.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        (
+            "compare.py bdpt path --scenes nowhere",
+            "scene='nowhere' is neither a scene file nor the name of one",
+        ),
         ("compare_ptracer.py --only=no-such-case --page missing.md", "missing.md"),
         ("endurance.py --show --record .", "Is a directory"),
         (
             "equal_time.py scenes/nowhere",
-            "neither a file nor the name of one in scenes/; there are ajar_door",
+            "neither a scene file nor the name of one in",
         ),
         ("equal_time.py cornell_box -o a.jpg", "output='a.jpg' must end in .png"),
-        ("equal_time.py room.xml", "give one with --reference"),
         ("equal_time.py room.xml --reference words.toml", "'words.toml' is not an EXR"),
         ("equal_time.py words.toml --reference flat.exr", "Parsing of XML"),
         ("equal_time.py room.xml --reference flat.exr -i nope bdpt", "nope"),
         ("equal_time.py room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
-        ("equal_time.py room.xml --reference flat.exr -i 'bdpt nothing' path", "the form KEY=VALUE"),
-        ("fireflies.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("floor.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("overhead.py nowhere", "scene='nowhere' is not in scenes/"),
+        ("fireflies.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("floor.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("overhead.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         ("mutants.py nowhere", "no mutant has 'nowhere' in its name"),
-        ("page.py broken", "broken: rows.parquet is missing or not whole; run scripts/sweep.py"),
+        ("page.py broken", "broken: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
         ("page.py . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page.py . -o words.toml/a.html", "words.toml"),
-        ("point_error.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("report.py nowhere", "nowhere: rows.parquet is missing or not whole; run scripts/sweep.py"),
-        ("stopping.py nowhere", "scene='nowhere' is not in scenes/"),
-        ("strategies.py nowhere", "scene='nowhere' is neither a file"),
+        ("point_error.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("report.py nowhere", "nowhere: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
+        ("stopping.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("strategies.py nowhere", "scene='nowhere' is neither a scene file"),
         ("strategies.py room.xml -o words.toml/a", "words.toml"),
         ("strategies.py room.xml --max-depth 1", "max_depth=1 has no strategies"),
         ("strategies.py room.xml --heuristic some", "bdpt: heuristic='some' is not known"),
-        ("strategy_noise.py nowhere", "scene='nowhere' is not in scenes/"),
+        ("strategy_noise.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         ("sweep.py nowhere.toml", "nowhere.toml"),
         ("sweep.py words.toml", "words.toml is not TOML"),
         (f"sweep.py {SCRIPTS.parent / 'presets' / 'small.toml'} -o words.toml", "words.toml"),
         ("versus.py nowhere", "checkout=nowhere has no integrators/mitsuba_bdpt; give a clone or a worktree"),
-        (f"versus.py {SCRIPTS.parent} --scenes nowhere", "scene='nowhere' is not in scenes/"),
+        (
+            f"versus.py {SCRIPTS.parent} --scenes nowhere",
+            "scene='nowhere' is neither a scene file nor the name of one",
+        ),
         (f"versus.py {SCRIPTS.parent} --parameters skip=some", "bdpt: skip='some' is not known"),
     ],
 )
 def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, message):
     """Expected: one line on standard error that names what is wrong, status 2, no traceback."""
-    reference.write_exr(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
+    write_layers(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
     script, *words = shlex.split(command)
     assert by_user(monkeypatch, script, *words) == 2
     error = capsys.readouterr().err
@@ -138,6 +143,13 @@ def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command
     assert f"argument {words[-2]}: got {words[-1]!r}, which must be" in error
 
 
+@pytest.mark.parametrize("words", ["bdpt nothing", "", "skip=none"])
+def test_integrators_of_command_lines_are_checked(here, monkeypatch, capsys, words):
+    """Expected: what is no type with properties is said with the form that is wanted, status 2."""
+    assert by_user(monkeypatch, "equal_time.py", "room.xml", "-i", words, "path") == 2
+    assert "which must have the form" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("option", ["--spp", "--rounds"])
 def test_options_of_rooms_want_rooms(here, monkeypatch, capsys, option):
     """Rationale: scenes of many emitters or BSDFs, which are the default, have sample counts of their own.
@@ -158,7 +170,7 @@ def test_options_of_rooms_want_rooms(here, monkeypatch, capsys, option):
 def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, command, taken):
     """Rationale: a name given by mistake must not cost the user the file. Expected: refused in words before
     anything is rendered."""
-    reference.write_exr(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
+    write_layers(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
     Path(taken).write_text("precious")
     before = sorted(Path().iterdir())
     script, *words = command.split()
@@ -173,10 +185,8 @@ def test_a_comparison_with_what_has_no_error_is_refused(monkeypatch):
     class Exact:
         image, share_of = np.ones((8, 8, 3)), None
 
-    monkeypatch.setattr(reference, "load_reference", lambda *where: Exact())
-    monkeypatch.setattr(compare.Side, "of", lambda words, name: compare.Side(None, None))
     monkeypatch.setattr(compare, "timed", lambda *what: (Exact.image, 1.0))
-    line = compare.line("furnace_white", ["path", "bdpt"], 4, 2)
+    line = compare.line("furnace_white", [compare.Side(None, None)] * 2, Exact(), 4, 2)
     assert len(line) == len(compare.HEADS) and line[:2] == ["`furnace_white`", "4"]
     assert "exactly that of the reference" in line[2]
 
@@ -255,9 +265,11 @@ def test_bugs_are_not_taken_for_mistakes():
     ):
         with pytest.raises((ValueError, KeyError, RuntimeError)):
             mistakes.answered(bug)
-    # This file is not among the scripts, so neither is its own `raise`.
+    # Only the errors of this project's own types are about what a user gave.
     with pytest.raises(ValueError, match="own"):
         mistakes.answered(lambda: raised(ValueError("own")))
+    for error in (CommandError("own"), UsageError("own"), UnsupportedError("own")):
+        assert mistakes.answered(lambda error=error: raised(error)) == mistakes.STATUS
 
 
 def test_equal_time_of_a_scene_file(here, capsys):
@@ -266,16 +278,16 @@ def test_equal_time_of_a_scene_file(here, capsys):
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file("room.xml")
     path = mi.load_dict({"type": "path", "max_depth": 3})
-    assert equal_time.depth_of(scene.integrator()) == 3 == equal_time.depth_of(path)
-    assert equal_time.depth_of(mi.load_dict({"type": "path"})) == -1 == equal_time.depth_of(None)
+    assert depth_of(scene.integrator()) == 3 == depth_of(path)
+    assert depth_of(mi.load_dict({"type": "path"})) == -1 == depth_of(None)
     for size, name in ((8, "right.exr"), (4, "wrong.exr")):
-        reference.write_exr(Path(name), {"": np.ones((size, size, 3))}, {})
-    arguments = ["room.xml", "--spp", "2", "-o", "a/b.png", "--reference"]
-    assert equal_time.main([*arguments, "right.exr"]) == 0
+        write_layers(Path(name), {"": np.ones((size, size, 3))}, {})
+    arguments = ["equal-time", "room.xml", "--spp", "2", "-o", "a/b.png", "--reference"]
+    assert main([*arguments, "right.exr"]) == 0
     assert matplotlib.image.imread("a/b.png").ndim == 3
     assert "bdpt, 2 spp" in capsys.readouterr().out
     with pytest.raises(ValueError, match="has 4 x 4 pixels, the film of 'room.xml' 8 x 8"):
-        equal_time.main([*arguments, "wrong.exr"])
+        equal_time.run(build_parser().parse_args([*arguments, "wrong.exr"]))
 
 
 def test_two_checkouts_are_compared(tmp_path, capsys):

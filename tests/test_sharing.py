@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.transport.sharing import LEAST_RUNS, LONGEST_RUN, Sharing
-from reference import load_scene
+from repository import load_scene
 
 PIXELS = (*range(1, 40), 97, 256, 257, 31 * 17, 997, 64 * 64, 4097, 4 * LEAST_RUNS * LONGEST_RUN + 13)
 

@@ -1,11 +1,13 @@
-"""Pictures of single strategies: scripts/strategies.py."""
+"""Pictures of single strategies: the command `pyramid`."""
 
 import matplotlib.image
 import numpy as np
 import OpenEXR
 import pytest
-import reference
-import strategies
+from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.measure import pyramid
+from mitsuba_bdpt.measure.project import Project
+from repository import PROJECT
 
 SCENE = """<scene version="3.0.0">
     <default name="spp" value="4"/> <default name="resolution" value="16"/>
@@ -29,7 +31,8 @@ def test_pyramid(tmp_path, capsys):
     file = tmp_path / "room.xml"
     file.write_text(SCENE)
     output = tmp_path / "made" / "room"
-    strategies.main([str(file), "-o", str(output), "--max-depth", "3", "--spp", "8", "--resolution", "16"])
+    options = ["--max-depth", "3", "--spp", "8", "--resolution", "16"]
+    assert main(["pyramid", str(file), "-o", str(output), *options]) == 0
     said = capsys.readouterr().out.split()
     assert said == [f"{output}_weighted.png", f"{output}_unweighted.png"]
     with OpenEXR.File(str(output.with_suffix(".exr")), separate_channels=True) as opened:
@@ -52,17 +55,21 @@ def test_panels_are_those_that_contribute():
     for name in ("weighted.s0t2.R", "weighted.s1t2.G"):
         image[..., 3 + names.index(name)] = 1
     image[0, 0, 3 + names.index("weighted.s2t2.B")] = 1
-    images = strategies.technique_images(image, names, "weighted")
+    images = pyramid.technique_images(image, names, "weighted")
     assert images[2, 1, 2].shape == (2, 2, 3) and len(images) == 12
-    assert list(strategies.panels(images)) == [(2, 1, 2), (3, 2, 2)]
+    assert list(pyramid.panels(images)) == [(2, 1, 2), (3, 2, 2)]
 
 
 def test_scenes_by_name_or_file(tmp_path):
-    """Expected: a name in scenes/, or a file; else an error that says so."""
-    assert reference.find_scene("cornell_box").name == "cornell_box.xml"
+    """Expected: a name in the project's scenes/, or a file, seen from here or from the project; else an error
+    that says what to do."""
+    assert PROJECT.scene("cornell_box").file.name == "cornell_box.xml"
+    assert PROJECT.scene("scenes/small_casters/area_cube.xml").name == "area_cube"
     file = tmp_path / "cornell_box"
     file.write_text(SCENE)
-    assert reference.find_scene(str(file)) == file
+    assert PROJECT.scene(str(file)).file == file
     for name in ("nothing", "scenes/nothing"):
         with pytest.raises(ValueError, match=f"scene='{name}' is neither .* there are ajar_door, "):
-            reference.find_scene(name)
+            PROJECT.scene(name)
+    with pytest.raises(ValueError, match="give the path of an XML file, or put it into .*scenes'"):
+        Project(tmp_path).scene("nothing")

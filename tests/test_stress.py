@@ -4,7 +4,7 @@ import json
 
 import pytest
 import stress
-from report import replace_part
+from mitsuba_bdpt.measure.report import replace_part
 from stress_cases import cases
 from stress_cases.agreement import Judged, worst
 

@@ -9,17 +9,21 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import analysis
-import metrics
 import mitsuba as mi
 import numpy as np
 import OpenEXR
-import probes
 import pyarrow.parquet
 import pytest
-import reference
-import sweep
-from preset import read_preset
+from mitsuba_bdpt.cli.arguments import build_parser
+from mitsuba_bdpt.files.images import read_layers
+from mitsuba_bdpt.files.texts import write_json
+from mitsuba_bdpt.measure import agreement, analysis, cells, making, metrics, probes, reference, scenes, sweep
+from mitsuba_bdpt.measure import bench as bench_module
+from mitsuba_bdpt.measure import halves as halves_module
+from mitsuba_bdpt.measure.making import Job
+from mitsuba_bdpt.measure.preset import read_preset
+from mitsuba_bdpt.measure.project import Project, depth_in
+from mitsuba_bdpt.measure.rows import errors
 
 ROOT = Path(__file__).resolve().parents[1]
 PRESET = """
@@ -47,12 +51,48 @@ width = 0.5
 METHODS = ("ours", "path", "ptracer")
 
 
+REPOSITORY = Project(ROOT)
+
+
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """References and sums in a folder of the test's own."""
-    monkeypatch.setattr(reference, "REFERENCES", tmp_path / "references")
-    monkeypatch.setattr(reference, "SUMS", tmp_path / "sums")
+def folder(tmp_path):
+    """A project of the test's own, with the scenes of this one and their recipes."""
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
+    (tmp_path / "presets").mkdir()
+    (tmp_path / "presets" / "benchmark.toml").symlink_to(REPOSITORY.preset("benchmark"))
+    (tmp_path / "references").mkdir()
+    (tmp_path / "references" / "scenes.toml").symlink_to(ROOT / "references" / "scenes.toml")
     return tmp_path
+
+
+@pytest.fixture
+def project(folder):
+    return Project(folder)
+
+
+@pytest.fixture
+def job(project):
+    """Makes jobs: the reference of a scene, 8 pixels wide, of some depth."""
+
+    def made(max_depth, name="cornell_box", **more):
+        return Job(project, project.scene(name), 8, max_depth, **({"spp": 4} | more))
+
+    return made
+
+
+@pytest.fixture
+def swept(folder):
+    """Sweeps the preset in a file, errors raised: the exit status."""
+
+    def run(path, *more):
+        words = ["sweep", str(path), "--project", str(folder), *map(str, more)]
+        return sweep.run(build_parser().parse_args(words))
+
+    return run
+
+
+def reference_of(project, max_depth, name="cornell_box"):
+    return reference.load_reference(project, project.scene(name), 8, max_depth)
 
 
 def preset_file(folder, text=PRESET):
@@ -64,35 +104,31 @@ def preset_file(folder, text=PRESET):
 # -- references -------------------------------------------------------------------------------
 
 
-def job(max_depth, **more):
-    return reference.Job("cornell_box", 8, max_depth, **({"spp": 4} | more))
-
-
-def test_a_reference_comes_back_with_its_error_and_provenance(folder):
+def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
     """Expected: the stored image is the rendered one within half precision (2^-11 relative), its own error
     is at most 0.9 % of that of `bdpt` with 4 samples per pixel (of three renders), the means for bias checks
     are those of at least 8 renders, and the provenance says what made it.
     """
-    made, reached = reference.make(job(2))
+    made, reached = making.make(job(2))
     assert reached
-    kept = reference.load_reference("cornell_box", 8, 2)
+    kept = reference_of(project, 2)
     np.testing.assert_allclose(kept.image, made.image, rtol=2.0**-11, atol=1e-6)
     assert kept.error == pytest.approx(made.error, rel=0.05)
-    scene = reference.load_scene("cornell_box", resolution=8)
+    scene = REPOSITORY.scene("cornell_box").load(8)
     ours = mi.load_dict({"type": "bdpt", "max_depth": 2})
     image = np.array(mi.render(scene, integrator=ours, spp=4, seed=0))[..., :3]
     assert 0 < made.error <= 0.009 * metrics.rel_mse(image, made.image)
     assert kept.means.columns.freedom >= 7
-    np.testing.assert_allclose(kept.means.columns.mean, metrics.tile_columns(kept.image), rtol=2e-3)
+    np.testing.assert_allclose(kept.means.columns.mean, agreement.tile_columns(kept.image), rtol=2e-3)
     np.testing.assert_allclose(kept.means.whole.error, made.means.whole.error, rtol=1e-6)
     assert kept.provenance["integrator"] == {"type": "path", "max_depth": 2}
     assert kept.provenance["spp"] % 512 == 0 and kept.provenance["versions"]["mitsuba"].startswith("3.9")
 
 
-def test_furnaces_are_known_without_error(folder):
+def test_furnaces_are_known_without_error(project, job):
     """Expected: 1 - 2^-3 in every pixel of furnace_emission at depth 3, by no integrator."""
-    reference.make(reference.Job("furnace_emission", 8, 3))
-    kept = reference.load_reference("furnace_emission", 8, 3)
+    making.make(job(3, "furnace_emission"))
+    kept = reference_of(project, 3, "furnace_emission")
     assert (kept.image == 0.875).all() and kept.error == 0
     assert (kept.means.columns.error == 0).all() and kept.means.columns.freedom == np.inf
     assert kept.provenance["integrator"] == "known answer"
@@ -102,29 +138,29 @@ def test_halves_estimate_the_error_of_their_mean(folder):
     """Rationale: the halves differ by twice the standard error of their mean. Expected: for halves r + e and
     r - e the mean is r and the error that of r + e against r: e^2 / (r^2 + 0.01 r^2).
     """
-    halves = reference.Halves(folder / "sums.npz", "key")
+    halves = halves_module.Halves(folder / "sums.npz", "key")
     r, e = np.full((4, 4, 3), 2.0), 0.1
     for _ in range(4):
         halves.add([r + e, r - e])
     made = halves.reference({})
     assert made.error == pytest.approx(e**2 / (4 * 1.01))
     assert made.means.columns.error == pytest.approx(e / np.sqrt(7))
-    again = reference.Halves(folder / "sums.npz", "key")
+    again = halves_module.Halves(folder / "sums.npz", "key")
     assert again.rounds == 4 and again.reference({}).error == pytest.approx(made.error)
-    assert reference.Halves(folder / "sums.npz", "another").rounds == 0
+    assert halves_module.Halves(folder / "sums.npz", "another").rounds == 0
 
 
 def test_windows_of_halves_have_more_samples(folder):
     """Expected: each pixel is the mean of all renders it is in, weighted by their samples; sums kept before
     there were windows count as whole images. The tile means are those of whole images alone.
     """
-    halves = reference.Halves(folder / "sums.npz", "key")
+    halves = halves_module.Halves(folder / "sums.npz", "key")
     for value in (1.0, 3.0):
         halves.add([np.full((4, 4, 3), value)] * 2)
     kept = dict(np.load(folder / "sums.npz"))
     del kept["counts"]
     np.savez(folder / "sums.npz", **kept)
-    halves = reference.Halves(folder / "sums.npz", "key")
+    halves = halves_module.Halves(folder / "sums.npz", "key")
     halves.add([np.full((2, 1, 3), 5.0), np.full((2, 1, 3), 9.0)], (slice(1, 3), slice(0, 1)), 4)
     image, difference = halves.mean()
     expected, half = np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3))
@@ -140,26 +176,27 @@ def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
     (2^-11 of a value); seeds that were used do not come again; after another round all have one more.
     """
     rng = np.random.default_rng(3)
-    halves, window = reference.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
-    for _ in range(metrics.FEWEST_RUNS):
+    halves, window = halves_module.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
+    for _ in range(agreement.FEWEST_RUNS):
         halves.add(rng.uniform(1, 2, (2, 16, 16, 3)))
     halves.add(rng.uniform(1, 2, (2, 4, 4, 3)), window, 4)
     spp = {
-        name: round(2 * reference.PASS_SPP * count) for name, count in (("spp", 8), ("spp_in_windows", 12))
+        name: round(2 * halves_module.PASS_SPP * count)
+        for name, count in (("spp", 8), ("spp_in_windows", 12))
     }
     reference.write(folder / "a.exr", halves.reference(spp | {"sources": ["x"]}))
-    (image, difference), header = reference.read_exr(folder / "a.exr", "", "difference.")
+    (image, difference), header = read_layers(folder / "a.exr", "", "difference.")
     kept = json.loads(header["provenance"])
-    stored = reference.Reference(image, difference, reference._means(kept["means"]), kept)
-    again = reference.Halves(folder / "other.npz", "key")
+    stored = reference.Reference(image, difference, reference.means_of(kept["means"]), kept)
+    again = halves_module.Halves(folder / "other.npz", "key")
     again.go_on_from(stored, [window])
     np.testing.assert_allclose(again.counts, halves.counts)
     assert again.rounds >= halves.rounds and "x" in again.sources
-    more = rng.uniform(1, 2, (metrics.FEWEST_RUNS, 2, 16, 16, 3))
+    more = rng.uniform(1, 2, (agreement.FEWEST_RUNS, 2, 16, 16, 3))
     for images in more:
         halves.add(images)
         again.add(images)
-    again = reference.Halves(folder / "other.npz", "key")
+    again = halves_module.Halves(folder / "other.npz", "key")
     np.testing.assert_allclose(again.sums, halves.sums, rtol=2**-10)
     for name in ("mean", "error", "nonzero", "freedom"):
         for part in ("columns", "whole"):
@@ -172,9 +209,9 @@ def test_windows_cover_the_glass_and_show_the_same():
     which fill less than a fifth of the image; a window shows that part of the whole image: depths, which
     range over 2, agree to 0.02 on average (random positions at the outlines).
     """
-    job = reference.Job("glass_caustics", 64)
-    scene = reference.load_scene("glass_caustics", resolution=64)
-    windows = [reference.Window(job, share) for share in reference.FOCUS["glass_caustics"]]
+    job = Job(REPOSITORY, REPOSITORY.scene("glass_caustics"), 64)
+    scene = REPOSITORY.scene("glass_caustics").load(64)
+    windows = [making.Window(job, share) for share in making.Recipe.of(REPOSITORY, "glass_caustics").windows]
     inside = np.zeros((64, 64), bool)
     for window in windows:
         inside[window.slices] = True
@@ -192,44 +229,44 @@ def test_windows_cover_the_glass_and_show_the_same():
     assert np.abs(part - whole).mean() < 0.02
 
 
-def test_references_go_on_where_they_stopped(folder):
+def test_references_go_on_where_they_stopped(project, job):
     """Expected: without time there is one round and it is not good enough; a second run adds to it; a third
     has nothing to do.
     """
-    first, reached = reference.make(job(2, seconds=0))
-    assert not reached and first.provenance["spp"] == 2 * reference.PASS_SPP
-    assert reference.load_reference("cornell_box", 8, 2).means is None
-    second, reached = reference.make(job(2))
+    first, reached = making.make(job(2, seconds=0))
+    assert not reached and first.provenance["spp"] == 2 * halves_module.PASS_SPP
+    assert reference_of(project, 2).means is None
+    second, reached = making.make(job(2))
     assert reached and second.provenance["spp"] > first.provenance["spp"]
-    third, reached = reference.make(job(2, seconds=0))
+    third, reached = making.make(job(2, seconds=0))
     assert reached and third.provenance["spp"] == second.provenance["spp"]
 
 
-def test_a_better_reference_stays(folder):
+def test_a_better_reference_stays(project, job):
     """Rationale: the sums behind the stored references are not in the repository. Expected: with the sums
     gone, and made by something else than now, so that a run begins anew, what a short run gives does not
     replace the stored one; with enough time a new one does.
     """
-    made, _ = reference.make(job(2))
+    made, _ = making.make(job(2))
     stored = replace(made, provenance=made.provenance | {"sampler": "another"})
-    reference.write(reference.reference_path("cornell_box", 8, 2), stored)
-    for sums in reference.SUMS.glob("*.npz"):
+    reference.write(reference.reference_path(project, "cornell_box", 8, 2), stored)
+    for sums in project.renders.glob("*.npz"):
         sums.unlink()
-    kept, reached = reference.make(job(2, seconds=0))
+    kept, reached = making.make(job(2, seconds=0))
     assert not reached and kept.provenance["spp"] == stored.provenance["spp"]
-    assert reference.load_reference("cornell_box", 8, 2).provenance["spp"] == stored.provenance["spp"]
-    assert reference.make(job(2))[1]
+    assert reference_of(project, 2).provenance["spp"] == stored.provenance["spp"]
+    assert making.make(job(2))[1]
 
 
 def test_sums_stay_finite_and_say_what_they_are_of(folder, capsys):
     """Expected: a value that is not finite is refused before it is added; sums of something else are not
     used, and it is said."""
-    halves = reference.Halves(folder / "sums.npz", "key")
+    halves = halves_module.Halves(folder / "sums.npz", "key")
     halves.add([np.ones((4, 4, 3))] * 2)
     with pytest.raises(ValueError, match=r"sums.npz: round 1 has values that are not finite"):
         halves.add([np.ones((4, 4, 3)), np.full((4, 4, 3), np.inf)])
-    assert reference.Halves(folder / "sums.npz", "key").rounds == 1 and not capsys.readouterr().out
-    assert reference.Halves(folder / "sums.npz", "another").rounds == 0
+    assert halves_module.Halves(folder / "sums.npz", "key").rounds == 1 and not capsys.readouterr().out
+    assert halves_module.Halves(folder / "sums.npz", "another").rounds == 0
     assert "sums.npz: of another scene, integrator or number of" in capsys.readouterr().out
 
 
@@ -241,34 +278,34 @@ def test_references_that_half_precision_cannot_hold_are_refused(folder):
 
 def test_wide_scenes_stay_wide():
     """Expected: 16:9 at any width."""
-    size = reference.load_scene("veach_mis", resolution=128).sensors()[0].film().size()
+    size = REPOSITORY.scene("veach_mis").load(128).sensors()[0].film().size()
     assert [int(n) for n in size] == [128, 72]
 
 
-def test_missing_and_stale_references_are_refused(folder, monkeypatch):
+def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
     """Expected: the command that makes the reference is named."""
-    command = "python scripts/reference.py cornell_box --resolution 8 --max-depth 2"
+    command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2"
     with pytest.raises(ValueError, match=f"no reference.*{command}"):
-        reference.load_reference("cornell_box", 8, 2)
-    reference.make(job(2, seconds=0))
-    monkeypatch.setattr(reference, "digest", lambda *paths: "another file")
+        reference_of(project, 2)
+    making.make(job(2, seconds=0))
+    monkeypatch.setattr(scenes, "digest", lambda *paths: "another file")
     with pytest.raises(ValueError, match=f"another cornell_box.xml, mesh or texture; {command}"):
-        reference.load_reference("cornell_box", 8, 2)
-    with pytest.raises(ValueError, match="scene='nowhere' is not in scenes/"):
-        reference.scene_file("nowhere")
+        reference_of(project, 2)
+    with pytest.raises(ValueError, match="scene='nowhere' is neither a scene file nor the name of one"):
+        project.scene("nowhere")
 
 
 # -- sweeps -----------------------------------------------------------------------------------
 
 
-def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch):
+def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch, job, swept):
     """Expected: scenes x integrators x samples x seeds rows, the same in CSV and Parquet; a second run
     renders nothing; with one cell removed it renders that one.
     """
-    reference.make(job(3))
+    making.make(job(3))
     path, output = preset_file(folder), folder / "out"
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(output)])
-    assert sweep.main() == 0
+    words = path, "-o", output
+    assert swept(*words) == 0
     table = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
     assert len(table) == 8 and (output / "rows.csv").read_text().count("\n") == 9
     assert {(r["method"], r["budget"], r["seed"]) for r in table} == {
@@ -284,22 +321,19 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch
     rendered = []
     measure = sweep.measure
     monkeypatch.setattr(sweep, "measure", lambda b, c: rendered.append(c.key) or measure(b, c))
-    assert sweep.main() == 0 and rendered == [table[3]["key"]]
+    assert swept(*words) == 0 and rendered == [table[3]["key"]]
     assert len(pyarrow.parquet.read_table(output / "rows.parquet")) == 8
 
 
-def test_a_sweep_on_a_cluster(folder, monkeypatch, workers):
+def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, job, swept):
     """Expected: the same cells as here, by the same keys, with their images (the same seeds, so the same up
     to rounding) and errors; further seeds until the interval is narrow enough; nothing is rendered twice.
     """
-    reference.make(job(3))
+    making.make(job(3))
     path = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 3") + MORE)
-    arguments = ["sweep.py", str(path), "-o"]
-    monkeypatch.setattr(sys, "argv", [*arguments, str(folder / "here")])
-    assert sweep.main() == 0
-    there = [*arguments, str(folder / "there"), "--scheduler", workers.scheduler_address]
-    monkeypatch.setattr(sys, "argv", there)
-    assert sweep.main() == 0
+    assert swept(path, "-o", folder / "here") == 0
+    there = ["-o", folder / "there", "--scheduler", workers.scheduler_address]
+    assert swept(path, *there) == 0
     tables = [
         pyarrow.parquet.read_table(folder / name / "rows.parquet").to_pylist() for name in ("here", "there")
     ]
@@ -310,46 +344,44 @@ def test_a_sweep_on_a_cluster(folder, monkeypatch, workers):
         here, remote = (table[key] for table in ours)
         assert remote["rel_mse"] == pytest.approx(here["rel_mse"], rel=1e-3) and remote["seconds"] > 0
         assert (folder / "there" / "images" / "cornell_box" / f"{key}.exr").exists()
-    monkeypatch.setattr(sweep.cluster, "results", None)
-    assert sweep.main() == 0
+    monkeypatch.setattr(sweep.workers, "results", None)
+    assert swept(path, *there) == 0
 
 
-def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers):
+def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, job, swept):
     """Expected: renders of another version are not mixed in; the message says what the worker has."""
-    reference.make(job(3))
-    monkeypatch.setattr(sweep, "software", lambda: {"mitsuba-bdpt": "other"})
-    there = ["sweep.py", str(preset_file(folder)), "-o", str(folder / "out")]
-    monkeypatch.setattr(sys, "argv", [*there, "--scheduler", workers.scheduler_address])
+    making.make(job(3))
+    monkeypatch.setattr(cells, "software", lambda: {"mitsuba-bdpt": "other"})
+    there = ["-o", folder / "out", "--scheduler", workers.scheduler_address]
     with pytest.raises(RuntimeError, match="failed on the cluster: a worker has other software"):
-        sweep.main()
+        swept(preset_file(folder), *there)
 
 
-def test_one_scene_of_a_preset_anew(folder, monkeypatch):
+def test_one_scene_of_a_preset_anew(folder, job, swept):
     """Expected: with --scenes the rows of other scenes stay as they are, in the preset's order, though their
     cells are gone; a scene that the preset lacks is named before anything is rendered.
     """
-    reference.make(job(3))
-    reference.make(reference.Job("furnace_emission", 8, 3))
+    making.make(job(3))
+    making.make(job(3, "furnace_emission"))
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "furnace_emission"]')
     path, output = preset_file(folder, text), folder / "out"
-    arguments = ["sweep.py", str(path), "-o", str(output)]
-    monkeypatch.setattr(sys, "argv", arguments)
-    assert sweep.main() == 0
+    words = path, "-o", output
+    assert swept(*words) == 0
     before = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
     for file in (output / "cells").iterdir():
         file.unlink()
-    monkeypatch.setattr(sys, "argv", [*arguments, "--scenes", "furnace_emission"])
-    assert sweep.main() == 0
+    words = *words[:3], "--scenes", "furnace_emission"
+    assert swept(*words) == 0
     after = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
     assert [row["key"] for row in after] == [row["key"] for row in before]
     kept = [row["scene"] == "cornell_box" for row in before]
     assert [a == b for a, b in zip(after, before, strict=True)] == kept and not all(kept) and any(kept)
-    monkeypatch.setattr(sys, "argv", [*arguments, "--scenes", "pool"])
+    words = *words[:3], "--scenes", "pool"
     with pytest.raises(ValueError, match="--scenes pool: not in the preset, which has cornell_box, furn"):
-        sweep.main()
+        swept(*words)
 
 
-class Clock(sweep.Bench):
+class Clock(bench_module.Bench):
     """Renders take 1 ms per sample by `ours` and 0.25 ms by others, and 1 s more the first time."""
 
     calls = []
@@ -361,20 +393,20 @@ class Clock(sweep.Bench):
         return np.ones((8, 8, 3)) + 0.1 * seed, seconds
 
 
-def test_equal_time_by_a_clock(folder, monkeypatch):
+def test_equal_time_by_a_clock(folder, monkeypatch, job, swept):
     """Rationale: seconds are what everything is divided by. Expected: `path` is four times as fast and gets
     four times the samples at every budget, by a ratio that is measured at the largest one; no measured
     render is the first with its number of samples, which compiles; stratified samplers get the nearest power
     of two (of 8, 12 and 28: 8, 16 and 32, of which multijitter makes 5 x 7).
     """
-    reference.make(job(3))
+    making.make(job(3))
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
     text += 'sampler = "multijitter"\nmatch = "seconds"\n'
     path, output = preset_file(folder, text), folder / "out"
     monkeypatch.setattr(Clock, "calls", [])
     monkeypatch.setattr(sweep, "Bench", Clock)
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(output)])
-    assert sweep.main() == 0
+    words = path, "-o", output
+    assert swept(*words) == 0
     table = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
     spp = {(r["method"], r["budget"]): r["spp"] for r in table}
     assert [spp["ours", b] for b in (2, 3, 7)] == [2, 3, 7]
@@ -384,7 +416,7 @@ def test_equal_time_by_a_clock(folder, monkeypatch):
     assert len(list((output / "ratios").glob("*.json"))) == 2
 
 
-def test_ctrl_c_ends_a_sweep(folder, monkeypatch):
+def test_ctrl_c_ends_a_sweep(folder, job, swept):
     """Rationale: `mitsuba.render` wraps what its integrators raise. Expected: the interruption arrives, and
     is not one failed cell of many.
     """
@@ -398,19 +430,34 @@ def test_ctrl_c_ends_a_sweep(folder, monkeypatch):
             raise KeyboardInterrupt
 
     mi.register_integrator("interrupted", Interrupted)
-    reference.make(job(3))
+    making.make(job(3))
     path = preset_file(folder, PRESET.replace('type = "path"', 'type = "interrupted"'))
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(folder / "out")])
+    words = path, "-o", folder / "out"
     with pytest.raises(KeyboardInterrupt):
-        sweep.main()
+        swept(*words)
 
 
-def test_no_reference_no_renders(folder, monkeypatch):
-    """Expected: a sweep without one of its references says so before it renders."""
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(preset_file(folder)), "-o", str(folder / "out")])
+def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
+    """Expected: a sweep makes those of its references that are missing before it renders anything; one that
+    cannot judge, since it is of another scene, it names before that too, and leaves it as it is."""
+    words, began = (preset_file(folder), "-o", folder / "out"), []
+
+    def measure(bench, cell):
+        began.append(reference.reference_path(project, "cornell_box", 8, 3).is_file())
+        return bench_module.measure(bench, cell)
+
+    monkeypatch.setattr(sweep, "measure", measure)
+    assert swept(*words) == 0 and began == [True] * 8
+    for file in (folder / "out" / "cells").iterdir():
+        file.unlink()
+    kept = reference_of(project, 3)
+    path = reference.reference_path(project, "cornell_box", 8, 3)
+    reference.write(path, replace(kept, provenance=kept.provenance | {"scene_sha256": "of another"}))
+    before = path.read_bytes()
     monkeypatch.setattr(sweep, "measure", None)
-    with pytest.raises(ValueError, match="no reference for scene='cornell_box' at 8 and depth 3"):
-        sweep.main()
+    with pytest.raises(ValueError, match="was made of another cornell_box.xml, mesh or texture; mitsuba"):
+        swept(*words)
+    assert path.read_bytes() == before
 
 
 def test_files_are_replaced_at_once(folder, monkeypatch):
@@ -418,57 +465,54 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
     beside it.
     """
     file = folder / "kept.json"
-    reference.write_json(file, [1, 2])
-    before = reference.Halves(folder / "sums.npz", "key")
+    write_json(file, [1, 2])
+    before = halves_module.Halves(folder / "sums.npz", "key")
     before.add([np.ones((4, 4, 3))] * 2)
 
     def killed(*args):
         raise SystemExit
 
     monkeypatch.setattr("os.replace", killed)
-    for write in (lambda: reference.write_json(file, [3]), lambda: before.add([np.zeros((4, 4, 3))] * 2)):
+    for write in (lambda: write_json(file, [3]), lambda: before.add([np.zeros((4, 4, 3))] * 2)):
         with pytest.raises(SystemExit):
             write()
     assert not list(folder.glob(".*"))
     assert json.loads(file.read_text()) == [1, 2]
-    assert reference.Halves(folder / "sums.npz", "key").rounds == 1
+    assert halves_module.Halves(folder / "sums.npz", "key").rounds == 1
 
 
-def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys):
+def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
     """Expected: measured once, again when the number of rounds changes; a failure is reported with what the
     process wrote, and the sweep goes on.
     """
-    reference.make(job(3))
+    making.make(job(3))
     calls = []
-    monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: calls.append(rounds) or {"2 spp": [1.0]})
+    monkeypatch.setitem(probes.PROBES, "memory", lambda _, rounds: calls.append(rounds) or {"2 spp": [1.0]})
     output = folder / "out"
     for rounds in (1, 1, 2):
         path = preset_file(folder, f"{PRESET}[probes]\nmemory = {rounds}\n")
-        monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(output)])
-        assert sweep.main() == 0
+        words = path, "-o", output
+        assert swept(*words) == 0
     assert calls == [1, 2]
     assert json.loads((output / "probes.json").read_text())["memory"]["values"] == {"2 spp": [1.0]}
-    monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: {"2 spp": [probes._printed("1 / 0")]})
+    monkeypatch.setitem(probes.PROBES, "memory", lambda _, rounds: {"2 spp": [probes._printed("1 / 0")]})
     preset_file(folder, f"{PRESET}[probes]\nmemory = 3\n")
-    assert sweep.main() == 1
+    assert swept(*words) == 1
     assert "failed: memory: a probe ended with status 1" in capsys.readouterr().out
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         probes._printed("1 / 0")
 
 
-def test_the_command_line_of_references_tells_what_failed(folder, monkeypatch, capsys):
+def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
     """Expected: status 1 if one is not good enough or fails, the others are made; bad numbers are refused."""
 
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["reference.py", *arguments])
-        return reference.main()
+        return making.run(build_parser().parse_args(["reference", "--project", str(folder), *arguments]))
 
     small = ("--resolution", "8", "--max-depth", "2", "--spp", "4")
     assert run("nowhere", "furnace_point", *small) == 1
     out = capsys.readouterr().out
-    assert (
-        "nowhere: failed: scene='nowhere' is not in scenes/" in out and "furnace_point: known answer" in out
-    )
+    assert "nowhere: failed: scene='nowhere' is neither" in out and "furnace_point: known answer" in out
     assert run("cornell_box", *small, "--seconds", "0") == 1
     assert "not good enough for 4 spp" in capsys.readouterr().out
     assert run("cornell_box", *small) == 0
@@ -477,42 +521,40 @@ def test_the_command_line_of_references_tells_what_failed(folder, monkeypatch, c
             run("cornell_box", *wrong)
 
 
-def test_a_reference_is_of_the_depth_that_presets_ask_for(folder, monkeypatch):
+def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, job):
     """Rationale: the scene's file had a depth of its own, and a reference of the benchmark's scene could not
     serve it. Expected: the default is the depth that the preset is read with, its own before that of all
     scenes before the file's."""
     depths = []
-    monkeypatch.setattr(reference, "_rendered", lambda job, depth: (depths.append(depth), True))
-    monkeypatch.setattr(reference, "write", lambda path, made: None)
+    monkeypatch.setattr(making, "_rendered", lambda job, recipe: (depths.append(job.depth), True))
+    monkeypatch.setattr(making, "write", lambda path, made: None)
     for name in ("cornell_box", "pool"):
-        reference.make(reference.Job(name, 8))
-    subjects = {subject.name: subject for subject in read_preset(reference.BENCHMARK).subjects}
+        making.make(job(None, name))
+    preset = read_preset(project.preset("benchmark"), project)
+    subjects = {subject.name: subject for subject in preset.subjects}
     assert depths == [subjects[name].max_depth for name in ("cornell_box", "pool")]
-    assert depths[0] != reference.default_depth("cornell_box")
+    assert depths[0] != project.scene("cornell_box").max_depth
     data = {"max_depth": 3, "scene": {"pool": {"max_depth": 4}}}
-    assert [reference.depth_in(data, name) for name in ("pool", "cornell_box")] == [4, 3]
+    assert [depth_in(data, project.scene(name)) for name in ("pool", "cornell_box")] == [4, 3]
 
 
-def test_a_failing_cell_does_not_cost_the_others(folder, capsys, monkeypatch):
+def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
     """Expected: the cells of a plugin that does not exist fail, are named, and the others are there."""
-    reference.make(job(3))
+    making.make(job(3))
     path = preset_file(folder, PRESET.replace('type = "path"', 'type = "no_such_plugin"\nname = "bad"'))
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(folder / "out")])
-    assert sweep.main() == 1
+    words = path, "-o", folder / "out"
+    assert swept(*words) == 1
     out = capsys.readouterr().out
     assert len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad:", out)) == 4 and ": 4 rows" in out
 
 
-def test_a_killed_sweep_loses_one_cell_at_most(folder):
+def test_a_killed_sweep_loses_one_cell_at_most(folder, project, job):
     """Expected: after kill -9 in the middle every file in cells/ is whole, and the next run completes."""
-    reference.make(job(3))
+    making.make(job(3))
     path, output = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 10")), folder / "out"
     code = (
-        f"import sys; sys.path.insert(0, {str(ROOT / 'scripts')!r})\n"
-        "import sweep, reference; from pathlib import Path\n"
-        f"reference.REFERENCES = Path({str(folder / 'references')!r})\n"
-        f"sys.argv = ['sweep.py', {str(path)!r}, '-o', {str(output)!r}]\n"
-        "sys.exit(sweep.main())\n"
+        "import sys; from mitsuba_bdpt.cli.arguments import main\n"
+        f"sys.exit(main(['sweep', {str(path)!r}, '-o', {str(output)!r}, '--project', {str(folder)!r}]))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
@@ -533,47 +575,47 @@ def test_a_reference_that_is_too_noisy_judges_nothing():
     image = np.random.default_rng(1).random((8, 8, 3)) + 0.5
     for own, judged in ((1e-9, True), (1.0, False)):
         ref = reference.Reference(np.ones((8, 8, 3)), np.full((8, 8, 3), own**0.5), None, {})
-        row = sweep.errors(image, ref, "", False)
+        row = errors(image, ref, "", False)
         assert row["judged"] is row["judged_trimmed"] is judged
-    exact = sweep.errors(ref.image, ref, "", True)
+    exact = errors(ref.image, ref, "", True)
     assert exact["rel_mse"] == 0 and not exact["judged"]
     assert row["flip"] is None and exact["flip"] == 0
 
 
-def test_rows_follow_a_better_reference(folder, monkeypatch):
+def test_rows_follow_a_better_reference(folder, monkeypatch, project, job, swept):
     """Expected: with another reference the errors are taken anew from the stored image, nothing is
     rendered, and the error is that of the image against the new reference.
     """
-    reference.make(job(3))
+    making.make(job(3))
     path, output = preset_file(folder), folder / "out"
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(output)])
-    assert sweep.main() == 0
+    words = path, "-o", output
+    assert swept(*words) == 0
     before = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
-    kept = reference.load_reference("cornell_box", 8, 3)
+    kept = reference_of(project, 3)
     better = replace(kept, image=1.25 * kept.image, difference=0 * kept.image)
-    reference.write(reference.reference_path("cornell_box", 8, 3), better)
+    reference.write(reference.reference_path(project, "cornell_box", 8, 3), better)
     monkeypatch.setattr(sweep, "measure", None)
-    assert sweep.main() == 0
+    assert swept(*words) == 0
     after = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
     for a, b in zip(before, after, strict=True):
         assert a["seconds"] == b["seconds"] and a["mean"] == pytest.approx(b["mean"], rel=1e-6)
         assert b["mape"] != a["mape"] and b["reference_rel_mse"] == 0
     with OpenEXR.File(str(next((output / "images").rglob(f"{after[0]['key']}.exr"))), True) as file:
         pixels = np.stack([file.channels()[c].pixels for c in "RGB"], axis=-1).astype(np.float64)
-    new = reference.load_reference("cornell_box", 8, 3).image
+    new = reference_of(project, 3).image
     assert after[0]["rel_mse"] == pytest.approx(metrics.rel_mse(pixels, new))
 
 
-def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch):
+def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept):
     """Expected: at least as many seeds as asked for, then one more at a time until the interval of the ratio
     of efficiencies is narrow enough; only of the integrators named; nothing more on a second run.
     """
-    reference.make(job(3))
+    making.make(job(3))
     path, output = preset_file(folder, PRESET + '[[integrator]]\ntype = "ptracer"\n' + MORE), folder / "out"
-    monkeypatch.setattr(sys, "argv", ["sweep.py", str(path), "-o", str(output)])
+    words = path, "-o", output
     monkeypatch.setattr(analysis, "widths", lambda rows, methods: {"path": 3.9 / len(rows)})
     for _ in range(2):
-        assert sweep.main() == 0
+        assert swept(*words) == 0
         table = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
         seeds = {m: [r["seed"] for r in table if r["method"] == m and r["budget"] == 4] for m in METHODS}
         # Two rows a seed: 3.9 / 6 and 3.9 / 8 from three and four seeds, of which the latter is below 0.5.
@@ -612,19 +654,19 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch):
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
     with pytest.raises(ValueError, match=message):
-        read_preset(preset_file(tmp_path, PRESET.replace(*edit)))
+        read_preset(preset_file(tmp_path, PRESET.replace(*edit)), REPOSITORY)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "presets").glob("*.toml")), ids=lambda p: p.stem)
 def test_presets_are_read(path):
     """Expected: every committed preset names scenes and integrators that exist."""
-    for method in read_preset(path).methods:
+    for method in read_preset(path, REPOSITORY).methods:
         mi.load_dict(dict(method.parameters))
 
 
 def keys(folder, text=PRESET):
-    preset = read_preset(preset_file(folder, text))
-    return {cell.key for cell in sweep.Cells(preset, preset.subjects[0]).planned()}
+    preset = read_preset(preset_file(folder, text), REPOSITORY)
+    return {cell.key for cell in cells.Cells(REPOSITORY, preset, preset.subjects[0]).planned()}
 
 
 def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):
@@ -635,5 +677,5 @@ def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):
     assert len(names | keys(tmp_path, PRESET.replace("seeds = 2", "seeds = [2, 3]"))) == 10
     fewer = keys(tmp_path, PRESET.replace('match = "seconds"', 'match = "seconds"\nseeds = 1'))
     assert len(fewer) == 6 and fewer < names
-    monkeypatch.setattr(reference, "source_digest", lambda: "edited")
+    monkeypatch.setattr(cells, "source_digest", lambda: "edited")
     assert not names & keys(tmp_path)

@@ -9,14 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from metrics import Sample, sidak, tile_means  # noqa: F401  (tile_means for the tests)
-from metrics import welch as difference
+from mitsuba_bdpt.measure.agreement import (  # noqa: F401  (tile_means for the tests)
+    SIGNIFICANCE,
+    Sample,
+    sidak,
+    tile_means,
+)
+from mitsuba_bdpt.measure.agreement import welch as difference
 from scipy import stats
 
 # Level of a whole family of comparisons, after Sidak's correction. Seeds are fixed, so a test
 # passes or fails for good; a change of the random numbers draws anew, with this chance per family
 # of a false alarm.
-LEVEL = 1e-3
+LEVEL = SIGNIFICANCE
 
 
 @dataclass
@@ -43,7 +48,7 @@ class Comparisons:
 
 def welch(a, b, label="", labels=None) -> Comparisons:
     """Welch's unequal-variances t-test of each column of ``a`` (renders, m) against ``b``'s, by
-    `metrics.welch`: a column in which both sides are often zero is left to the image's mean."""
+    `agreement.welch`: a column in which both sides are often zero is left to the image's mean."""
     return _comparisons(Sample.of(a), Sample.of(b), label, labels)
 
 

@@ -38,3 +38,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_case = {other.lower(): other for other in known}
     near = difflib.get_close_matches(name.lower(), by_case, 1)
     return f"did you mean {by_case[near[0]]}? " if near else ""
+
+
+def message(error: Exception) -> str:
+    """The text of `error`; of a Python traceback that Mitsuba has put into it, the last line only."""
+    before, traceback, rest = str(error).partition("Traceback (most recent call last):")
+    return before + rest.strip().splitlines()[-1] if traceback else before

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from metrics import Sample, sidak, tile_means, welch
+from mitsuba_bdpt.measure.agreement import SIGNIFICANCE, TILES, Sample, sidak, tile_means, welch
 from scipy import stats
 
 import mitsuba as mi  # isort: skip
@@ -21,9 +21,7 @@ WAYS = {"default parameters": {}, "all strategies": {"skip": "none"}}
 
 # Chance that a right program fails one comparison, had the seeds not been fixed: the level of all its t-tests
 # together, after Sidak's correction.
-LEVEL = 1e-3
-
-TILES = 4  # along each side of the image
+LEVEL = SIGNIFICANCE
 
 
 def images(scene, integrator: dict, seeds, spp: int):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-import reference
+import repository
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from mitsuba_bdpt.settings import Settings
@@ -96,7 +96,7 @@ def _parameters(examples: int, renders: int) -> Outcome:
             accepted.setdefault(str(bdpt), bdpt)
 
     fuzz(PARAMETERS, load, examples)
-    scene = reference.load_scene("cornell_box", resolution=4)
+    scene = repository.load_scene("cornell_box", resolution=4)
     for bdpt in list(accepted.values())[:renders]:
         try:
             image = np.array(bdpt.render(scene, spp=8))
@@ -124,7 +124,7 @@ ARGUMENTS = st.fixed_dictionaries(
 def _render_arguments(examples: int) -> Outcome:
     """Fuzz the arguments of `render`; however many samples are accepted, one pass is made."""
     counts, wrong = Counter(), []
-    scene = reference.load_scene("cornell_box", resolution=4)
+    scene = repository.load_scene("cornell_box", resolution=4)
     bdpt = mi.load_dict(
         {"type": "bdpt", "max_depth": 3, "light_paths": 1, "connections": "one", "timeout": 0}
     )
@@ -158,7 +158,7 @@ AS_PATH = (
     "(so "
     "few seeds have heavy tails; a lost lamp or a doubled light is off by far more)"
 )
-VARIED = tuple(path.stem for path in sorted((reference.ROOT / "scenes").glob("*.xml")))
+VARIED = tuple(path.stem for path in sorted((repository.ROOT / "scenes").glob("*.xml")))
 # Scenes whose light `path` finds as well.
 EASY = ("cornell_box", "many_lights", "open_sky", "veach_mis", "window_room")
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-import fireflies
 import numpy as np
-import reference
-from reference import benchmark_depth
+from mitsuba_bdpt.measure import fireflies
+from repository import benchmark_depth, load_reference, load_scene
 
 import mitsuba as mi  # isort: skip
 
@@ -23,7 +22,7 @@ LARGE = 3.0
 
 def _target(name: str, depth: int) -> np.ndarray:
     """The scene's reference in a lower resolution: its filter is a box."""
-    image = reference.load_reference(name, 128, depth).image.astype(float)
+    image = load_reference(name, 128, depth).image.astype(float)
     width = 128 // RESOLUTION
     return image.reshape(RESOLUTION, width, RESOLUTION, width, 3).mean(axis=(1, 3))
 
@@ -37,7 +36,7 @@ def _undrawn(firefly) -> float:
 def _explained(name: str) -> Outcome:
     """The worst samples of a scene found anew."""
     depth = benchmark_depth(name)
-    scene = reference.load_scene(name, resolution=RESOLUTION)
+    scene = load_scene(name, resolution=RESOLUTION)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     target = _target(name, depth)
     found = []

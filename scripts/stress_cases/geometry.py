@@ -10,7 +10,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
-from metrics import Sample
+from mitsuba_bdpt.measure.agreement import Sample
 
 import mitsuba as mi  # isort: skip
 

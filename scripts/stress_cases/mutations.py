@@ -8,7 +8,7 @@ import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import reference
+import repository
 
 VALUES = ("nan", "inf", "-inf", "1e39", "1e-39", "-1", "0", "", "x" * 100_000, "true", "1e9", "0.5, 0.5", "7")
 TAGS = ("float", "integer", "string", "boolean", "rgb", "spectrum", "point", "vector", "transform", "texture")
@@ -91,11 +91,11 @@ KINDS = (_delete, _double, _number, _number, _number, _number, _attribute, _with
 def mutate(name: str, seed: int, folder: Path) -> tuple[Path, str, tuple[str, ...]]:
     """A file in ``folder`` made of a scene of scenes/, what is wrong with it, and the names of what is."""
     rng = random.Random(f"{name} {seed}")
-    tree = ET.parse(reference.scene_file(name))
+    tree = ET.parse(repository.scene_file(name))
     words, names = rng.choice(KINDS)(rng, tree.getroot())
     for data in ("meshes", "textures"):
         if not (folder / data).exists():
-            (folder / data).symlink_to(reference.ROOT / "scenes" / data)
+            (folder / data).symlink_to(repository.ROOT / "scenes" / data)
     path = folder / f"{name}_{seed}.xml"
     tree.write(path)
     return path, f"`{name}`: {words}", names

@@ -13,9 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 from unittest import mock
 
-import reference
+import repository
 from mitsuba_bdpt.cli import arguments as __main__
-from mitsuba_bdpt.cli import files, render
+from mitsuba_bdpt.cli import render
+from mitsuba_bdpt.files.whole import MAGIC
 
 import mitsuba as mi  # isort: skip
 
@@ -90,7 +91,7 @@ def missing_files() -> Outcome:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "folder").mkdir()
-        mesh, texture = next((reference.ROOT / "scenes" / "meshes").glob("*.ply")), folder / "whole.exr"
+        mesh, texture = next((repository.ROOT / "scenes" / "meshes").glob("*.ply")), folder / "whole.exr"
         mi.Bitmap(mi.TensorXf([0.5] * 3000, shape=(25, 40, 3))).write(str(texture))
         _half(mesh, folder / "half.ply")
         _half(texture, folder / "half.exr")
@@ -131,7 +132,7 @@ def _no_file(folder: Path, kind: str) -> Path:
     elif kind == "a text":
         (folder / "a.exr").write_text("precious")
     elif kind == "a PNG named EXR":
-        (folder / "a.exr").write_bytes(files.MAGIC[".png"] + b"precious")
+        (folder / "a.exr").write_bytes(MAGIC[".png"] + b"precious")
     elif kind == "a folder where the checkpoint goes":
         (folder / "a.checkpoint.npz").mkdir()
     elif kind == "no name":
@@ -250,7 +251,7 @@ type = "bdpt"
 
 
 def _sweep(folder: Path, preset: Path, keywords: dict):
-    command = [sys.executable, str(reference.ROOT / "scripts" / "sweep.py"), str(preset), "-o", str(folder)]
+    command = [sys.executable, str(repository.ROOT / "scripts" / "sweep.py"), str(preset), "-o", str(folder)]
     return subprocess.run(
         command, capture_output=True, text=True, env=child.environment(), check=False, **keywords
     )

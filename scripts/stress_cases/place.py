@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import reference
-from metrics import Sample
+import repository
+from mitsuba_bdpt.measure.agreement import Sample
 
 import mitsuba as mi  # isort: skip
 
@@ -102,7 +102,7 @@ def _look_from(element, place: Place):
 
 def _full_path(element):
     for file in element.findall("string[@name='filename']"):
-        file.set("value", str(reference.ROOT / "scenes" / file.get("value")))
+        file.set("value", str(repository.ROOT / "scenes" / file.get("value")))
 
 
 def _place_sensor(sensor, place: Place):
@@ -158,7 +158,7 @@ class Subject:
 
     def load(self, place: Place = Place(), size: int = SIZE):  # noqa: B008 (frozen)
         """The scene in its place."""
-        root = ElementTree.parse(reference.scene_file(self.scene)).getroot()
+        root = ElementTree.parse(repository.scene_file(self.scene)).getroot()
         if self.edit is not None:
             self.edit(root)
         for sensor in root.findall("sensor"):

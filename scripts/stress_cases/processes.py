@@ -16,7 +16,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
-import reference
+import repository
 from mitsuba_bdpt.planning import budget
 
 import mitsuba as mi  # isort: skip
@@ -198,7 +198,7 @@ def _alternating() -> Outcome:
     for variant in ("llvm_ad_rgb", "llvm_ad_spectral"):
         mi.set_variant(variant)
         # Loaded anew for each render, so that pilots are not remembered.
-        loads = [lambda: mi.load_dict(_room()), lambda: reference.load_scene("glass_caustics", resolution=8)]
+        loads = [lambda: mi.load_dict(_room()), lambda: repository.load_scene("glass_caustics", resolution=8)]
         made[variant] = mi.load_dict({"type": "bdpt", "max_depth": 5}), loads
     for _ in range(3):
         for variant, (bdpt, loads) in made.items():
@@ -314,7 +314,7 @@ def _sigint_after(seconds: float):
 
 def _interrupted(times: int) -> Outcome:
     """SIGINT at some moment of a render, its pilot included, then the same again."""
-    load = partial(reference.load_scene, "cornell_box", resolution=32)  # anew: its pilot is not remembered
+    load = partial(repository.load_scene, "cornell_box", resolution=32)  # anew: its pilot is not remembered
     # Short passes: recording them takes as long as tracing them, and may be interrupted as well.
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 8})
     keywords = {"seed": 5, "spp": 128}

@@ -18,8 +18,8 @@ from mitsuba_bdpt.settings import HEURISTICS
 
 import mitsuba as mi  # isort: skip
 
-import oracle
-from oracle import Paths
+from mitsuba_bdpt.measure import oracle
+from mitsuba_bdpt.measure.oracle import Paths
 
 from .capture import Capture
 from .case import Case, Outcome

@@ -1,25 +1,24 @@
 """The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
 
 ``render`` renders a scene file; ``explain`` says what such a render would do and what it would leave out;
-``doctor`` explains what the installation found and whether it works. What needs Mitsuba is imported inside
-`main`, because `doctor` has to run where that cannot be imported.
+``doctor`` explains what the installation found and whether it works; `measuring` declares those that measure.
+What needs Mitsuba is imported inside `main`, because `doctor` has to run where that cannot be imported.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import mitsuba_bdpt
 
 from ..errors import did_you_mean
-
-PropertyValue = bool | int | float | str
+from . import measuring
+from .values import definition, number, property_
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -34,6 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if mitsuba_bdpt.failure is not None:
         print(f"error: {mitsuba_bdpt.failure}", file=sys.stderr)
         return 1
+    if options.command in measuring.COMMANDS:
+        return measuring.run(options)
     from . import render
 
     return render.explain(options) if options.command == "explain" else render.run(options)
@@ -85,6 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
     explain = commands.add_parser("explain", help=help_text, description=help_text)
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None)
+    measuring.add_commands(commands)
     return parser
 
 
@@ -140,44 +142,3 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
     text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
     add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
-
-
-def number(kind: type, minimum: float, maximum: float = math.inf) -> Callable[[str], int | float]:
-    """An argparse type: a finite `kind` between `minimum` and `maximum`."""
-
-    def parse(text: str) -> int | float:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = math.nan
-        if not (minimum <= value <= maximum and math.isfinite(value)):
-            most = maximum if kind is int else f"{maximum:g}"
-            limit = "" if maximum == math.inf else f" and at most {most}"
-            name = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(
-                f"got {text!r}, which must be {name} of at least {minimum:g}{limit}"
-            )
-        return value
-
-    return parse
-
-
-def definition(text: str) -> tuple[str, str]:
-    """Split ``KEY=VALUE``."""
-    key, equals, value = text.partition("=")
-    if not key or not equals:
-        raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form KEY=VALUE")
-    return key, value
-
-
-def property_(text: str) -> tuple[str, PropertyValue]:
-    """Split ``KEY=VALUE`` and read the value as a Boolean, a whole number, a number or a string."""
-    key, value = definition(text)
-    if value in ("true", "false"):
-        return key, value == "true"
-    for kind in (int, float):
-        try:
-            return key, kind(value)
-        except ValueError:
-            continue
-    return key, value

@@ -8,59 +8,18 @@ import os
 import sys
 import time
 from argparse import Namespace
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from ..errors import CommandError
+from ..files.named import named_files
+from ..files.whole import check_writable, replacing
 from ..run.snapshot import Snapshot, read
-from .files import check_writable, replacing
-from .loading import elements
 
 
 def path_of(output: Path) -> Path:
     """Where the checkpoint of an image lies: beside it."""
     return output.with_suffix(".checkpoint.npz")
-
-
-def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
-    """Meshes, textures, spectra and scene files that a scene file names, and those that the latter name, as
-    far as they exist, each once; raises ``ValueError`` if one of the scene files is not XML. ``definitions``
-    of parameters, for names that hold some."""
-    found = {}
-    _note_files(scene, dict(definitions), [Path()], found)
-    return list(found)
-
-
-def _note_files(scene: Path, values: dict, folders: list[Path], found: dict[Path, None]) -> None:
-    """Add to ``found``, a set in the order of the files, what a scene file names, looked for as Mitsuba does:
-    beside it, then in ``folders``. ``values`` of parameters, to which its own defaults are added."""
-    folders = [scene.parent, *folders]
-
-    def resolved(name, exists):
-        return next((folder / name for folder in folders if exists(folder / name)), None)
-
-    for element in elements(scene):
-        own = {key: _substituted(text, values) for key, text in element.attrib.items()}
-        if element.tag == "default":
-            values.setdefault(own.get("name", ""), own.get("value", ""))
-        elif element.tag == "path" and (folder := resolved(own.get("value", ""), Path.is_dir)):
-            folders.insert(0, folder)
-        name = own.get("value" if own.get("name") == "filename" else "filename")
-        path = resolved(name, Path.is_file) if name else None
-        if path is None:
-            continue
-        is_new = path not in found
-        found[path] = None
-        if element.tag == "include" and is_new:
-            _note_files(path, values, folders, found)
-
-
-def _substituted(text: str, values: dict) -> str:
-    """``text`` with the values of its parameters, longer names first, as one may begin with another."""
-    for key in sorted(values, key=len, reverse=True):
-        text = text.replace(f"${key}", values[key])
-    return text
 
 
 def digest(options: Namespace) -> str:

@@ -8,23 +8,21 @@ worker made which, nor on whether one of them was lost.
 from __future__ import annotations
 
 import json
-import threading
 import time
 import uuid
 from argparse import Namespace
-from collections import deque
 from collections.abc import Callable
-from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
 import mitsuba as mi
 
 from ..errors import CommandError
+from ..files.loading import load
 from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
 from ..run.statistics import RAYS
-from .loading import load
+from ..workers import connected, one_at_a_time, results, worker_count
 
 # Parts for each worker: the last one that is waited for then takes a quarter of what a worker does in all.
 PARTS_PER_WORKER = 4
@@ -34,8 +32,6 @@ LEAST_SPP = 16
 
 # Between seeds of the parts, 2^32 / golden ratio: renders whose own seeds are neighbours share none.
 STRIDE = 0x9E3779B9
-
-one_at_a_time = threading.Lock()
 
 
 def check_settings(settings) -> None:
@@ -130,71 +126,6 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     kept = {name: getattr(options, name) for name in names}
     kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
-
-
-def results(client, function, arguments):
-    """Index and result of ``function(*arguments[index])`` as they come from the workers of a
-    ``distributed.Client``, each index once. A worker has one call at a time; where none are left to begin,
-    idle ones take over calls that others still have, so that one slow machine does not hold up the rest: a
-    call has to give the same wherever it runs. That of a lost worker is made by another one."""
-    from distributed import as_completed
-
-    to_do, running, done = deque(range(len(arguments))), {}, set()
-    pending = as_completed()
-
-    def submit(index):
-        future = client.submit(function, *arguments[index], pure=False)
-        running[future] = index
-        pending.add(future)
-
-    def fill():
-        workers = max(1, worker_count(client))  # none for a moment: another one may come
-        while len(running) < workers and to_do:
-            submit(to_do.popleft())
-        for index in [i for i in running.values() if i not in done]:
-            if len(running) < workers and list(running.values()).count(index) == 1:
-                submit(index)
-
-    try:
-        fill()
-        while len(done) < len(arguments):
-            future = next(pending)
-            index = running.pop(future)
-            if index not in done:
-                done.add(index)
-                yield index, _result(future, index)
-            fill()
-    finally:
-        client.cancel(list(running), force=True)
-
-
-def _result(future, index: int):
-    try:
-        return future.result()
-    except Exception as error:
-        text = str(error) or type(error).__name__
-        raise RuntimeError(f"part {index} failed on the cluster: {text}") from error
-
-
-def worker_count(client) -> int:
-    """Workers that the scheduler of a ``distributed.Client`` has now."""
-    return len(client.scheduler_info(n_workers=-1)["workers"])
-
-
-@contextmanager
-def connected(address: str):
-    """A ``distributed.Client`` of the scheduler at ``address``. Raises ``ValueError`` if distributed is not
-    installed or the scheduler has no worker, ``OSError`` if there is no such scheduler."""
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise CommandError(
-            "scheduler needs dask.distributed; install it with: pip install 'mitsuba-bdpt[cluster]'"
-        ) from error
-    with Client(address, timeout="20s") as client:
-        if not worker_count(client):
-            raise CommandError(f"scheduler={address!r} has no worker; start some with `dask worker`.")
-        yield client
 
 
 def render_part(job: str, seed: int, spp: int) -> bytes:

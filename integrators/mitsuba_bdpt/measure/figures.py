@@ -10,7 +10,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
-from analysis import (  # noqa: E402
+from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
+
+from .analysis import (  # noqa: E402
     ALONE,
     INDEPENDENT,
     LIGHT_TRACER,
@@ -22,7 +24,6 @@ from analysis import (  # noqa: E402
     check_judged,
     select,
 )
-from matplotlib.ticker import FuncFormatter, NullFormatter  # noqa: E402
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {
@@ -159,7 +160,7 @@ def _ratios(axis, results, scene, rival, place):
 
 
 def rays(results: Results, path: Path):
-    """Rays per sample of the first integrator by kind, a bar per scene."""
+    """Rays per sample of the first integrator by kind, a bar per scene; none where it counts no rays."""
     figure, axis = plt.subplots(figsize=(9, 0.28 * len(results.scenes) + 1.4))
     left = np.zeros(len(results.scenes))
     for kind, (label, colour, hatch) in RAYS.items():
@@ -185,6 +186,7 @@ def rays(results: Results, path: Path):
 
 def _rays_per_sample(results, scene, kind) -> float:
     rows = results.of(scene, results.methods[0], results.deciding)
+    rows = [row for row in rows if row.get(f"rays_{kind}") is not None]
     pixels = [row["width"] * row["height"] for row in rows]
     counts = [row[f"rays_{kind}"] / row["spp"] / n for row, n in zip(rows, pixels, strict=True)]
     return float(np.median(counts)) if counts else 0.0

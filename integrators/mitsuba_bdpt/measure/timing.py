@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import time
 
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import drjit as dr
+import mitsuba as mi
 import numpy as np
-
-import mitsuba as mi  # isort: skip
-import drjit as dr  # isort: skip
 
 
 def timed(scene, integrator, spp: int, seed: int) -> tuple[np.ndarray, float]:

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import endpoints
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import drjit as dr
+import mitsuba as mi
 import numpy as np
-import oracle
 
-import drjit as dr  # isort: skip
-import mitsuba as mi  # isort: skip
+from . import endpoints, oracle
 
 # Lobes of a delta BSDF are looked for with these numbers; a direction is the same up to this cosine, a vertex
 # is the same up to this part of the edge to it.

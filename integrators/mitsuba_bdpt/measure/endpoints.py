@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import mitsuba as mi  # isort: skip
-
-from oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
+from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
 
 KINDS = {
     "AreaLight": AREA,

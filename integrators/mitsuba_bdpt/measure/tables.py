@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis import NotJudged, Refused, Summary
+from .analysis import NotJudged, Refused, Summary
 
 
 def table(head, rows) -> str:

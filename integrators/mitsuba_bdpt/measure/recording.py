@@ -13,16 +13,15 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from unittest import mock
 
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import drjit as dr  # isort: skip
-import mitsuba as mi  # isort: skip
-from mitsuba_bdpt.transport import kernel  # isort: skip
-from mitsuba_bdpt.run import rendering  # isort: skip
-from mitsuba_bdpt.image import sink  # isort: skip
-from mitsuba_bdpt.transport import connections  # isort: skip
-from mitsuba_bdpt.transport.counters import Counters  # isort: skip
+from ..errors import CommandError
+from ..image import sink
+from ..run import rendering
+from ..transport import connections, kernel
+from ..transport.counters import Counters
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -64,7 +63,9 @@ class Collector(sink.Image):
     def __init__(self, film, least, lanes: int):
         super().__init__(film)
         if lanes > MOST_LANES:
-            raise ValueError(f"{lanes} lanes in a launch, more than {MOST_LANES}: set a smaller spp_per_pass")
+            raise CommandError(
+                f"{lanes} lanes in a launch, more than {MOST_LANES}: set a smaller spp_per_pass"
+            )
         self._least, self._lanes, self._width = mi.Float(least.ravel()), lanes, film.size[0]
         dr.make_opaque(self._least)
         # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
@@ -100,7 +101,7 @@ class Collector(sink.Image):
         for number, rows in self.kept:
             count = int(number[0])
             if count > CAPACITY:
-                raise ValueError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
+                raise CommandError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
             numbers = np.array(rows, dtype=float).reshape(-1, COLUMNS)[:count]
             slots = _slots(launch, numbers)
             found += [_outlier(launch, row, slot) for row, slot in zip(numbers, slots, strict=True)]
@@ -135,7 +136,7 @@ def render(scene, integrator, least, spp: int, seed: int):
     image's shape) in one of the colours, largest first. Raises ``ValueError`` for a film of other colours."""
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        raise ValueError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
+        raise CommandError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
     outliers = []
 
     def trace(traced, image, batch, points, of):

@@ -1,6 +1,7 @@
 """What a render costs besides its samples: the first image from an empty kernel cache, and memory.
 
-Each probe takes the number of repetitions and returns plain numbers; a repetition is a process of its own.
+Each probe takes the project and the number of repetitions, and returns plain numbers; a repetition is a
+process of its own.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from .project import Project
 
 # One or two camera subpaths per light subpath: with 16 the replay is cut into so many small kernels that it
 # is no floor.
@@ -37,9 +40,11 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 """
 
 FLOOR = """
-import sys, floor, mitsuba as mi
+import sys, pathlib, mitsuba_bdpt, mitsuba as mi
+from mitsuba_bdpt.measure import floor, scenes
 mi.set_variant('llvm_ad_rgb')
-print(*floor.measure(sys.argv[1], int(sys.argv[2])))
+file = pathlib.Path(sys.argv[1])
+print(*floor.measure(scenes.SceneFile(file.stem, file), int(sys.argv[2])))
 """
 
 
@@ -48,11 +53,10 @@ def _printed(code, environment=None) -> float:
     return numbers(code, environment=environment)[-1]
 
 
-def numbers(code, *arguments, environment=None) -> list[float]:
-    """The numbers that a new process prints."""
+def numbers(code, *arguments, environment=None, folder: Path | None = None) -> list[float]:
+    """The numbers that a new process prints, run in a ``folder``."""
     command = [sys.executable, "-c", code, *arguments]
-    here = str(Path(__file__).parent)
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=here)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder)
     if done.returncode:
         raise RuntimeError(f"a probe ended with status {done.returncode}: {done.stderr[-500:]}")
     return [float(word) for word in done.stdout.split() if _is_number(word)]
@@ -66,7 +70,7 @@ def _is_number(word) -> bool:
     return True
 
 
-def coldstart(rounds: int) -> dict:
+def coldstart(project: Project, rounds: int) -> dict:
     """Seconds from an empty kernel cache to the first image of the Cornell box, 256x256, depth 6, 16 spp, by
     integrator, a value per round; imports and loading apart."""
     seconds = {"path": [], "bdpt": []}
@@ -78,15 +82,16 @@ def coldstart(rounds: int) -> dict:
     return seconds
 
 
-def memory(rounds: int) -> dict:
+def memory(project: Project, rounds: int) -> dict:
     """Peak resident GiB of a process that renders the Cornell box at 1920x1080, depth 8, by samples per
     pixel, a value per round."""
     return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
 
 
-def kernel_floor(rounds: int) -> dict:
+def kernel_floor(project: Project, rounds: int) -> dict:
     """Kernel time over that of its rays alone, by scene, a value per round."""
-    return {name: numbers(FLOOR, name, str(rounds)) for name in FLOOR_SCENES}
+    files = {name: str(project.scene(name).file.resolve()) for name in FLOOR_SCENES}
+    return {name: numbers(FLOOR, file, str(rounds)) for name, file in files.items()}
 
 
 PROBES = {"coldstart": coldstart, "memory": memory, "floor": kernel_floor}

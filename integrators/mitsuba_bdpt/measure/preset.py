@@ -1,7 +1,7 @@
 """Presets: what a sweep renders, as TOML.
 
     resolution = 128
-    scenes = ["cornell_box", "open_sky"]
+    scenes = ["cornell_box", "rooms/kitchen.xml"]   # names in PROJECT/scenes, or files seen from PROJECT
     spp = [4, 16, 64]      # samples per pixel of the first integrator: the budgets
     seeds = [5, 16, 5]     # renders of each; one number for all
 
@@ -14,20 +14,20 @@
     sampler = "multijitter"
     match = "seconds"      # as many samples as fit into the seconds of the first (the nearest power of two,
                            # if the sampler is stratified); or "spp", the same samples
-    scenes = ["open_sky"]  # only there; default: in all
+    scenes = ["kitchen"]   # only there; default: in all
     seeds = 5              # at most so many; default: all
 
     [scene.cornell_box]    # where a scene differs: max_depth (default: the scene's own), spp, seeds
     max_depth = 6
 
     [more]                 # further seeds until the interval of a median is narrow enough
-    scenes = ["open_sky"]
+    scenes = ["kitchen"]
     integrators = ["bdpt", "path multijitter"]
     spp = 64
     seeds = [20, 60]       # at least, at most
     width = 0.04           # of the 95 % interval of the ratio of efficiencies, in all pairs with the first
 
-    [probes]               # of scripts/probes.py: how often each is repeated
+    [probes]               # what else a render costs (`probes`): how often each is repeated
     coldstart = 5
 
 Further keys of an integrator are parameters of the plugin.
@@ -38,9 +38,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import probes
-import reference
-from metrics import TILES
+from ..errors import CommandError
+from ..files.texts import read_toml
+from . import probes
+from .agreement import TILES
+from .project import Project, depth_in
+from .scenes import SceneFile
 
 MATCHES = ("seconds", "spp")
 
@@ -63,10 +66,15 @@ class Method:
 class Subject:
     """A scene of a preset: ``max_depth``, samples per pixel of each budget, number of seeds of each."""
 
-    name: str
+    scene: SceneFile
     max_depth: int
     spp: tuple
     seeds: tuple
+
+    @property
+    def name(self) -> str:
+        """That of the scene."""
+        return self.scene.name
 
 
 @dataclass(frozen=True)
@@ -93,96 +101,98 @@ class Preset:
     probes: dict
 
 
-def read_preset(path: Path) -> Preset:
-    """Read and check a TOML file; raises ``ValueError`` naming the file and the key."""
-    data = reference.read_toml(path)
+def read_preset(path: Path, project: Project) -> Preset:
+    """Read and check a TOML file of a ``project``; raises ``ValueError`` naming the file and the key."""
+    data = read_toml(path)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
     for key in {"resolution", "max_depth"} & set(data):
         _whole(path, key, data[key])
     if data["resolution"] % TILES:
-        raise ValueError(f"{path}: resolution={data['resolution']} must be divisible by {TILES}")
+        raise CommandError(f"{path}: resolution={data['resolution']} must be divisible by {TILES}")
     for key in ("scenes", "integrator"):
         if not isinstance(data[key], list) or not data[key]:
-            raise ValueError(f"{path}: {key}={data[key]!r} must be a list with at least one entry")
-    if len(set(data["scenes"])) < len(data["scenes"]):
-        raise ValueError(f"{path}: scenes={data['scenes']!r} names one twice")
+            raise CommandError(f"{path}: {key}={data[key]!r} must be a list with at least one entry")
+    scenes = [project.scene(name) for name in data["scenes"]]
+    names = [scene.name for scene in scenes]
+    if len(set(names)) < len(names):
+        raise CommandError(f"{path}: scenes={data['scenes']!r} names one twice")
     for name in data.get("scene", {}):
-        if name not in data["scenes"]:
-            raise ValueError(f"{path}: [scene.{name}] is not among the scenes {data['scenes']}")
-    methods = tuple(_method(path, dict(entry), data["scenes"]) for entry in data["integrator"])
+        if name not in names:
+            raise CommandError(f"{path}: [scene.{name}] is not among the scenes {names}")
+    methods = tuple(_method(path, dict(entry), names) for entry in data["integrator"])
     if len({m.name for m in methods}) < len(methods):
-        raise ValueError(f"{path}: two integrators have the same name")
+        raise CommandError(f"{path}: two integrators have the same name")
     if methods[0].scenes is not None or methods[0].seeds is not None or methods[0].match == "seconds":
-        raise ValueError(
+        raise CommandError(
             f"{path}: the first integrator, {methods[0].name!r}, sets the time of the others; it takes "
             "neither scenes nor seeds nor match = 'seconds'"
         )
     counts = data.get("probes", {})
     for name, count in counts.items():
         if name not in probes.PROBES:
-            raise ValueError(f"{path}: probe {name!r} is unknown; there are {sorted(probes.PROBES)}")
+            raise CommandError(f"{path}: probe {name!r} is unknown; there are {sorted(probes.PROBES)}")
         _whole(path, name, count)
     return Preset(
-        subjects=tuple(_subject(path, data, name) for name in data["scenes"]),
+        subjects=tuple(_subject(path, data, scene) for scene in scenes),
         methods=methods,
         resolution=data["resolution"],
-        more=_more(path, data["more"], data["scenes"], methods) if "more" in data else None,
+        more=_more(path, data["more"], names, methods) if "more" in data else None,
         probes=counts,
     )
 
 
 def _check_keys(path, entry, needed, allowed, what):
     if unknown := sorted(set(entry) - allowed):
-        raise ValueError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
+        raise CommandError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
     if missing := sorted(needed - set(entry)):
-        raise ValueError(f"{path}: {missing[0]} is missing")
+        raise CommandError(f"{path}: {missing[0]} is missing")
 
 
 def _whole(path, key, value) -> int:
     if type(value) is not int or value < 1:
-        raise ValueError(f"{path}: {key}={value!r} must be a whole number of at least 1")
+        raise CommandError(f"{path}: {key}={value!r} must be a whole number of at least 1")
     return value
 
 
 def _row(path, key, value) -> tuple:
     if not isinstance(value, list) or not value or not all(type(n) is int and n > 0 for n in value):
-        raise ValueError(f"{path}: {key}={value!r} must be a list of whole numbers of at least 1")
+        raise CommandError(f"{path}: {key}={value!r} must be a list of whole numbers of at least 1")
     return tuple(value)
 
 
-def _subject(path, data, name) -> Subject:
-    reference.scene_file(name)
+def _subject(path, data, scene) -> Subject:
+    name = scene.name
     own = data.get("scene", {}).get(name, {})
     _check_keys(path, own, set(), {"max_depth", "spp", "seeds"}, f"[scene.{name}]")
     merged = data | own
     spp, seeds = _row(path, "spp", merged["spp"]), merged["seeds"]
     if len(set(spp)) < len(spp):
-        raise ValueError(f"{path}: spp={list(spp)} of {name} names a budget twice")
+        raise CommandError(f"{path}: spp={list(spp)} of {name} names a budget twice")
     if isinstance(seeds, list):
         seeds = _row(path, "seeds", seeds)
         if len(seeds) != len(spp):
-            raise ValueError(f"{path}: seeds={list(seeds)} of {name} must be as many as spp={list(spp)}")
+            raise CommandError(f"{path}: seeds={list(seeds)} of {name} must be as many as spp={list(spp)}")
     else:
         seeds = (_whole(path, "seeds", seeds),) * len(spp)
     if "max_depth" in merged:
         _whole(path, "max_depth", merged["max_depth"])
-    return Subject(name, reference.depth_in(data, name), spp, seeds)
+    return Subject(scene, depth_in(data, scene), spp, seeds)
 
 
 def _method(path, entry, scenes) -> Method:
     if "type" not in entry:
-        raise ValueError(f"{path}: an integrator without type: {entry!r}")
+        raise CommandError(f"{path}: an integrator without type: {entry!r}")
     name, sampler = entry.pop("name", entry["type"]), entry.pop("sampler", "independent")
     match, only, seeds = entry.pop("match", "spp"), entry.pop("scenes", None), entry.pop("seeds", None)
     if "max_depth" in entry:
-        raise ValueError(
+        raise CommandError(
             f"{path}: max_depth of integrator {name!r} would compare different images; set it for all"
         )
     if match not in MATCHES:
-        raise ValueError(f"{path}: match={match!r} of integrator {name!r} must be one of {MATCHES}")
+        raise CommandError(f"{path}: match={match!r} of integrator {name!r} must be one of {MATCHES}")
     if unknown := [scene for scene in only or () if scene not in scenes]:
-        raise ValueError(f"{path}: scene {unknown[0]!r} of integrator {name!r} is not in the preset")
+        raise CommandError(f"{path}: scene {unknown[0]!r} of integrator {name!r} is not in the preset")
     if seeds is not None:
         _whole(path, f"seeds of integrator {name!r}", seeds)
     return Method(name, tuple(sorted(entry.items())), sampler, match, tuple(only) if only else None, seeds)
@@ -193,19 +203,19 @@ def _more(path, entry, scenes, methods) -> More:
     _check_keys(path, entry, keys, keys, "[more]")
     for key, known in (("scenes", scenes), ("integrators", [m.name for m in methods])):
         if unknown := [name for name in entry[key] if name not in known]:
-            raise ValueError(f"{path}: {unknown[0]!r} of [more] {key} is not in the preset")
+            raise CommandError(f"{path}: {unknown[0]!r} of [more] {key} is not in the preset")
     if entry["integrators"][:1] != [methods[0].name] or len(entry["integrators"]) < 2:
-        raise ValueError(
+        raise CommandError(
             f"{path}: integrators of [more] must be the first one, {methods[0].name!r}, and its rivals"
         )
     seeds = _row(path, "seeds of [more]", entry["seeds"])
     if len(seeds) != 2 or not 2 <= seeds[0] <= seeds[1]:
-        raise ValueError(f"{path}: seeds={entry['seeds']!r} of [more] must be [at least, at most]")
+        raise CommandError(f"{path}: seeds={entry['seeds']!r} of [more] must be [at least, at most]")
     limited = [m.name for m in methods if m.name in entry["integrators"] and (m.scenes or m.seeds)]
     if limited:
-        raise ValueError(f"{path}: {limited[0]!r} of [more] is limited by scenes or seeds of its own")
+        raise CommandError(f"{path}: {limited[0]!r} of [more] is limited by scenes or seeds of its own")
     if not 0 < entry["width"] < 1:
-        raise ValueError(f"{path}: width={entry['width']!r} of [more] must be between 0 and 1")
+        raise CommandError(f"{path}: width={entry['width']!r} of [more] must be between 0 and 1")
     spp = _whole(path, "spp of [more]", entry["spp"])
     return More(
         tuple(entry["scenes"]), tuple(entry["integrators"]), spp, seeds[0], seeds[1], float(entry["width"])

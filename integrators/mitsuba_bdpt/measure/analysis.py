@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from metrics import (
-    FEWEST_RUNS,
-    BiasCheck,
-    Estimate,
-    Means,
+
+from ..errors import CommandError
+from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means
+from .checks import Estimate
+from .efficiency import (
     Measurement,
     bootstrap_median,
-    compare_means,
     equal_time_speedup,
     reference_good_enough,
     reference_refusal,
@@ -40,7 +39,7 @@ LIGHT_TRACER = "ptracer"
 DECIDING = 64
 
 
-class Refused(ValueError):
+class Refused(CommandError):
     """A figure that the data cannot give; the text says why."""
 
 
@@ -204,6 +203,14 @@ class Results:
         return list(dict.fromkeys([self.rows[0]["first"], *(row["method"] for row in self.rows)]))
 
     @cached_property
+    def rivals(self) -> list[str]:
+        """What the first integrator is compared with at equal time: `path`, then others that no figure of the
+        project's own looks for."""
+        known = {*RIVALS, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, LIGHT_TRACER}
+        others = self.methods[1:]
+        return [name for name in RIVALS if name in others] + [name for name in others if name not in known]
+
+    @cached_property
     def _of(self) -> dict:
         """Rows by scene and integrator."""
         found = {}
@@ -269,7 +276,7 @@ class Results:
         """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
         that were rendered and pass the bias check; raises `Biased` if none does."""
         found, biased = [], {}
-        rivals = [rival for rival in RIVALS if self.of(scene, rival)]
+        rivals = [rival for rival in RIVALS if rival != self.methods[0] and self.of(scene, rival)]
         if not rivals:
             raise Refused(f"{RIVALS[0]} was not rendered")
         for rival in rivals:

@@ -1,0 +1,46 @@
+"""What a command answers to a user's mistake: one line, and the exit status 2 (as argparse's), no traceback.
+
+Taken for mistakes is what names something that the user gave:
+
+* `errors.UsageError` and `errors.UnsupportedError`: a value, a file or a name that cannot be used.
+* ``argparse.ArgumentTypeError``: words of the command line that are read after the rest of it.
+* ``OSError``: a file or a folder that is missing, or cannot be written.
+* ``RuntimeError`` of Mitsuba's parser: about a scene's file, an unknown plugin, or its parameters; where it
+  holds the traceback of a plugin in Python, only if that ends in one of the first.
+
+All else is a bug, whose traceback must be seen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+
+from ..errors import UnsupportedError, UsageError, message
+
+STATUS = 2
+
+IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
+
+
+def answered(main: Callable[[], int | None]) -> int | None:
+    """The exit status of ``main``; that of a mistake if there was one, which is printed."""
+    try:
+        return main()
+    except Exception as error:
+        if not is_mistake(error):
+            raise
+        print(f"error: {' '.join(message(error).split())}", file=sys.stderr)
+        return STATUS
+
+
+def is_mistake(error: Exception) -> bool:
+    """Whether the user is to mend it, see above."""
+    if isinstance(error, UsageError | UnsupportedError | OSError | argparse.ArgumentTypeError):
+        return True
+    if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
+        return False
+    _, traceback, rest = str(error).partition("Traceback (most recent call last):")
+    return not traceback or bool(IN_WORDS.match(rest.strip().splitlines()[-1]))

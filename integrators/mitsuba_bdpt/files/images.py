@@ -1,0 +1,129 @@
+"""Image files: EXR with a PNG beside it, layers of an EXR."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+
+from ..errors import CommandError
+from .whole import MAGIC, check_format, check_writable, replacing
+
+PNG_SIDE = 1_000_000
+"""Pixels in a row or column of a PNG, at most: libpng's limit."""
+
+
+def check_png(film: mi.Film) -> None:
+    """Raise ``ValueError`` for an image that no PNG can hold, which would come out after the render."""
+    width, height = film.crop_size()
+    if max(width, height) > PNG_SIDE:
+        raise CommandError(
+            f"the image of {width} x {height} is too long for a PNG, whose sides have {PNG_SIDE} "
+            "pixels at most; render crop windows."
+        )
+
+
+def prepare_output(output: Path) -> None:
+    """Refuse an `output` that cannot be written in the end, which may be in hours; create its directory."""
+    if output.suffix.lower() != ".exr":
+        raise CommandError(
+            f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."
+        )
+    for path in (output, output.with_suffix(".png")):
+        check_format(path, output)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        for path in (output, output.with_suffix(".png")):
+            check_writable(path)
+    except OSError as error:
+        raise CommandError(
+            f"output={str(output)!r} cannot be written ({error.strerror}); name another with -o."
+        ) from error
+
+
+def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
+    """Write the film as an EXR with these header `attributes`, and as a PNG beside it."""
+    bitmap = film.bitmap()
+    names = [channel.name for channel in bitmap.struct_()]
+    # Mitsuba's own conversion loses the names of channels beyond the image's.
+    component = re.search(r"component_format = (float16|float32|uint32)", str(film))
+    pixels = np.array(bitmap).astype(component[1] if component else np.float32)
+    image = mi.Bitmap(pixels, bitmap.pixel_format(), names)
+    for key, value in attributes.items():
+        image.metadata()[key] = value
+    write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        bitmap = grey(pixels[..., : film.base_channels_count()])
+    write_whole(developed(bitmap, exposure), output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
+
+
+def grey(bands: np.ndarray) -> mi.Bitmap:
+    """What a film without colours shows on a screen: the mean of its `bands`, whose units are the user's
+    own, so bright that one pixel in a hundred is white."""
+    mean = np.mean(bands, axis=-1, dtype=np.float32, keepdims=True)
+    return mi.Bitmap(mean / max(np.quantile(mean, 0.99), 1e-30), mi.Bitmap.PixelFormat.Y)
+
+
+def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
+    """The picture for a screen: exposure, clipping to [0, 1] and the sRGB curve."""
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        bitmap = next(part for name, part in bitmap.split() if name == "<root>")
+    rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    bright = mi.Bitmap(mi.TensorXf(rgb) * 2.0**exposure, mi.Bitmap.PixelFormat.RGB)
+    return bright.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+
+
+def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
+    """Write an image by `replacing`. (Mitsuba's own files are closed without a look at what could not be
+    written: on a full disk the end of a PNG is missing, and nobody hears of it.)"""
+    stream = mi.MemoryStream()
+    bitmap.write(stream, file_format)
+    with replacing(path) as temporary:
+        temporary.write_bytes(stream.raw_buffer())
+
+
+def check_output(path: Path, suffix: str) -> None:
+    """Refuse, before anything is rendered, an output of another ``suffix``, one that cannot be written, and
+    one that would overwrite an image of another format; its folder is made. With an EXR goes a PNG of its
+    name, as from the command ``render``."""
+    if suffix == ".exr":
+        prepare_output(path)
+        return
+    if path.suffix.lower() != suffix:
+        raise CommandError(f"output={str(path)!r} must end in {suffix}")
+    check_format(path, path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
+
+
+def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
+    """An EXR of layers {prefix: (height, width, 3)}, written by `replacing`."""
+    channels = {
+        f"{layer}{c}": np.ascontiguousarray(pixels[..., i]).astype(dtype)
+        for layer, pixels in layers.items()
+        for i, c in enumerate("RGB")
+    }
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))
+
+
+def read_layers(path: Path, *layers: str):
+    """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_layers`, and its header; raises
+    ``ValueError`` for another file."""
+    with path.open("rb") as file:  # OpenEXR does not say what hinders it
+        start = file.read(4)
+    if start != MAGIC[".exr"]:
+        raise CommandError(f"{str(path)!r} is not an EXR")
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels, header = file.channels(), dict(file.header())
+        missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
+        if missing:
+            raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")
+        images = [np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1) for layer in layers]
+    return [image.astype(np.float64) for image in images], header

@@ -1,0 +1,171 @@
+"""Renders of a sweep's cells, here or on a worker of a cluster."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import math
+import tempfile
+from dataclasses import asdict
+from functools import cache, lru_cache
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .. import workers
+from ..errors import CommandError, message
+from ..files.texts import write_json
+from .cells import Cell, Cells, machine, software
+from .preset import read_preset
+from .project import Project
+from .scenes import integrator_of
+from .timing import timed
+
+CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
+
+
+class Bench:
+    """The loaded scenes and integrators of one scene's cells, warm."""
+
+    def __init__(self, cells: Cells, output: Path):
+        self.cells, self.output = cells, output
+        _, self._file, self._resolution, self._depth = cells.where()
+        self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
+
+    def scene(self, sampler: str):
+        """The scene with that sampler."""
+        if sampler not in self._scenes:
+            self._scenes[sampler] = self._file.load(self._resolution, sampler)
+        return self._scenes[sampler]
+
+    def integrator(self, cell: Cell):
+        """The plugin of a cell."""
+        if cell.parameters not in self._integrators:
+            self._integrators[cell.parameters] = integrator_of(dict(cell.parameters), self._depth)
+        return self._integrators[cell.parameters]
+
+    def timed(self, cell: Cell, spp: int, seed: int):
+        """Image and wall seconds of a render."""
+        return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
+
+    def compile_seconds(self, cell: Cell, spp: int) -> float:
+        """Seconds for the kernels of an integrator (less where they come from the cache on disk); afterwards
+        it is warm. Mitsuba's integrators have kernels of their own for each number of samples."""
+        key = cell.method, spp
+        if key not in self._compile:
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+                dr.kernel_history_clear()
+                self.timed(cell, spp, 0)
+                kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            statistics = getattr(self.integrator(cell), "statistics", None)
+            self._pilot[key] = statistics["seconds"]["pilot"] if statistics else 0.0
+            self._compile[key] = (
+                statistics["seconds"]["compile"]
+                if statistics
+                else sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+            )
+        return self._compile[key]
+
+    def pilot_seconds(self, cell: Cell, spp: int) -> float:
+        """Seconds of the pilots of the first render of so many samples, which later ones remember."""
+        self.compile_seconds(cell, spp)
+        return self._pilot[cell.method, spp]
+
+    def spp_of(self, cell: Cell) -> int:
+        """Samples of a cell: its budget, or what fits into the first method's seconds for it.
+
+        The ratio of seconds is measured once, at the largest budget, and kept.
+        """
+        first, largest = self.cells.of(cell.budget, cell.seed)[0], max(self.cells.subject.spp)
+        if cell.match == "spp" or cell.method == first.method:
+            return self._possible(cell.sampler, cell.budget)
+        if cell.method not in self._spp:
+            one = [c for c in self.cells.of(largest, 0) if c.method == cell.method][0]
+            kept = self.output / "ratios" / f"{one.key}.json"
+            if not kept.exists():
+                for one_of_both in (first, cell):
+                    self.compile_seconds(one_of_both, largest)
+                pairs = [
+                    [self.timed(c, largest, seed)[1] for c in (first, cell)] for seed in range(CALIBRATIONS)
+                ]
+                write_json(kept, float(np.median([ours / theirs for ours, theirs in pairs])))
+            self._spp[cell.method] = json.loads(kept.read_text())
+        wanted = cell.budget * self._spp[cell.method]
+        if cell.sampler == "independent":
+            return max(round(wanted), 1)
+        # Mitsuba's stratified samplers take a tenth longer per sample for numbers far from a power of two.
+        return self._possible(cell.sampler, 2 ** max(round(math.log2(wanted)), 0))
+
+    def _possible(self, sampler: str, spp: int) -> int:
+        """The samples that a sampler makes of so many: stratified ones may round up."""
+        fork = self.scene(sampler).sensors()[0].sampler().fork()
+        fork.set_sample_count(spp)
+        return int(fork.sample_count())
+
+
+def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
+    """Render a cell; its row, but for the errors, and its image."""
+    spp = bench.spp_of(cell)
+    compile_seconds = bench.compile_seconds(cell, spp)
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    image, seconds = bench.timed(cell, spp, cell.seed)
+    statistics = getattr(bench.integrator(cell), "statistics", {})
+    row = {
+        "key": cell.key,
+        **{k: v for k, v in asdict(cell).items() if k not in ("parameters", "versions", "against")},
+        "machine": machine(),
+        "parameters": json.dumps(dict(cell.parameters)),
+        "versions": json.dumps(dict(cell.versions)),
+        "started": started,
+        "spp": spp,
+        "seconds": seconds,
+        "seconds_compile": compile_seconds,
+        "seconds_pilot": bench.pilot_seconds(cell, spp),
+        "statistics": json.dumps(statistics),
+        "decisions": json.dumps(statistics.get("decisions")),
+    }
+    return row | {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}, image
+
+
+def measured(root: str, preset: str, scene: str, cells: list[dict]) -> list:
+    """On a worker: row and image of each cell, or why it failed, as text; one after the other.
+
+    ``root`` of the project, text of the ``preset``, name of the ``scene``.
+    """
+    with workers.one_at_a_time:
+        mi.set_variant("llvm_ad_rgb")
+        bench, found = _bench(root, preset, scene, cells[0]["scene_sha256"]), []
+        for entry in cells:
+            cell = Cell(**entry)
+            if cell.versions != _loaded_software():
+                raise CommandError(f"a worker has other software than the client: {dict(_loaded_software())}")
+            if cell.scene_sha256 != bench.cells.common["scene_sha256"]:
+                raise CommandError(f"a worker has another {scene}.xml, mesh or texture than the client")
+            try:
+                found.append(measure(bench, cell))
+            except Exception as error:  # one cell must not cost the others
+                found.append(message(error))
+        return found
+
+
+@cache
+def _loaded_software() -> tuple:
+    """`software` when this process first asked: files may change under a worker, not what it imported."""
+    return tuple(software().items())
+
+
+@lru_cache(maxsize=2)
+def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
+    """The bench of a scene, of these contents, of the preset in a file of this text; kept, so that it stays
+    warm."""
+    folder = tempfile.TemporaryDirectory(prefix="bdpt_sweep_")
+    file = Path(folder.name) / "preset.toml"
+    file.write_text(preset)
+    project = Project(Path(root))
+    whole = read_preset(file, project)
+    subject = next(subject for subject in whole.subjects if subject.name == scene)
+    bench = Bench(Cells(project, whole, subject), file.parent)
+    bench.folder = folder  # goes with the bench
+    return bench

@@ -1,0 +1,105 @@
+"""Two ways to render, alternating in time: seconds, errors and efficiency of the first over the second.
+
+Medians over pairs of renders of different seeds, after one that compiles; of the efficiency the quartiles
+too. Errors are relMSE, trimmed of the worst 0.1 % and raw; the last column is what the reference's own error
+adds to the trimmed one, of that side where it is more (ratios are off by as much). Where an image has no
+error at all there are no ratios of errors, and that is said.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from .analysis import Refused
+from .making import Job, obtained
+from .metrics import TRIM, rel_mse
+from .project import Project
+from .reference import Reference
+from .scenes import integrator_of
+from .tables import table
+from .timing import timed
+
+HEADS = (
+    "scene",
+    "spp",
+    "time",
+    "error",
+    "raw error",
+    "efficiency (quartiles)",
+    "raw efficiency",
+    "reference",
+)
+
+
+@dataclass(frozen=True)
+class Side:
+    """A plugin with parameters, and the scene with the sampler that it is given."""
+
+    made: object
+    scene: object
+
+    @staticmethod
+    def of(parameters: dict, job: Job) -> Side:
+        """From the ``parameters`` of the plugin, of which ``sampler`` is the sensor's; at the size and depth
+        of the ``job`` of the reference."""
+        own = dict(parameters)
+        sampler = own.pop("sampler", "independent")
+        return Side(integrator_of(own, job.depth), job.scene.load(job.resolution, sampler))
+
+    def measured(self, target: Reference, spp: int, seed: int) -> tuple[float, ...]:
+        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render; raises
+        `Refused` if it has no error."""
+        image, seconds = timed(self.scene, self.made, spp, seed)
+        trimmed = rel_mse(image, target.image, TRIM)
+        if trimmed == 0:
+            raise Refused("every value (trimmed) is exactly that of the reference")
+        return seconds, trimmed, rel_mse(image, target.image), target.share_of(image, TRIM) / trimmed
+
+
+def line(name: str, sides: list[Side], target: Reference, spp: int, pairs: int) -> list[str]:
+    """A scene's line of the table."""
+    try:
+        return [f"`{name}`", str(spp), *ratios(sides, target, spp, pairs)]
+    except Refused as why:
+        return [f"`{name}`", str(spp), str(why), *["–"] * (len(HEADS) - 3)]
+
+
+def ratios(sides: list[Side], target: Reference, spp: int, pairs: int) -> list[str]:
+    """The figures of a scene's line; raises `Refused` for an image without an error."""
+    found = []
+    for seed in range(pairs + 1):
+        pair = [None, None]
+        for i in (0, 1) if seed % 2 else (1, 0):
+            pair[i] = sides[i].measured(target, spp, seed)
+        found.append(pair)
+    first, second = np.array(found[1:]).transpose(1, 2, 0)
+    time, error, raw, _ = first / second
+    share = max(np.median(first[3]), np.median(second[3]))
+    low, middle, high = np.quantile(1 / (time * error), (0.25, 0.5, 0.75))
+    cells = [*np.median([time, error, raw], axis=1), np.median(1 / (time * raw))]
+    text = [f"{x:.3g}" for x in cells]
+    return [
+        *text[:3],
+        f"{middle:.3g} ({low:.3g}–{high:.3g})",
+        text[3],
+        f"{100 * share:.1f} %",
+    ]
+
+
+def run(options: Namespace) -> int:
+    """Print the table that the command line ``options`` ask for."""
+    mi.set_variant("llvm_ad_rgb")
+    project = Project(options.project)
+    scenes = [project.scene(name) for name in options.scenes]
+    rows = []
+    for scene in scenes:
+        job = Job(project, scene, options.resolution, None, max(options.spp), options.reference_seconds)
+        target = obtained(job)
+        made = [Side.of(side, job) for side in options.sides]
+        rows += [line(scene.name, made, target, spp, options.pairs) for spp in options.spp]
+    print(table(HEADS, rows))
+    return 0

@@ -1,0 +1,89 @@
+"""Sums of renders from which a reference is made, kept between runs."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import CommandError
+from ..files.whole import replacing
+from .agreement import FEWEST_RUNS, Means, tile_columns
+from .reference import Reference, kept_of, means_of, source_digest
+
+PASS_SPP = 256
+"""Samples per pixel of a render of the whole image."""
+
+
+class Halves:
+    """Sums of two independent halves and how many renders are in each pixel (``counts``), the tile means of
+    each render of the whole image, and the digests of the plugin's source that made them, kept in a file
+    between runs."""
+
+    def __init__(self, path: Path, key: str):
+        self.path, self.key, self.rounds, self.sums, self.columns = path, key, 0, None, []
+        self.sources, self.counts, self.earlier = set(), None, None
+        if path.is_file():
+            kept = np.load(path)
+            if str(kept["key"]) != key:
+                print(f"{path}: of another scene, integrator or number of samples; begun anew")
+            else:
+                self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
+                self.columns = list(kept["columns"])
+                whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
+                self.counts = kept["counts"] if "counts" in kept else whole
+                self.sources = set(kept["sources"].tolist())
+                self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
+        self.sources.add(source_digest())
+
+    def go_on_from(self, stored: Reference, windows: list):
+        """Take a stored reference for the renders before the first; ``windows`` are slices of rows and
+        columns. Its seeds are not used again."""
+        spp = stored.provenance["spp"]
+        whole, most = spp / (2 * PASS_SPP), stored.provenance.get("spp_in_windows", spp) / (2 * PASS_SPP)
+        self.counts = np.full((*stored.image.shape[:2], 1), whole)
+        for window in windows:
+            self.counts[window] = most
+        self.sums = np.stack([stored.image + stored.difference, stored.image - stored.difference])
+        self.sums *= self.counts
+        self.rounds = math.ceil((1 + len(windows)) * most)  # no less than were rendered
+        self.sources |= set(stored.provenance.get("sources", ()))  # older ones do not say
+        self.earlier = stored.means
+
+    def means(self) -> Means | None:
+        """Of all renders of the whole image; None if there are too few."""
+        if len(self.columns) < FEWEST_RUNS:
+            return self.earlier
+        made = Means.of(self.columns)
+        return self.earlier.joined(made) if self.earlier else made
+
+    def add(self, images, window=None, times: float = 1.0):
+        """Add an image to each half, and keep the sums. ``window`` (slices of rows and columns): the images
+        are of that part alone; ``times``: they have so many times the samples of a whole one. Raises
+        ``ValueError`` for values that are not finite, and leaves the sums as they are."""
+        if not all(np.isfinite(image).all() for image in images):
+            raise CommandError(f"{self.path.name}: round {self.rounds} has values that are not finite")
+        if self.sums is None:
+            self.sums, self.counts = np.zeros((2, *images[0].shape)), np.zeros((*images[0].shape[:2], 1))
+        self.sums[:, *(window or ())] += times * np.stack(images)
+        self.counts[window or ...] += times
+        if window is None:
+            self.columns += [tile_columns(image) for image in images]
+        self.rounds += 1
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        kept = {"sums": self.sums, "counts": self.counts, "columns": np.array(self.columns)}
+        kept |= {"earlier": json.dumps(kept_of(self.earlier))} if self.earlier else {}
+        with replacing(self.path) as temporary, temporary.open("wb") as file:
+            np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
+
+    def mean(self):
+        """Image, and half the difference of the halves: one sample of the image's own error."""
+        a, b = self.sums / self.counts
+        return (a + b) / 2, (a - b) / 2
+
+    def reference(self, provenance: dict) -> Reference:
+        """What there is after at least one round."""
+        image, difference = self.mean()
+        return Reference(image, difference, self.means(), provenance)

@@ -1,0 +1,330 @@
+"""Reference images with an error estimate of their own.
+
+A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
+the samples per pixel that it is to judge, and of `path` in the same time where the reference is made by it.
+It is the mean of two halves with seeds of their own, rendered in turn until that is reached or the time is
+over; the halves differ by twice the standard error of their mean. What makes it stands in `Recipe`: `bdpt`
+with everything switched on, or `path` where that converges, so that `bdpt` is judged by another integrator;
+windows in which few samples find the light have more of them; furnaces are known exactly. Files lie in the
+project's references/: EXR in half precision with the image (R, G, B), half the difference of the halves
+(difference.R ...), and the provenance as JSON in the header, with what a bias check needs. Sums in double
+precision are kept in renders/, so that a further run improves a reference instead of starting anew; where
+they are gone, it goes on from the stored image, whose rounding to half precision is far below its own error.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import platform
+import time
+from argparse import Namespace
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import CommandError
+from ..files.texts import read_toml
+from ..host.versions import versions
+from ..run.rendering import raise_interrupt
+from .agreement import FEWEST_RUNS, TILES, Means
+from .efficiency import REFERENCE_SHARE
+from .halves import PASS_SPP, Halves
+from .metrics import TRIM, rel_mse
+from .project import Project
+from .reference import Reference, load_reference, reference_path, write
+from .scenes import SceneFile, integrator_of
+
+WAYS = {
+    "path": {"type": "path"},
+    "bdpt": {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"},
+}
+"""What makes references."""
+
+FOCUS_TIMES = 16  # of the samples, in windows
+
+SAMPLER = "multijitter"  # of `path`: half the error of `independent` at equal time; `bdpt` has its own points
+
+FIRST_SEED = 1_000_000  # far from the seeds of measurements
+WINDOW_PASSES = 4  # in one render of a window
+TRIALS = 3  # renders of bdpt that say what it has to judge
+TWICE = 2  # samples of `path` in the time of one of `bdpt`, roughly
+MARGIN = 0.9  # of the share that a reference may carry
+SECONDS = 600.0  # that a reference may take
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the reference of a scene is made, from the table of its name in PROJECT/references/scenes.toml:
+
+        [glass_caustics]
+        by = "bdpt"                 # or "path", where that converges; default: "bdpt"
+        windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
+
+        [furnace_point]
+        radiance = { limit = 1.0, lacks = 2.0 }   # known: limit - lacks / 2^max_depth in every pixel
+
+    Windows have to be chosen by what a scene shows, not by the noise found, which would bias the image. (A
+    window has fewer light subpaths than as many samples of the whole image: t = 1 gains less from it.)
+    """
+
+    by: str = "bdpt"
+    windows: tuple = ()
+    radiance: dict | None = None
+
+    @staticmethod
+    def of(project: Project, name: str) -> Recipe:
+        """That of a scene; raises ``ValueError`` for one that cannot be followed."""
+        file = project.references / "scenes.toml"
+        entry = (read_toml(file) if file.is_file() else {}).get(name, {})
+        keys = {"by", "windows", "radiance"}
+        if unknown := sorted(set(entry) - keys):
+            raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
+        if entry.get("by", "bdpt") not in WAYS:
+            raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
+        windows = entry.get("windows", [])
+        if not all(len(w) == 4 and 0 <= w[0] < w[2] <= 1 and 0 <= w[1] < w[3] <= 1 for w in windows):
+            raise CommandError(
+                f"{file}: windows={windows!r} of [{name}] must be lists of four shares, left, top, "
+                "right, bottom"
+            )
+        known = entry.get("radiance")
+        if known is not None and set(known) != {"limit", "lacks"}:
+            raise CommandError(f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks")
+        return Recipe(entry.get("by", "bdpt"), tuple(map(tuple, windows)), known)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A reference to be made: ``spp`` of the renders that it has to judge, ``seconds`` that it may take,
+    ``rounds`` of two renders that it has at least; ``max_depth`` None: the project's; ``by``, a key of
+    `WAYS`, in place of the recipe's."""
+
+    project: Project
+    scene: SceneFile
+    resolution: int
+    max_depth: int | None = None
+    spp: int = 64
+    seconds: float = SECONDS
+    by: str | None = None
+    rounds: int = 1
+
+    @cached_property
+    def scene_sha256(self) -> str:
+        """Of the scene, taken before it is rendered."""
+        return self.scene.sha256
+
+    @cached_property
+    def depth(self) -> int:
+        """The ``max_depth``."""
+        return self.max_depth or self.project.depth(self.scene)
+
+    @property
+    def stored(self) -> Reference | None:
+        """The reference that there is; None if it is of another scene."""
+        try:
+            return load_reference(self.project, self.scene, self.resolution, self.depth)
+        except ValueError:
+            return None
+
+
+def obtained(job: Job) -> Reference:
+    """The stored reference, made now if there is none, with renders enough for a bias check, and a word on
+    standard output. Raises ``ValueError`` if the stored one is of another scene."""
+    if not reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
+        print(
+            f"{job.scene.name}: no reference at {job.resolution} and depth {job.depth} yet; making one, "
+            f"for at most about {job.seconds:g} s",
+            flush=True,
+        )
+        made = replace(job, max_depth=job.depth, rounds=FEWEST_RUNS // 2)
+        print(said(job, *make(made)), flush=True)
+    return load_reference(job.project, job.scene, job.resolution, job.depth)
+
+
+def make(job: Job) -> tuple[Reference, bool]:
+    """Render until the reference is good enough or the time is over, and store it; also whether it is good
+    enough. One that the time has cut short does not replace a better one."""
+    recipe = Recipe.of(job.project, job.scene.name)
+    check_size(job)
+    reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
+    stored = None if reached else job.stored
+    if stored is not None and stored.error < reference.error:
+        print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
+        return stored, False
+    write(reference_path(job.project, job.scene.name, job.resolution, job.depth), reference)
+    return reference, reached
+
+
+def check_size(job: Job) -> None:
+    """Raise ``ValueError`` for an image that the tiles of a bias check do not divide."""
+    width, height = job.scene.size(job.resolution)
+    if height % TILES == 0 == width % TILES:
+        return
+    own_width, own_height = job.scene.size()
+    widths = range(TILES, 4 * job.resolution, TILES)
+    fitting = [n for n in widths if (round(n * own_height / own_width) or 1) % TILES == 0]
+    nearest = sorted(fitting, key=lambda n: abs(n - job.resolution))[:1]
+    advice = f"; take resolution={nearest[0]}" if nearest else "; give the film another shape"
+    raise CommandError(
+        f"scene={job.scene.name!r} has {width} x {height} pixels at resolution={job.resolution}; both must "
+        f"be divisible by {TILES}{advice}."
+    )
+
+
+def _pixels(image):
+    return np.array(image, dtype=np.float64)[..., :3]
+
+
+class Aim:
+    """What a reference has to judge: renders of default `bdpt` with ``spp`` samples per pixel, and of `path`
+    in the same time where that converges."""
+
+    def __init__(self, scene, depth: int, spp: int, by_path: bool):
+        rivals = [({"type": "bdpt"}, spp)] + [(WAYS["path"], TWICE * spp)] * by_path
+        self.images = []
+        for parameters, samples in rivals:
+            rival = integrator_of(parameters, depth)
+            for seed in range(TRIALS):
+                self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
+
+    def reached(self, reference: Reference) -> bool:
+        """Whether the reference carries little enough of their errors, and can serve in a bias check."""
+        if reference.means is None:
+            return False
+        return all(
+            reference.share_of(image, trim)
+            <= MARGIN * REFERENCE_SHARE * rel_mse(image, reference.image, trim)
+            for image in self.images
+            for trim in (0.0, TRIM)
+        )
+
+
+def _same(stored: Reference, **wanted) -> bool:
+    return all(stored.provenance.get(key) == value for key, value in wanted.items())
+
+
+def _provenance(job: Job, **more) -> dict:
+    return {
+        "scene": job.scene.name,
+        "scene_sha256": job.scene_sha256,
+        "resolution": job.resolution,
+        "max_depth": job.depth,
+        "date": datetime.date.today().isoformat(),
+        "machine": platform.machine(),
+        "versions": versions(),
+        **more,
+    }
+
+
+def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
+    """The same radiance everywhere, without error, and True."""
+    width, height = job.scene.size(job.resolution)
+    value = radiance["limit"] - (radiance["lacks"] * 2.0**-job.depth if job.depth > 0 else 0.0)
+    image = np.full((height, width, 3), value)
+    provenance = _provenance(job, integrator="known answer")
+    return Reference(image, 0 * image, Means.known(image), provenance), True
+
+
+def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
+    """As `_known`, by an integrator; False if the time was over first."""
+    by = job.by or recipe.by
+    parameters = WAYS[by] | {"max_depth": job.depth}
+    integrator = mi.load_dict(parameters)
+    key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, SAMPLER])
+    scene = job.scene.load(job.resolution, SAMPLER)
+    halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
+    aim = Aim(scene, job.depth, job.spp, by == "path")
+    windows = [Window(job, share) for share in recipe.windows]
+    stored = job.stored if halves.rounds == 0 else None
+    if stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):
+        halves.go_on_from(stored, [window.slices for window in windows])
+    started = time.perf_counter()
+    reached = halves.rounds > 0 and aim.reached(halves.reference({}))
+    while halves.rounds < job.rounds or not (reached or time.perf_counter() - started > job.seconds):
+        behind = [w for w in windows if w.is_behind(halves)]
+        for window in behind:
+            halves.add(_pair(window.scene, integrator, halves, WINDOW_PASSES), window.slices, WINDOW_PASSES)
+        if not behind:
+            halves.add(_pair(scene, integrator, halves))
+        reached = aim.reached(halves.reference({}))
+    provenance = _provenance(
+        job,
+        integrator=parameters,
+        sampler=SAMPLER,
+        spp=round(2 * float(halves.counts.min()) * PASS_SPP),
+        spp_in_windows=round(2 * float(halves.counts.max()) * PASS_SPP),
+        first_seed=FIRST_SEED,
+        sources=sorted(halves.sources),
+        judges_spp=job.spp,
+    )
+    return halves.reference(provenance), reached
+
+
+def _pair(scene, integrator, halves: Halves, times: int = 1):
+    """Two images with seeds of their own."""
+    seed = FIRST_SEED + 2 * halves.rounds
+    spp = times * PASS_SPP
+    return [_pixels(mi.render(scene, integrator=integrator, spp=spp, seed=seed + i)) for i in (0, 1)]
+
+
+class Window:
+    """A part of the image that needs more samples: the ``scene`` with that crop window, and the ``slices`` of
+    rows and columns."""
+
+    def __init__(self, job: Job, share):
+        self.scene = job.scene.load(job.resolution, SAMPLER)
+        if not self.scene.sensors()[0].film().rfilter().is_box_filter():
+            raise CommandError(f"scene={job.scene.name!r}: windows need rfilter 'box', or borders differ")
+        size = np.array(self.scene.sensors()[0].film().size())
+        low, high = np.floor(share[:2] * size).astype(int), np.ceil(share[2:] * size).astype(int)
+        self.slices = (slice(low[1], high[1]), slice(low[0], high[0]))
+        parameters = mi.traverse(self.scene)
+        for name, value in (("crop_size", high - low), ("crop_offset", low)):
+            (key,) = (key for key in parameters.keys() if key.endswith(f"film.{name}"))
+            parameters[key] = value.tolist()
+        parameters.update()
+
+    def is_behind(self, halves: Halves) -> bool:
+        """Whether it has fewer than `FOCUS_TIMES` the samples of the rest."""
+        if halves.counts is None:
+            return False
+        return halves.counts[self.slices].min() < FOCUS_TIMES * halves.counts.min()
+
+
+def said(job: Job, made: Reference, reached: bool) -> str:
+    """What was made, in a line."""
+    text = f"{job.scene.name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e}"
+    return text + ("" if reached else f", not good enough for {job.spp} spp: go on by the command reference")
+
+
+def run(options: Namespace) -> int:
+    """Make the references that the command line ``options`` name; the status is 1 if one failed or is not
+    good enough."""
+    if not (options.all or options.scenes):
+        raise CommandError("reference: name a scene, or give --all")
+    mi.set_variant("llvm_ad_rgb")
+    project, status = Project(options.project), 0
+    for name in project.scene_names() if options.all else options.scenes:
+        try:
+            scene = project.scene(name)
+            job = Job(
+                project,
+                scene,
+                options.resolution,
+                options.max_depth,
+                options.spp,
+                options.seconds,
+                options.by,
+            )
+            made, reached = make(job)
+        except (ValueError, RuntimeError, NotImplementedError) as error:  # go on with the other scenes
+            raise_interrupt(error)
+            print(f"{name}: failed: {error}", flush=True)
+            status = 1
+            continue
+        status |= not reached
+        print(said(job, made, reached), flush=True)
+    return int(status)

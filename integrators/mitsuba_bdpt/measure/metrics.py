@@ -1,0 +1,189 @@
+"""Measures of error and colour difference, each with its formula and its source.
+
+Images are floats in linear sRGB of shape (height, width, 3), any float type; the arithmetic is float64.
+What would make a number meaningless (another shape, NaN or infinite values, a black reference where one
+divides by it) is refused with ``ValueError`` or ``TypeError``; nothing is replaced by 0. No function prints,
+writes, or renders.
+
+colour-science and flip-evaluator are imported when first used, since they take seconds to load.
+"""
+
+from __future__ import annotations
+
+import functools
+import warnings
+
+import numpy as np
+
+from ..errors import CommandError
+from .checks import image_of, number_of, pair_of
+
+# Luminance of display white in cd/m^2: that of standard-dynamic-range video, ITU-R BT.2035.
+WHITE = 100.0
+
+# Share of the worst values that the trimmed relMSE leaves out.
+TRIM = 0.001
+
+# HDR-FLIP clamps luminances here (float32's epsilon), and ends the process if all are below.
+FLIP_DARKEST = 2.0**-23
+
+
+def mse(image, reference) -> float:
+    """Mean squared error: mean of (x - r)^2 over pixels and channels, in squared units of radiance."""
+    image, reference = pair_of(image, reference)
+    return float(np.mean((image - reference) ** 2))
+
+
+def rel_mse_epsilon(reference) -> float:
+    """The eps of `rel_mse`: 0.01 mean(r)^2 over pixels and channels, in squared units of radiance.
+
+    It keeps dark pixels from deciding: where r is a tenth of the mean, r^2 and eps weigh the same.
+    """
+    epsilon = 0.01 * float(image_of("reference", reference).mean()) ** 2
+    if not epsilon > 0:
+        raise CommandError("reference has mean 0, so nothing is relative to it; use mse.")
+    return epsilon
+
+
+def rel_mse(image, reference, trim=0.0) -> float:
+    """Relative mean squared error: mean of (x - r)^2 / (r^2 + eps) over pixels and channels.
+
+    eps is `rel_mse_epsilon`. Source: F. Rousselle, C. Knaus, M. Zwicker, Adaptive Sampling and
+    Reconstruction using Greedy Error Minimization, SIGGRAPH Asia 2011, there with a constant 0.01; ours
+    follows the image's brightness, so scaling both images changes nothing.
+
+    ``trim``: share of the worst values left out, round(trim * n) of the n = 3 * height * width ones, 0.001
+    for the *trimmed* relMSE. It leaves out values, not pixels: of a pixel it may take one channel. With less
+    than 500 values 0.001 of them rounds to none. Trimmed figures depend on the budget (more samples have more
+    rare values): state the samples with them.
+    """
+    error, kept = _relative_errors(image, reference, trim)
+    return float(error[kept].mean())
+
+
+def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
+    """What the reference's own error adds to ``rel_mse(image, reference, trim)``.
+
+    ``difference``: an image of the reference's error, as half the difference of two halves of it. Its relMSE
+    over the values that the measurement keeps: those that are trimmed are the image's worst, not the
+    reference's.
+    """
+    _, kept = _relative_errors(image, reference, trim)
+    difference = image_of("difference", difference)
+    own, _ = _relative_errors(image_of("reference", reference) + difference, reference, 0.0)
+    return float(own[kept].mean())
+
+
+def _relative_errors(image, reference, trim):
+    """Squared relative errors (n,), and the indices of those that are not trimmed."""
+    image, reference = pair_of(image, reference)
+    if trim != 0:
+        trim = number_of("trim", trim, 0, 1)
+    error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
+    keep = len(error) - round(trim * len(error))
+    if keep == 0:
+        raise CommandError(f"trim={trim} leaves none of {len(error)} values; choose a smaller share.")
+    return error, np.argpartition(error, keep - 1)[:keep]
+
+
+def mape(image, reference) -> float:
+    """Mean absolute relative error: mean of |x - r| / (|r| + eps1) over pixels and channels; 1 is 100 %.
+
+    eps1 = 0.01 mean(r): small against what is seen, so only pixels below a hundredth of the mean count
+    less than their relative error, and 0 / 0 in black ones is 0.
+    """
+    image, reference = pair_of(image, reference)
+    epsilon = 0.01 * float(reference.mean())
+    if not epsilon > 0:
+        raise CommandError(f"reference has mean {reference.mean():g}, so nothing is relative to it; use mse.")
+    return float(np.mean(np.abs(image - reference) / (np.abs(reference) + epsilon)))
+
+
+def energy_in_black(image, reference) -> float:
+    """Share of the image's energy where the reference is black: sum of x over those pixels / sum of x.
+
+    Black are pixels in which all three channels of the reference are exactly 0. An image without energy has
+    none there either: 0.
+    """
+    image, reference = pair_of(image, reference)
+    if image.min() < 0:
+        raise CommandError(f"image holds negative values down to {image.min():g}; energies must not cancel.")
+    total = image.sum()
+    black = (reference == 0).all(axis=-1)
+    return float(image[black].sum() / total) if total > 0 else 0.0
+
+
+def tone_map(image, exposure=0.0) -> np.ndarray:
+    """What a display shows: sRGB-encoded values in [0, 1], shape (height, width, 3).
+
+    x = clip(image * 2^exposure, 0, 1) with ``exposure`` in stops, then the transfer function of
+    IEC 61966-2-1: 12.92 x up to 0.0031308, above it 1.055 x^(1/2.4) - 0.055. Negative values (filters with
+    negative lobes) become black, as on a display.
+    """
+    x = np.clip(image_of("image", image) * 2.0 ** number_of("exposure", exposure, -100, 100), 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+
+
+@functools.cache
+def _colour():
+    """The package colour, without its notes on packages that it misses and that are not used here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import colour
+    return colour
+
+
+def delta_e_2000(image, reference, exposure=0.0) -> float:
+    """Mean over pixels of CIEDE2000 between both images as `tone_map` shows them; 1 is just visible.
+
+    sRGB to XYZ to L*a*b* under D65, k_L = k_C = k_H = 1. Source: CIE 142-2001; G. Sharma, W. Wu,
+    E. Dalal, The CIEDE2000 color-difference formula, 2005.
+    """
+    colour = _colour()
+    labs = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(tone_map(x, exposure))) for x in pair_of(image, reference)]
+    return float(np.mean(colour.delta_E(*labs, method="CIE 2000")))
+
+
+def delta_e_itp(image, reference, exposure=0.0, white=WHITE) -> float:
+    """Mean over pixels of Delta E ITP between both images as `tone_map` shows them; 1 is just visible.
+
+    720 sqrt(dI^2 + (dC_T / 2)^2 + dC_P^2) in IC_TC_P of BT.2100 (PQ), linear BT.2020 in cd/m^2 with 1 at
+    ``white``. Source: Recommendation ITU-R BT.2124. It tells dark differences better than `delta_e_2000`.
+    """
+    colour = _colour()
+    white = number_of("white", white, 0)
+    encoded = []
+    for x in pair_of(image, reference):
+        linear = colour.RGB_to_RGB(tone_map(x, exposure), "sRGB", "ITU-R BT.2020", apply_cctf_decoding=True)
+        encoded.append(colour.RGB_to_ICtCp(white * np.maximum(linear, 0)))
+    return float(np.mean(colour.difference.delta_E_ITP(*encoded)))
+
+
+def hdr_flip(image, reference):
+    """Mean HDR-FLIP error in [0, 1] and the error map (height, width), float32.
+
+    The largest LDR-FLIP error over a range of exposures that is chosen from the reference, ACES tone
+    mapping, 67 pixels per degree (a 0.7 m wide screen of 3840 pixels seen from 0.7 m). Not symmetric: the
+    reference decides the exposures. Where more than half of it is black, these reach 24 stops beyond its
+    highlights and any light in black counts nearly 1. Source: P. Andersson, J. Nilsson, P. Shirley,
+    T. Akenine-Moller, Visualizing Errors in Rendered High Dynamic Range Images, Eurographics 2021.
+    """
+    try:
+        import flip_evaluator
+    except ImportError as error:
+        raise CommandError("hdr_flip needs flip-evaluator: pip install 'mitsuba-bdpt[measure]'.") from error
+    pair = pair_of(image, reference)
+    for name, x in zip(("image", "reference"), pair, strict=True):
+        if x.min() < 0 or x.max() > np.finfo(np.float32).max:
+            raise CommandError(
+                f"{name} holds values from {x.min():g} to {x.max():g}; HDR-FLIP needs 0 to 3e38."
+            )
+    image, reference = (x.astype(np.float32) for x in pair)
+    brightest = float((reference @ np.array([0.2126, 0.7152, 0.0722], np.float32)).max())
+    if brightest < 2 * FLIP_DARKEST:
+        raise CommandError(
+            f"reference has luminances up to {brightest:g} only, and HDR-FLIP cannot expose less than "
+            f"{2 * FLIP_DARKEST:.1g}; scale both images by the same factor, or use mse if it is black."
+        )
+    error_map, mean, _ = flip_evaluator.evaluate(reference, image, "HDR", applyMagma=False)
+    return float(mean), np.asarray(error_map).reshape(reference.shape[:2])

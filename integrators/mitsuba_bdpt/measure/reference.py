@@ -1,0 +1,123 @@
+"""Reference images with an error estimate of their own, as they are stored.
+
+Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
+two halves of its samples (difference.R ...), which is one sample of its own error, and the provenance as JSON
+in the header, with what a bias check needs. `making` makes them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import CommandError
+from ..files.images import read_layers, write_layers
+from .agreement import Means, Sample
+from .metrics import reference_rel_mse, rel_mse
+from .project import Project
+from .scenes import SceneFile, digest
+
+HALF_MAX = 65504.0
+"""The largest number in half precision."""
+
+PACKAGE = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """``image`` and ``difference`` (height, width, 3), half the difference of the halves; ``means`` for bias
+    checks, None if too few renders made it; ``provenance`` what made it."""
+
+    image: np.ndarray
+    difference: np.ndarray
+    means: Means | None
+    provenance: dict
+
+    @property
+    def error(self) -> float:
+        """Its own relMSE."""
+        return rel_mse(self.image + self.difference, self.image)
+
+    def share_of(self, image, trim: float) -> float:
+        """What its own error adds to ``rel_mse(image, self.image, trim)``."""
+        return reference_rel_mse(self.difference, image, self.image, trim)
+
+
+def reference_path(project: Project, name: str, resolution: int, max_depth: int) -> Path:
+    """Where the reference of a scene lies."""
+    return project.references / f"{name}_{resolution}_{max_depth}.exr"
+
+
+def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
+    """The stored reference; raises ``ValueError`` with the command that makes it, if there is none, and
+    if it was made of another version of the scene's file."""
+    path = reference_path(project, scene.name, resolution, max_depth)
+    make = f"mitsuba-bdpt reference {project.called(scene)} --resolution {resolution} --max-depth {max_depth}"
+    if not path.is_file():
+        raise CommandError(
+            f"no reference for scene={scene.name!r} at {resolution} and depth {max_depth}; {make}"
+        )
+    found = read_reference(path)
+    if found.provenance["scene_sha256"] != scene.sha256:
+        raise CommandError(
+            f"the reference {path.name} was made of another {scene.name}.xml, mesh or texture; {make}"
+        )
+    return found
+
+
+def read_reference(path: Path) -> Reference:
+    """The reference in a file, whatever scene it was made of."""
+    (image, difference), header = read_layers(path, "", "difference.")
+    provenance = json.loads(header["provenance"])
+    return Reference(image, difference, means_of(provenance["means"]), provenance)
+
+
+def write(path: Path, reference: Reference):
+    """Write a reference; whoever looks at ``path`` never sees half a file."""
+    brightest = float(reference.image.max())
+    if brightest > HALF_MAX:
+        raise CommandError(
+            f"{path.name}: radiance {brightest:g} does not fit into half precision; scale the lamps"
+        )
+    layers = {"": reference.image, "difference.": reference.difference}
+    header = reference.provenance | {"rel_mse": reference.error, "means": kept_of(reference.means)}
+    write_layers(path, layers, {"provenance": json.dumps(header)})
+
+
+def means_of(kept) -> Means | None:
+    """`Means` of what the provenance keeps of them: those of an exact image have no end of freedom."""
+    if kept is None:
+        return None
+    return Means(
+        **{
+            name: Sample(
+                np.array(sample["mean"]),
+                np.array(sample["error"]),
+                np.inf if sample["freedom"] is None else sample["freedom"],
+                np.array(sample["nonzero"]),
+            )
+            for name, sample in kept.items()
+        }
+    )
+
+
+def kept_of(means: Means | None):
+    """The reverse of `means_of`, for JSON."""
+    if means is None:
+        return None
+    plain = {name: asdict(getattr(means, name)) for name in ("columns", "whole")}
+    for sample in plain.values():
+        for key in ("mean", "error", "nonzero"):
+            sample[key] = [float(f"{x:.9g}") for x in sample[key]]
+        sample["freedom"] = None if np.isinf(sample["freedom"]) else sample["freedom"]
+    return plain
+
+
+def source_digest() -> str:
+    """SHA-256 of the source files of what renders, shortened."""
+    others = (PACKAGE / "cli", PACKAGE / "measure")
+    files = sorted(PACKAGE.rglob("*.py"))
+    return digest(*(file for file in files if not any(map(file.is_relative_to, others))))[:12]

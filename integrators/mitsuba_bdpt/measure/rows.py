@@ -1,0 +1,130 @@
+"""The rows that a sweep leaves: errors of its images, files of cells, tables of all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+
+from ..files.images import read_layers, write_layers
+from ..files.texts import write_json
+from ..files.whole import replacing
+from . import agreement, analysis, metrics
+from .cells import FIRST_SEED, Cell, Cells
+from .preset import Preset
+from .project import Project
+from .reference import Reference, load_reference, reference_path
+from .scenes import SceneFile, digest
+
+
+def cell_file(output: Path, cell: Cell) -> Path:
+    """Where a finished cell lies."""
+    return output / "cells" / f"{cell.key}.json"
+
+
+def image_file(output: Path, cell: Cell) -> Path:
+    """Where its image lies."""
+    return output / "images" / cell.scene / f"{cell.key}.exr"
+
+
+def judge_of(project: Project, scene: SceneFile, resolution: int, depth: int):
+    """A reference, and the SHA-256 of its file, taken before: should another one replace it meanwhile, the
+    next run takes the errors anew."""
+    path = reference_path(project, scene.name, resolution, depth)
+    sha256 = digest(path) if path.exists() else ""
+    return load_reference(project, scene, resolution, depth), sha256
+
+
+def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None:
+    """Write the image and the row of a cell, the errors against ``judge`` (see `judge_of`) added."""
+    write_layers(image_file(output, cell), {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
+    found = row | errors(image, *judge, cell.seed == FIRST_SEED)
+    write_json(cell_file(output, cell), found)
+
+
+def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
+    """All measures of an image; ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not
+    good enough for them. HDR-FLIP takes longer than most renders: only where ``flip``, else None."""
+    raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
+    own = [ref.share_of(image, trim) for trim in (0.0, metrics.TRIM)]
+    return {
+        "reference_sha256": ref_sha256,
+        "width": image.shape[1],
+        "height": image.shape[0],
+        "mean": float(image.mean()),
+        "tile_means": [float(f"{x:.7g}") for x in agreement.tile_columns(image)],
+        "mse": metrics.mse(image, ref.image),
+        "rel_mse": raw,
+        "rel_mse_trimmed": trimmed,
+        "rel_mse_epsilon": metrics.rel_mse_epsilon(ref.image),
+        "mape": metrics.mape(image, ref.image),
+        "flip": metrics.hdr_flip(image, ref.image)[0] if flip else None,
+        "delta_e_2000": metrics.delta_e_2000(image, ref.image),
+        "delta_e_itp": metrics.delta_e_itp(image, ref.image),
+        "energy_in_black": metrics.energy_in_black(image, ref.image),
+        "reference_rel_mse": own[0],
+        "reference_rel_mse_trimmed": own[1],
+        "judged": analysis.judged(own[0], raw),
+        "judged_trimmed": analysis.judged(own[1], trimmed),
+    }
+
+
+def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
+    """The rows of those cells, ``wanted`` ones of a scene's ``cells``, that are finished; their errors anew
+    where the reference is another now."""
+    project, scene, resolution, depth = cells.where()
+    path, found = reference_path(project, scene.name, resolution, depth), []
+    for cell in wanted:
+        file = cell_file(output, cell)
+        if not file.exists():
+            continue
+        row = json.loads(file.read_text())
+        if not path.exists() or row["reference_sha256"] != digest(path):
+            (image,), _ = read_layers(image_file(output, cell), "")
+            row |= errors(image, *judge_of(*cells.where()), cell.seed == FIRST_SEED)
+            write_json(file, row)
+        found.append(row)
+    return found
+
+
+def rows(project: Project, preset: Preset, output: Path) -> list[dict]:
+    """The rows of all finished cells of the preset, in its order."""
+    found = []
+    for subject in preset.subjects:
+        cells = Cells(project, preset, subject)
+        wanted = {c.key: c for c in cells.planned()}
+        if cells.fewest():
+            wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
+        found += read_rows(output, cells, wanted.values())
+    return [row | {"first": preset.methods[0].name} for row in found]
+
+
+def beside(table: list[dict], preset: Preset, output: Path) -> list[dict]:
+    """``table`` and the rows of other scenes of the ``preset`` that OUTPUT/rows.parquet has, as they are."""
+    file, done = output / "rows.parquet", {row["scene"] for row in table}
+    others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
+    order = [subject.name for subject in preset.subjects]
+    found = table + [row for row in others if row["scene"] in order and row["scene"] not in done]
+    return sorted(found, key=lambda row: order.index(row["scene"]))
+
+
+def write_tables(table: list[dict], output: Path) -> None:
+    """rows.csv and rows.parquet, the same columns in both."""
+    columns = list(dict.fromkeys(key for row in table for key in row))
+    table = [{key: row.get(key) for key in columns} for row in table]
+    with replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(table)
+    arrays = pa.Table.from_pylist(table)
+    place = columns.index("tile_means")
+    means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits were written
+    with replacing(output / "rows.parquet") as temporary:
+        pyarrow.parquet.write_table(
+            arrays.set_column(place, "tile_means", means), temporary, compression="zstd"
+        )

@@ -1,0 +1,270 @@
+"""The commands that measure, on a scene file of a user's in a project folder of a user's."""
+
+import importlib.resources
+import importlib.util
+import re
+import subprocess
+import sys
+
+import mitsuba as mi
+import numpy as np
+import pyarrow.parquet
+import pytest
+from mitsuba_bdpt.cli import measuring
+from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.measure import making, reference
+from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.scenes import SceneFile
+
+# Nothing of it is as in this repository: a size that no parameter sets, Mitsuba's default filter and sampler,
+# materials without names.
+ROOM = """<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm">
+            <integer name="width" value="64"/><integer name="height" value="{height}"/>
+        </film>
+        {sampler}
+    </sensor>
+    <shape type="sphere"><float name="radius" value="5"/><boolean name="flip_normals" value="true"/></shape>
+    <shape type="obj"><string name="filename" value="lamp.obj"/>
+        <emitter type="area"><rgb name="radiance" value="3, 2, 1"/></emitter></shape>
+</scene>"""
+LAMP = "v -1 1 0\nv 1 1 0\nv 0 1 1\nf 1 2 3\n"
+STRATIFIED = '<sampler type="stratified"><integer name="sample_count" value="9"/></sampler>'
+
+PRESET = """
+resolution = 16
+scenes = ["../elsewhere/room.xml"]
+spp = [2, 4]
+seeds = [8, 2]
+[[integrator]]
+type = "bdpt"
+[[integrator]]
+type = "path"
+match = "seconds"
+[[integrator]]
+name = "power"
+type = "bdpt"
+heuristic = "power"
+sampler = "multijitter"
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working directory with a scene and a project, in folders of their own."""
+    monkeypatch.chdir(tmp_path)
+    for folder in ("elsewhere", "project/presets"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "elsewhere" / "room.xml").write_text(ROOM.format(height=64, sampler=""))
+    (tmp_path / "elsewhere" / "lamp.obj").write_text(LAMP)
+    (tmp_path / "project" / "presets" / "mine.toml").write_text(PRESET)
+    return tmp_path
+
+
+def command(*words):
+    """Output of ``python -m mitsuba_bdpt`` with these words, which has to succeed without a warning."""
+    done = subprocess.run([sys.executable, "-m", "mitsuba_bdpt", *words], capture_output=True, text=True)
+    assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
+    return done.stdout
+
+
+def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
+    """Expected: from a scene file anywhere and a preset in the project come a reference, made on the way and
+    said to be, the rows of all renders, tables, plots and the page, each by the installed command, all in the
+    project's folder; a second sweep renders and makes nothing."""
+    said = command("sweep", "mine", "--project", "project")
+    assert "room: no reference at 16 and depth 4 yet; making one" in said and ": 30 rows" in said
+    results = here / "project" / "results" / "mine"
+    rows = pyarrow.parquet.read_table(results / "rows.parquet").to_pylist()
+    assert {row["scene"] for row in rows} == {"room"} and len(rows) == 30
+    assert {(row["width"], row["height"], row["max_depth"]) for row in rows} == {(16, 16, 4)}
+    kept = reference.read_reference(here / "project" / "references" / "room_16_4.exr")
+    assert kept.provenance["integrator"]["type"] == "bdpt" and kept.means.columns.freedom >= 7
+    said = command("sweep", "project/presets/mine.toml", "--project", "project")
+    assert "reference" not in said and ": 30 rows" in said
+    command("report", "mine", "--project", "project")
+    text = (results / "README.md").read_text()
+    assert "| scene | over path, trimmed | over path, raw | over power, trimmed | over power, raw |" in text
+    assert re.search(r"\| `room` \|.*passed, p = ", text)
+    for name in re.findall(r"\((\w+\.png)\)", text):
+        assert (results / name).stat().st_size > 5000
+    command("page", "mine", "--project", "project")
+    page = (results / "page.html").read_text()
+    assert 'href="#scene-room"' in page and "@DATA@" not in page
+    assert not (here / "references").exists() and not (here / "results").exists()
+
+
+def test_other_commands_take_the_users_scene(here, capsys):
+    """Expected: compare, equal-time, pyramid and fireflies make their reference in the project, once, and
+    leave their pictures there."""
+    common = ["--resolution", "16", "--project", "project"]
+    room = "elsewhere/room.xml"
+    words = ["compare", "bdpt skip=none", "path sampler=stratified", "--scenes", room, "--spp", "4"]
+    assert main([*words, "--pairs", "1", *common]) == 0
+    out = capsys.readouterr().out
+    assert "making one" in out and "| `room` | 4 |" in out
+    assert main(["equal-time", room, "--spp", "4", *common]) == 0
+    assert main(["pyramid", room, "--spp", "4", *common]) == 0
+    assert main(["fireflies", room, "--spp", "4", "--seeds", "1", "--level", "0.05", *common]) == 0
+    out = capsys.readouterr().out
+    assert "making one" not in out and "SmoothDiffuse" in out
+    made = {path.name for path in (here / "project" / "renders").iterdir()}
+    assert {"equal_time_room.png", "pyramid_room.exr", "pyramid_room_weighted.png"} <= made
+
+
+def test_the_first_integrator_may_be_any(here):
+    """Rationale: tables looked for rays and pilots, which Mitsuba does not tell. Expected: a sweep
+    of `path` alone is reported and shown."""
+    preset = here / "project" / "presets" / "alone.toml"
+    head = PRESET.partition("[[integrator]]")[0]
+    preset.write_text(head + '[[integrator]]\ntype = "path"\n')
+    for words in (["sweep", "alone"], ["report", "alone"], ["page", "alone"]):
+        assert main([*words, "--project", "project"]) == 0
+    text = (here / "project" / "results" / "alone" / "README.md").read_text()
+    assert "| `room` |" in text and "efficiency.png" not in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("reference nowhere", "nowhere: failed: scene='nowhere' is neither a scene file nor the name of one"),
+        ("compare bdpt path --scenes nowhere", "give the path of an XML file, or put it into 'scenes'"),
+        ("equal-time rooom --project named", "or a name; there are room; did you mean room?"),
+        ("sweep nowhere", "nowhere"),
+        ("report nowhere", "run mitsuba-bdpt sweep PRESET -o nowhere"),
+        ("reference", "name a scene, or give --all"),
+        ("compare bdpt path --scenes wide.xml", "64 x 33 pixels at resolution=64"),
+        ("reference elsewhere/room.xml --project badly", "by='light' of [room] must be one of"),
+    ],
+)
+def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
+    """Expected: one line, a status that is not 0, no render."""
+    (here / "named" / "scenes").mkdir(parents=True)
+    (here / "named" / "scenes" / "room.xml").write_text(ROOM)
+    (here / "badly" / "references").mkdir(parents=True)
+    (here / "badly" / "references" / "scenes.toml").write_text('[room]\nby = "light"\n')
+    (here / "wide.xml").write_text(ROOM.format(height=33, sampler=""))
+    (here / "lamp.obj").write_text(LAMP)
+    words = words.split()
+    if "wide.xml" in words:
+        words += ["--resolution", "64"]
+    assert main(words) in (1, 2)
+    said = capsys.readouterr()
+    (line,) = (said.out + said.err).strip().splitlines()[-1:]
+    assert message in line
+
+
+def test_a_width_that_fits_is_named(here):
+    """Expected: the size that a scene has cannot be divided into tiles; the one that is advised can."""
+    file = here / "elsewhere" / "room.xml"
+    file.write_text(ROOM.format(height=36, sampler=""))
+    scene = SceneFile("room", file)
+    for resolution in (12, 20, 44):
+        with pytest.raises(ValueError, match="take resolution=") as refused:
+            making.check_size(making.Job(Project(here), scene, resolution))
+        advised = int(str(refused.value).partition("take resolution=")[2].rstrip("."))
+        making.check_size(making.Job(Project(here), scene, advised))
+
+
+@pytest.mark.parametrize("sampler", ["", STRATIFIED])
+def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
+    """Expected: without parameters in the file the film and the sampler are as asked for, the sampler with
+    the file's sample count; the picture is that of the file's own film, half as wide: pixels agree with
+    means of 2 x 2 ones (box filters and the same light: to the noise of 1024 samples)."""
+    file = here / "elsewhere" / "room.xml"
+    text = ROOM.format(height=32, sampler=sampler)
+    file.write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
+    scene = SceneFile("room", file)
+    loaded = scene.load(32, "multijitter")
+    sensor = loaded.sensors()[0]
+    assert [int(n) for n in sensor.film().size()] == [32, 16] == list(scene.size(32))
+    assert "Multijitter" in sensor.sampler().class_name()
+    assert sensor.sampler().sample_count() == (9 if sampler else 4)
+    whole = np.array(mi.render(scene.load(), spp=256))
+    small = np.array(mi.render(loaded, spp=1024))
+    means = whole.reshape(16, 2, 32, 2, 3).mean(axis=(1, 3))
+    assert np.abs(small - means).mean() < 0.05 * means.mean()
+    assert scene.max_depth == 4
+
+
+def test_recipes_say_what_makes_a_reference(here):
+    """Expected: `path` by recipe or by the command line, in place of `bdpt`; a radiance that is known."""
+    references = here / "project" / "references"
+    references.mkdir()
+    recipe = references / "scenes.toml"
+    words = ["reference", "elsewhere/room.xml", "--resolution", "8", "--spp", "1", "--seconds", "0"]
+    words += ["--project", "project"]
+
+    def maker(*more):
+        main([*words, *more])
+        return reference.read_reference(references / "room_8_4.exr").provenance["integrator"]
+
+    assert maker()["type"] == "bdpt"
+    recipe.write_text('[room]\nby = "path"\n')
+    (references / "room_8_4.exr").unlink()
+    assert maker()["type"] == "path"
+    (references / "room_8_4.exr").unlink()
+    assert maker("--by", "bdpt")["type"] == "bdpt"
+    recipe.write_text("[room]\nradiance = { limit = 1.0, lacks = 2.0 }\n")
+    assert maker() == "known answer"
+    assert (reference.read_reference(references / "room_8_4.exr").image == 0.875).all()
+    for wrong, message in (
+        ("windows = [[0, 0, 2, 1]]", "must be lists of four shares"),
+        ("radiance = { limit = 1.0 }", "must have the keys limit and lacks"),
+        ("window = 1", "window is not a key of"),
+    ):
+        recipe.write_text(f"[room]\n{wrong}\n")
+        with pytest.raises(ValueError, match=message):
+            making.Recipe.of(Project(here / "project"), "room")
+
+
+@pytest.mark.parametrize("command", measuring.COMMANDS)
+def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, capsys):
+    """Expected: one line that names what is missing and the extra, status 2; nothing of `measure` is imported
+    before."""
+    arguments = {
+        "sweep": ["x"],
+        "report": ["x"],
+        "page": ["x"],
+        "reference": ["x"],
+        "compare": ["bdpt", "path", "--scenes", "x"],
+        "equal-time": ["x"],
+        "pyramid": ["x"],
+        "fireflies": ["x"],
+    }[command]
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "scipy" else find(name))
+    assert main([command, *arguments]) == measuring.mistakes.STATUS
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line == f"error: {command} needs scipy; install them with: pip install 'mitsuba-bdpt[measure]'"
+
+
+def test_the_parser_needs_nothing_of_the_extra():
+    """Expected: the command line is declared, and rendering works, without any package of the extra."""
+    code = (
+        "import sys\n"
+        f"for name in {measuring.NEEDED!r}: sys.modules[name] = None\n"
+        "from mitsuba_bdpt.cli import render\n"
+        "from mitsuba_bdpt.cli.arguments import build_parser\n"
+        "build_parser().format_help()\n"
+        "assert not [name for name in sys.modules if name.startswith('mitsuba_bdpt.measure')]\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
+    """Expected: no traceback, and the exit status of an interrupted process."""
+    parsed = build_parser().parse_args(["report", "x"])
+    monkeypatch.setattr(parsed, "measuring", lambda options: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert measuring.run(parsed) == measuring.INTERRUPTED
+    assert capsys.readouterr().err == "interrupted; what was finished is kept\n"
+
+
+def test_the_frame_of_the_page_is_in_the_package():
+    """Expected: the file lies beside the module, where the wheel, which takes the whole package, has it."""
+    frame = importlib.resources.files("mitsuba_bdpt.measure").joinpath("page.html")
+    assert "@DATA@" in frame.read_text()
