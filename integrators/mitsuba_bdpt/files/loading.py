@@ -145,7 +145,8 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if node is not None:
         replace_integrator(state.nodes, node, options.integrator, overrides)
     mi.parser.transform_all(config, state)
-    scene = mi.parser.instantiate(config, state)
+    # The stub says object; `_check_root` has seen that it is a scene.
+    scene: mi.Scene = mi.parser.instantiate(config, state)  # pyright: ignore[reportAssignmentType]
     if node is not None:
         return scene, scene.integrator()
     kind = options.integrator or "bdpt"
@@ -243,7 +244,7 @@ def _in_words(error: str, options: Namespace) -> str | None:
         return f"{error}{_files_near(options.scene, missing[1])}"
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
     given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
-    if given:
+    if strange and given:
         return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
     other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
     if other and other[1] == options.integrator:

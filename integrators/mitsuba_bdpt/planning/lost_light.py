@@ -20,7 +20,7 @@ from ..geometry import rays
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..transport import bsdf
-from ..transport.kernel import Shared
+from ..transport.inputs import Shared
 from .possible import unreachable_paths
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
@@ -276,7 +276,7 @@ def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) 
     Where one has both, a coin decides. One kernel for both sides.
     """
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
-    last, adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
+    last, is_adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
 
     def body(walk, generator, ends):
         ray, weight = walk.ray, walk.weight
@@ -294,7 +294,7 @@ def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) 
         active = active & ~here & delta & (walk.edges < last)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
+        factor *= dr.select(is_adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
         active &= ~bsdf.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)

@@ -37,7 +37,8 @@ from ..sampling.points import Points
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
 from ..transport.counters import COUNTERS, Counters, one
-from ..transport.kernel import Kernel, trace
+from ..transport.inputs import Kernel
+from ..transport.kernel import trace
 from . import moments
 from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
