@@ -82,7 +82,8 @@ class Render:
         # Whether the first pass, of one sample, gives roulette the scale of the image; see `_steps`.
         self._small_first: bool | None = None
         self._error: float | None = None
-        self._state: tuple[tuple[int, ...], Progress, dict] | None = None  # of the newest report, see `_freeze`
+        # Of the newest report, see `_freeze`.
+        self._state: tuple[tuple[int, ...], Progress, dict] | None = None
 
     @property
     def passes(self) -> tuple[int, ...]:
