@@ -23,6 +23,7 @@ from mitsuba_bdpt.run import rendering  # isort: skip
 from mitsuba_bdpt.image import sink  # isort: skip
 from mitsuba_bdpt.transport import connections  # isort: skip
 from mitsuba_bdpt.transport.counters import Counters  # isort: skip
+from mitsuba_bdpt.transport.observer import Observer  # isort: skip
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -216,7 +217,7 @@ def stepwise():
         yield
 
 
-class Recorder:
+class Recorder(Observer):
     """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`: writes down contributions, and
     the vertices of the walks."""
 

@@ -96,31 +96,22 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     `Counters.summed`; nothing is evaluated yet.
     """
     sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(batch, sharing))
+    kernel = kernel.bound(points, _count_light(batch, sharing), Observer())
     index = dr.arange(mi.UInt32, sharing.lanes)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
 
-    def serve(slot, counters):
+    def serve(slot) -> Counters:
         active = slot < dr.opaque(mi.UInt32, batch.size)
-        return counters + _camera_subpath(kernel, sink, lane, slot, active)
+        return _camera_subpath(kernel, sink, lane, slot, active)
 
-    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
-    if not kernel.plan.light:
-        counters = serve(index, counters)
+    if kernel.plan.light:
+        of_camera = _serve_all(kernel, sharing, sharing.seat(index), serve)
     else:
-        seat = sharing.seat(index)
-        _, counters = dr.while_loop(
-            (mi.UInt32(0), counters),
-            lambda served, counters: served < kernel.camera_paths_per_light_path,
-            lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
-            label="camera subpaths of one light subpath",
-        )
-    return (of_light + counters).summed()
+        of_camera = serve(index)
+    return (of_light + of_camera).summed()
 
 
-def retrace(
-    kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot, observer: Observer | None = None
-):
+def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot, observer: Observer):
     """Trace some camera samples of a batch again, as `trace` does, and show an ``observer`` how.
 
     The samples of these ``slot``s (``UInt32``), with the light subpath of the lane that each is in. (For
@@ -211,8 +202,7 @@ def _emission(kernel, stream, shared):
         shared,
         mi.Bool(True),
     )
-    if kernel.observer is not None:
-        kernel.observer.emitted(e)
+    kernel.observer.emitted(e)
     return e
 
 
@@ -250,7 +240,22 @@ def _splat(kernel, sink, c, shared) -> Counters:
     return c.counted + sink.splat(kernel, c, shared)
 
 
-# -- a camera subpath -------------------------------------------------------------------------
+# -- its camera subpaths ----------------------------------------------------------------------
+
+
+@dr.syntax
+def _serve_all(kernel, sharing: Sharing, seat, serve) -> Counters:
+    """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
+    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
+    served = mi.UInt32(0)
+    while dr.hint(
+        served < kernel.camera_paths_per_light_path,
+        label="camera subpaths of one light subpath",
+        exclude=[kernel, sharing, seat, serve],
+    ):
+        counters = counters + serve(sharing.slot(seat, served))
+        served += 1
+    return counters
 
 
 def _camera_subpath(kernel, sink, lane: _Lane, slot, active) -> Counters:
