@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from unittest import mock
 
@@ -301,8 +301,7 @@ class Recorder(Observer):
         found = []
 
         def add(c, visible, total):
-            c.active = visible
-            found.append(c)
+            found.append(replace(c, active=visible))
             return total
 
         _, counted = connections.connect_all(traced, z, lane.path, total, add)

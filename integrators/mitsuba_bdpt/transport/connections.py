@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _roulette, _size, finite
+from .contribution import Contribution, finite, roulette, size_of, worth_a_ray
 from .counters import Counters, one
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
@@ -52,7 +52,7 @@ def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
         f_y.pdf_fwd_w * cos_z * inverse,
     )
     weight, shares = h.weigh(kernel.kappa.inner, light_side, camera_side)
-    active &= _counts(kernel, value, weight)
+    active &= worth_a_ray(kernel, value, weight)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
 
 
@@ -68,11 +68,11 @@ def connect_all(kernel, z: Vertex, path: LightPath, total, add):
     while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, add, candidates]):
         y = read_light_vertex(kernel, path, slot)
         c = finite(inner(kernel, z, y))
+        nonzero += one(c.active)
+        lost += c.counted.non_finite
         ray, own = _sight(kernel, z, y)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
         total = add(c, visible, total)
-        nonzero += one(c.active)
-        lost += c.counted.non_finite
         slot += 1
     counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
     return total, counted
@@ -87,9 +87,9 @@ def connect_one(kernel, z: Vertex, path: LightPath, stream):
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
     drawn = _draw(kernel, z, path, candidates, u)
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
-    value = (drawn.value / _size(drawn.value)) * drawn.total
+    value = (drawn.value / size_of(drawn.value)) * drawn.total
     active = drawn.total > 0
-    active, survival, rouletted = _roulette(kernel, value, drawn.u, active)
+    active, survival, rouletted = roulette(kernel, value, drawn.u, active)
     counted = rouletted + Counters(
         shadow_inner=one(active),
         evaluated=candidates,
@@ -139,7 +139,7 @@ def _draw(kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         y = read_light_vertex(kernel, path, slot)
         c = finite(inner(kernel, z, y))
         of_this = c.weighted()
-        size = _size(of_this)
+        size = size_of(of_this)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
         u_total = u * total

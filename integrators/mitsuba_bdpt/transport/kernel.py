@@ -218,7 +218,8 @@ def _light_walk(kernel, e, shared) -> Walk:
     # s = 0 is an older alternative, that of making y_0 by a hit.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
-    return Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, broken)
+    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
+    return replace(walk, broken=broken)
 
 
 def _light_side(kernel, e, stream, shared, walk) -> Side:

@@ -44,8 +44,8 @@ class Walk:
     active: object
 
     @staticmethod
-    def begin(kernel, pi, ray, previous, throughput, partial, active, broken=False) -> Walk:
-        """A subpath on its first edge; ``broken``: it has none, for want of a finite throughput."""
+    def begin(kernel, pi, ray, previous, throughput, partial, active) -> Walk:
+        """A subpath on its first edge."""
         return Walk(
             pi=pi,
             o=mi.Point3f(ray.o),
@@ -56,7 +56,7 @@ class Walk:
             eta=mi.Float(1) if kernel.refracts else 1,
             edges=mi.UInt32(1),
             seen=mi.Bool(False),
-            broken=mi.Bool(broken),
+            broken=mi.Bool(False),
             active=active,
         )
 
