@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress endurance mutants
+.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress same endurance mutants
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -66,6 +66,12 @@ sweep: $(INSTALLED)
 # What was tried to break it, under twenty minutes on two cores: docs/reports/stress.md.
 stress: $(INSTALLED)
 	$(VENV)/bin/python scripts/stress.py
+
+# Whether a change keeps all images: scenes and stress cases beside those of another checkout, whose record of
+# stress cases is of its own source. make same BEFORE=../before
+same: $(INSTALLED)
+	$(VENV)/bin/python scripts/versus.py $(BEFORE) --same --pairs 1 --spp 16
+	$(VENV)/bin/python scripts/stress.py --same $(wildcard $(BEFORE)/docs/stress.json $(BEFORE)/docs/reports/stress.json)
 
 # Planted bugs, and whether the tests see them: a few minutes.
 mutants: $(INSTALLED)

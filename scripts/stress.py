@@ -3,23 +3,28 @@
     python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress*
     python scripts/stress.py NAME ...    # some of them, printed
     python scripts/stress.py --list      # names of all
+    python scripts/stress.py --same ../before/docs/reports/stress.json   # the same as that record?
 
 Each case runs in a process of its own, so that a crash or a hang is an outcome too. Written are the record,
 docs/reports/stress.json; the tables of all cases, docs/reports/stress_cases.md; and between the lines
 `<!-- report: stress -->` and `<!-- end -->` of docs/reports/stress.md how many cases went as expected, and
 those that did not. Exit status 1 if one did not; one that can't be tried here (as this user, on this system)
-says so.
+says so. With ``--same`` nothing is written, and it is 1 as well if words or figures of a case differ from
+those of a record: what a change that must not change images is checked by, beside scripts/versus.py.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import re
 import subprocess
 import sys
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import repository
 from mitsuba_bdpt.cli.values import number
@@ -41,6 +46,11 @@ LIMIT = 1800
 
 # Cases at a time.
 JOBS = 2
+
+# Of a figure: what sums of floats in another order, and the digits that are shown, make of it.
+ROUNDING = 1e-2
+
+_NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?")
 
 # What is put before that which happened, by `Outcome.ok`.
 MARKS = {True: "", False: "**no**: ", None: "**not tried**: "}
@@ -138,6 +148,31 @@ def run(chosen: list[Case], jobs: int) -> list[dict]:
         return [futures[case.name].result() for case in chosen]
 
 
+def is_same(one: str, other: str) -> bool:
+    """Whether two texts have the same words, and figures within `ROUNDING` of each other."""
+    if _NUMBER.sub("#", one) != _NUMBER.sub("#", other):
+        return False
+    pairs = zip(_NUMBER.findall(one), _NUMBER.findall(other), strict=True)
+    return all(
+        math.isclose(*(float(text.replace(",", "")) for text in pair), rel_tol=ROUNDING) for pair in pairs
+    )
+
+
+def changes(record: list[dict], before: list[dict]) -> list[str]:
+    """What cases of a ``record`` did otherwise than ``before``, a line each.
+
+    Not those whose figures depend on the clock."""
+    known = {row["name"]: row["happened"] for row in before}
+    timed = {case.name for case in cases() if case.timed}
+    return [
+        f"{row['name']}: {row['happened']}\n    before: {known[row['name']]}"
+        for row in record
+        if row["name"] in known
+        and row["name"] not in timed
+        and not is_same(row["happened"], known[row["name"]])
+    ]
+
+
 def main(arguments=None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
@@ -150,6 +185,9 @@ def main(arguments=None) -> int:
     text = "cases at a time; much of one is compiling kernels, on one core (default: %(default)s)"
     parser.add_argument("--jobs", type=number(int, 1), default=JOBS, help=text)
     parser.add_argument("--list", action="store_true", help="print the names of all cases")
+    parser.add_argument(
+        "--same", type=Path, metavar="RECORD", help="fail unless figures are those of a record"
+    )
     parser.add_argument("--here", metavar="NAME", help=argparse.SUPPRESS)
     args = parser.parse_args(arguments)
     if unknown := {*args.names, *filter(None, [args.here])} - set(known):
@@ -163,9 +201,13 @@ def main(arguments=None) -> int:
         print(json.dumps({"ok": ok, "happened": outcome.happened}))
         return 0
     record = run([known[name] for name in args.names or known], args.jobs)
-    if not args.names:
+    changed = []
+    if args.same is not None:
+        changed = changes(record, json.loads(args.same.read_text()))
+        print("\n".join(changed) or f"{len(record)} cases as in {args.same}")
+    elif not args.names:
         write(record)
-    return 1 if any(row["ok"] is False for row in record) else 0
+    return 1 if changed or any(row["ok"] is False for row in record) else 0
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
 from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, light_path, mis, techniques
 from mitsuba_bdpt.transport.counters import Counters
+from mitsuba_bdpt.transport.observer import Observer
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------
@@ -516,7 +517,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         strategy_images=False,
         store_size=64,
         surfaces=True,
-        observer=None,
+        observer=Observer(),
         max_depth=u32(k),
         rr_depth=u32(10**6),
         last_stored=u32(k - 2 if k > 2 else 0),

@@ -743,6 +743,25 @@ def test_explain_says_what_is_lost(lamp, area, parameters, expected):
         assert re.search(pattern, line), text
 
 
+def test_connections_that_are_zero_are_those_of_either_way():
+    """Rationale: what a connection adds is counted as zero before its ray is traced, whoever adds up the
+    others. Expected: exactly as many whether all light vertices are joined or one is drawn, on the same
+    subpaths; and a ball in the way, so that some of the others are not visible.
+    """
+    lamp = {"type": "point", "position": [0, 1.5, 0]}
+    ball = {"type": "sphere", "bsdf": diffuse(), "to_world": mi.ScalarTransform4f().scale(0.5)}
+    wall = {"type": "sphere", "radius": 3, "bsdf": diffuse(), "flip_normals": True}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, "ball": ball, "wall": wall, "eye": sensor()})
+    found = []
+    for connections in ("all", "one"):
+        bdpt = integrator(max_depth=5, light_paths=1, connections=connections)
+        bdpt.render(scene, seed=1, spp=16)
+        found.append(bdpt.statistics["connections"])
+    assert found[0]["evaluated"] == found[1]["evaluated"] > 0
+    assert found[0]["zero"] == found[1]["zero"] < found[0]["evaluated"]
+    assert found[0]["traced"] == found[0]["evaluated"] - found[0]["zero"]
+
+
 # -- strategy images --------------------------------------------------------------------------
 
 

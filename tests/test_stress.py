@@ -70,3 +70,23 @@ def test_the_worst_of_several_is_told():
     assert "said of other" in outcome.happened and "said of one" not in outcome.happened
     outcome = worst(fine | {"wrong": Judged(False, "said of wrong", 1.0, 0.0)})
     assert not outcome.ok and "said of wrong" in outcome.happened and "said of other" not in outcome.happened
+
+
+def test_other_figures_are_seen(tmp_path, monkeypatch, capsys):
+    """Expected: exit status 0 beside a record of the same words and nearly the same figures, 1 if a figure is
+    off by 2 % or a word is another, unless the case's figures depend on the clock."""
+    happened = "means 1.234e-05 and 1,234.5 apart, 3 values not finite"
+    record = tmp_path / "record.json"
+    monkeypatch.setattr(stress, "apart", lambda name: stress.Outcome(True, happened))
+    timed = next(case.name for case in stress.cases() if case.timed)
+    plain = next(case.name for case in stress.cases() if not case.timed)
+    for name, before, status in (
+        (plain, happened, 0),
+        (plain, happened.replace("1,234.5", "1,234.6"), 0),
+        (plain, happened.replace("1,234.5", "1,260"), 1),
+        (plain, happened.replace("values", "pixels"), 1),
+        (timed, happened.replace("3", "4"), 0),
+    ):
+        record.write_text(json.dumps([{"name": name, "happened": before}]))
+        assert stress.main([name, "--same", str(record)]) == status
+    assert "before: means" in capsys.readouterr().out

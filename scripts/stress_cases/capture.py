@@ -25,6 +25,7 @@ from mitsuba_bdpt.measure.recording import stepwise
 from mitsuba_bdpt.transport import connections
 from mitsuba_bdpt.transport.counters import Counters
 from mitsuba_bdpt.transport.light_path import StoredVertex
+from mitsuba_bdpt.transport.observer import Observer
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.
@@ -83,7 +84,7 @@ def densities(si, to_light, to_camera):
     return forward, plugin.pdf(ctx, bsdf.with_wi(si, to_camera), to_light)
 
 
-class Capture:
+class Capture(Observer):
     """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer; `made` yields
     all paths."""
 
@@ -152,9 +153,6 @@ class Capture:
         if not side.adjoint and self.plan.direct:
             u = self.kernel.points.draw_2d("camera", self.stream, Purpose.EMITTER, vertex.edges)
             self._keep_endpoint(1, reached + 1, u)
-
-    def drawn(self, end):
-        """All connections are weighed, whichever is drawn, see `made`."""
 
     def _keep_endpoint(self, s, t, endpoint):
         dr.eval(endpoint)

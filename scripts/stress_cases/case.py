@@ -20,7 +20,8 @@ class Case:
     """Something tried: its ``name`` (lower case, words with hyphens, unique), the heading ``section`` of the
     table, what is ``tried`` and what is ``expected`` with the reason of every tolerance, in a few words of
     Markdown; ``run`` does it, in a process of its own with the variant ``llvm_ad_rgb`` set. ``quick`` cases,
-    of a few seconds each, are tests too."""
+    of a few seconds each, are tests too; figures of a ``timed`` one depend on the clock or the memory, and
+    differ from run to run."""
 
     name: str
     section: str
@@ -28,6 +29,7 @@ class Case:
     expected: str
     run: Callable[[], Outcome]
     quick: bool = False
+    timed: bool = False
 
 
 def of_section(section: str) -> Callable[..., Case]:

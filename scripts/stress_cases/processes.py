@@ -470,6 +470,7 @@ CASES = (
         "`points=sampler`, `skip=none` or plain",
         f"{STAYS}; 50 pilots",
         partial(_in_a_row, 1000, IN_TURN),
+        timed=True,
     ),
     _case(
         "scenes-400",
@@ -478,6 +479,7 @@ CASES = (
         "then "
         "compiles a kernel of `path`, too",
         partial(_scenes_in_a_row, 400),
+        timed=True,
     ),
     _case(
         "alternating-scenes-and-variants",
@@ -509,6 +511,7 @@ CASES = (
         "passes that were done (mean within a factor of 2: of 8 samples per pixel); then "
         f"{SAME}, by the same decision",
         partial(_interrupted, 12),
+        timed=True,
     ),
     _case(
         "two-processes",

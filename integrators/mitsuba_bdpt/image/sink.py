@@ -7,6 +7,8 @@ is done, ``splat`` for contributions with t <= 1. The last three return `Counter
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -40,8 +42,7 @@ class Image:
         if kernel.plan.connections == "all":
 
             def add(c, visible, total):
-                c.active = visible
-                return self.add(kernel, c, total, start, lane.shared)
+                return self.add(kernel, replace(c, active=visible), total, start, lane.shared)
 
             return connections.connect_all(kernel, z, lane.path, total, add)
         found, counted = connections.connect_one(kernel, z, lane.path, stream)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from unittest import mock
 
@@ -22,6 +22,7 @@ from ..image import sink
 from ..run import rendering
 from ..transport import connections, kernel
 from ..transport.counters import Counters
+from ..transport.observer import Observer
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -217,7 +218,7 @@ def stepwise():
         yield
 
 
-class Recorder:
+class Recorder(Observer):
     """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`: writes down contributions, and
     the vertices of the walks."""
 
@@ -301,8 +302,7 @@ class Recorder:
         found = []
 
         def add(c, visible, total):
-            c.active = visible
-            found.append(c)
+            found.append(replace(c, active=visible))
             return total
 
         _, counted = connections.connect_all(traced, z, lane.path, total, add)

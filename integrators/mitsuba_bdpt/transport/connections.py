@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _roulette, _size, finite
+from .contribution import Contribution, finite, roulette, size_of, worth_a_ray
 from .counters import Counters, one
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
@@ -50,32 +52,28 @@ def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
         f_y.pdf_fwd_w * cos_z * inverse,
     )
     weight, shares = h.weigh(kernel.kappa.inner, light_side, camera_side)
-    active &= _counts(kernel, value, weight)
+    active &= worth_a_ray(kernel, value, weight)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
 
 
+@dr.syntax
 def connect_all(kernel, z: Vertex, path: LightPath, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
     ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
     ``visible``: it is active and nothing is in between. Returns the ``total`` and `Counters`.
     """
-
-    def body(slot, total, nonzero, lost):
+    candidates = candidate_count(kernel, z, path)
+    slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, add, candidates]):
         y = read_light_vertex(kernel, path, slot)
         c = finite(inner(kernel, z, y))
-        nonzero = nonzero + one(c.active)
+        nonzero += one(c.active)
+        lost += c.counted.non_finite
         ray, own = _sight(kernel, z, y)
         visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
-        return slot + 1, add(c, visible, total), nonzero, lost + c.counted.non_finite
-
-    candidates = candidate_count(kernel, z, path)
-    _, total, nonzero, lost = dr.while_loop(
-        (mi.UInt32(0), total, mi.UInt32(0), mi.UInt32(0)),
-        lambda slot, *_: slot < candidates,
-        body,
-        label="inner connections",
-    )
+        total = add(c, visible, total)
+        slot += 1
     counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
     return total, counted
 
@@ -83,55 +81,78 @@ def connect_all(kernel, z: Vertex, path: LightPath, total, add):
 def connect_one(kernel, z: Vertex, path: LightPath, stream):
     """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
 
-    The draw is a running one over all candidates; the estimate is that of all of them. One random
-    number serves the whole draw: what is left of it after each decision is uniform again. Returns what it
-    adds to the sample, weighted, and `Counters`.
+    The estimate is that of all of them. Returns what it adds to the sample, weighted, and `Counters`.
     """
+    candidates = candidate_count(kernel, z, path)
+    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
+    drawn = _draw(kernel, z, path, candidates, u)
+    # In this order: the draw may hit a tiny one, for which total / size is infinite.
+    value = (drawn.value / size_of(drawn.value)) * drawn.total
+    active = drawn.total > 0
+    active, survival, rouletted = roulette(kernel, value, drawn.u, active)
+    counted = rouletted + Counters(
+        shadow_inner=one(active),
+        evaluated=candidates,
+        zero=candidates - drawn.nonzero,
+        non_finite=drawn.lost,
+    )
+    end, own = drawn.end, None
+    if kernel.shape_errors.small:
+        y = read_light_vertex(kernel, path, drawn.end)
+        ray, own = _sight(kernel, z, y)
+        end = y.si.p
+    else:
+        ray = rays.segment_to(z.anchor, end, z.si)
+    kernel.observer.drawn(end)
+    active &= ~rays.occluded(kernel.scene, ray, active, own)
+    return dr.select(active, value / survival, 0), counted
 
-    def body(slot, chosen, total, end, u, nonzero, lost):
+
+@dataclass
+class _Drawn:
+    """A draw among inner connections: the weighted ``value`` of the one drawn, the ``total`` size of all, the
+    ``end`` of the visibility ray to it (its slot, if `ShapeErrors.small`), what is left of the random number
+    ``u``, and how many are not zero, and ``lost`` for want of a finite value."""
+
+    value: object
+    total: object
+    end: object
+    u: object
+    nonzero: object
+    lost: object
+
+
+@dr.syntax
+def _draw(kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
+    """Draw one of the inner connections of ``z`` in proportion to its size.
+
+    The draw is a running one. One random number serves all of it: what is left of it after each decision is
+    uniform again.
+    """
+    small = kernel.shape_errors.small
+    slot, value, total = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0)
+    end = mi.UInt32(0) if small else mi.Point3f(z.si.p)
+    nonzero, lost = mi.UInt32(0), mi.UInt32(0)
+    while dr.hint(
+        slot < candidates, label="draw an inner connection", exclude=[kernel, z, path, candidates, small]
+    ):
         y = read_light_vertex(kernel, path, slot)
         c = finite(inner(kernel, z, y))
-        value = c.weighted()
-        size = _size(value)
+        of_this = c.weighted()
+        size = size_of(of_this)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
         u_total = u * total
         take = u_total < size
         rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
         u = dr.select(total > 0, rest, u)
-        chosen = dr.select(take, value, chosen)
+        value = dr.select(take, of_this, value)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
-        return slot + 1, chosen, total, end, u, nonzero + one(c.active), lost + c.counted.non_finite
-
-    candidates = candidate_count(kernel, z, path)
-    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
-    small = kernel.shape_errors.small
-    none = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0), mi.UInt32(0) if small else mi.Point3f(z.si.p)
-    _, chosen, total, end, u, nonzero, lost = dr.while_loop(
-        (*none, u, mi.UInt32(0), mi.UInt32(0)),
-        lambda slot, *_: slot < candidates,
-        body,
-        label="draw an inner connection",
-    )
-    # In this order: the draw may hit a tiny one, for which total / size is infinite.
-    value = (chosen / _size(chosen)) * total
-    active = total > 0
-    active, survival, rouletted = _roulette(kernel, value, u, active)
-    counted = rouletted + Counters(
-        shadow_inner=one(active), evaluated=candidates, zero=candidates - nonzero, non_finite=lost
-    )
-    own = None
-    if small:
-        y = read_light_vertex(kernel, path, end)
-        ray, own = _sight(kernel, z, y)
-        end = y.si.p
-    else:
-        ray = rays.segment_to(z.anchor, end, z.si)
-    if kernel.observer is not None:
-        kernel.observer.drawn(end)
-    active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return dr.select(active, value / survival, 0), counted
+        nonzero += one(c.active)
+        lost += c.counted.non_finite
+        slot += 1
+    return _Drawn(value, total, end, u, nonzero, lost)
 
 
 def _sight(kernel, z: Vertex, y: StoredVertex):

@@ -49,13 +49,13 @@ def finite(c: Contribution) -> Contribution:
     return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))
 
 
-def _roulette(kernel, value, u, active):
+def roulette(kernel, value, u, active):
     """Unbiased roulette on a weighted contribution before its visibility is tested.
 
     Returns where it survived, the probability of that, and `Counters`."""
     if not kernel.plan.roulette:
         return active, mi.Float(1), Counters()
-    size = _size(value)
+    size = size_of(value)
     # Not below the spacing of the random numbers, which are 0 more often than that; NaN goes on.
     survival = dr.clip(size * kernel.inverse_threshold, LEAST_SURVIVAL, 1)
     survival = dr.select(dr.isfinite(size), survival, 1)
@@ -63,12 +63,12 @@ def _roulette(kernel, value, u, active):
     return active & survived, survival, Counters(rouletted=one(active & ~survived))
 
 
-def _counts(kernel, value, weight):
+def worth_a_ray(kernel, value, weight):
     """Mask: a strategy of this ``value`` and weight is worth a ray, or has to be counted by `finite` (of what
     is not finite the weight may be 0). Technique images show unweighted ones too."""
     return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 
-def _size(value):
+def size_of(value):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
     return bsdf.brightest(value)

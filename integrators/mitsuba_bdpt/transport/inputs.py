@@ -63,9 +63,8 @@ class Kernel:
         self.camera_paths_per_light_path = u32(plan.camera_paths_per_light_path)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
-        self.observer = None
 
-    def bound(self, points, count_light: float, observer: Observer | None = None) -> Kernel:
+    def bound(self, points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
         camera subpath, which the estimates of t <= 1 are divided by (weights keep the nominal one)."""
         other = copy(self)

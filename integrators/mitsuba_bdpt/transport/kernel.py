@@ -96,31 +96,22 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     `Counters.summed`; nothing is evaluated yet.
     """
     sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(batch, sharing))
+    kernel = kernel.bound(points, _count_light(batch, sharing), Observer())
     index = dr.arange(mi.UInt32, sharing.lanes)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
 
-    def serve(slot, counters):
+    def serve(slot) -> Counters:
         active = slot < dr.opaque(mi.UInt32, batch.size)
-        return counters + _camera_subpath(kernel, sink, lane, slot, active)
+        return _camera_subpath(kernel, sink, lane, slot, active)
 
-    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
-    if not kernel.plan.light:
-        counters = serve(index, counters)
+    if kernel.plan.light:
+        of_camera = _serve_all(kernel, sharing, sharing.seat(index), serve)
     else:
-        seat = sharing.seat(index)
-        _, counters = dr.while_loop(
-            (mi.UInt32(0), counters),
-            lambda served, counters: served < kernel.camera_paths_per_light_path,
-            lambda served, counters: (served + 1, serve(sharing.slot(seat, served), counters)),
-            label="camera subpaths of one light subpath",
-        )
-    return (of_light + counters).summed()
+        of_camera = serve(index)
+    return (of_light + of_camera).summed()
 
 
-def retrace(
-    kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot, observer: Observer | None = None
-):
+def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot, observer: Observer):
     """Trace some camera samples of a batch again, as `trace` does, and show an ``observer`` how.
 
     The samples of these ``slot``s (``UInt32``), with the light subpath of the lane that each is in. (For
@@ -211,8 +202,7 @@ def _emission(kernel, stream, shared):
         shared,
         mi.Bool(True),
     )
-    if kernel.observer is not None:
-        kernel.observer.emitted(e)
+    kernel.observer.emitted(e)
     return e
 
 
@@ -228,7 +218,8 @@ def _light_walk(kernel, e, shared) -> Walk:
     # s = 0 is an older alternative, that of making y_0 by a hit.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
-    return Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, broken)
+    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
+    return replace(walk, broken=broken)
 
 
 def _light_side(kernel, e, stream, shared, walk) -> Side:
@@ -250,7 +241,22 @@ def _splat(kernel, sink, c, shared) -> Counters:
     return c.counted + sink.splat(kernel, c, shared)
 
 
-# -- a camera subpath -------------------------------------------------------------------------
+# -- its camera subpaths ----------------------------------------------------------------------
+
+
+@dr.syntax
+def _serve_all(kernel, sharing: Sharing, seat, serve) -> Counters:
+    """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
+    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
+    served = mi.UInt32(0)
+    while dr.hint(
+        served < kernel.camera_paths_per_light_path,
+        label="camera subpaths of one light subpath",
+        exclude=[kernel, sharing, seat, serve],
+    ):
+        counters = counters + serve(sharing.slot(seat, served))
+        served += 1
+    return counters
 
 
 def _camera_subpath(kernel, sink, lane: _Lane, slot, active) -> Counters:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Protocol
 
+class Observer:
+    """Is shown what the subpaths of a lane do while they are recorded; this one does nothing.
 
-class Observer(Protocol):
-    """Is shown what the subpaths of a lane do while they are recorded (`kernel.retrace`).
-
-    What it is given are arrays of Dr.Jit, which it must not change. In recorded loops they have no values
-    yet; who wants to read them turns `SymbolicLoops` and `SymbolicConditionals` off, so that loops run step
-    by step. Lanes whose subpath has ended keep the values of their last step, with ``active`` false.
+    `kernel.retrace` takes one. What it is given are arrays of Dr.Jit, which it must not change. In recorded
+    loops they have no values yet; who wants to read them turns `SymbolicLoops` and `SymbolicConditionals`
+    off, so that loops run step by step. Lanes whose subpath has ended keep the values of their last step,
+    with ``active`` false.
     """
 
     def emitted(self, emission):

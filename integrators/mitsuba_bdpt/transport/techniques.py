@@ -16,7 +16,7 @@ import mitsuba as mi
 from ..geometry import rays
 from ..sampling.points import Purpose
 from . import bsdf, mis
-from .contribution import Contribution, _counts, _roulette
+from .contribution import Contribution, roulette, worth_a_ray
 from .counters import Counters, one
 from .walk import Vertex, newest_coefficient
 
@@ -91,7 +91,7 @@ def next_event(kernel, z: Vertex) -> Contribution:
         e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
     )
     weight, shares = h.weigh(kernel.kappa.direct, light_side, camera_side)
-    active &= _counts(kernel, value, weight)
+    active &= worth_a_ray(kernel, value, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
@@ -128,7 +128,7 @@ def join_endpoints(kernel, emission, stream, active) -> Contribution:
         pdf_second = dr.select(covered, pdf_second, 0)
         camera_side = h.scale(h.start(pdf_second * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
-    active &= _counts(kernel, value, weight)
+    active &= worth_a_ray(kernel, value, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
     # From the sensor into the distance, for light from infinity.
@@ -167,11 +167,11 @@ def splat(kernel, y: Vertex, stream) -> Contribution:
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
     weight, shares = h.weigh(kernel.kappa.splat, light_side, camera_side)
-    active &= _counts(kernel, value, weight)
+    active &= worth_a_ray(kernel, value, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
-    active, survival, rouletted = _roulette(kernel, c.weighted(), u, active)
+    active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
     if kernel.plan.hide_emitters:
@@ -205,7 +205,7 @@ def hit_sensor(kernel, emission, y: Vertex, walk) -> Contribution:
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
-    active &= _counts(kernel, value, weight)
+    active &= worth_a_ray(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))

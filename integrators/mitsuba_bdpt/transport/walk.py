@@ -44,8 +44,8 @@ class Walk:
     active: object
 
     @staticmethod
-    def begin(kernel, pi, ray, previous, throughput, partial, active, broken=False) -> Walk:
-        """A subpath on its first edge; ``broken``: it has none, for want of a finite throughput."""
+    def begin(kernel, pi, ray, previous, throughput, partial, active) -> Walk:
+        """A subpath on its first edge."""
         return Walk(
             pi=pi,
             o=mi.Point3f(ray.o),
@@ -56,7 +56,7 @@ class Walk:
             eta=mi.Float(1) if kernel.refracts else 1,
             edges=mi.UInt32(1),
             seen=mi.Bool(False),
-            broken=mi.Bool(broken),
+            broken=mi.Bool(False),
             active=active,
         )
 
@@ -126,29 +126,24 @@ def not_finite(active, throughput, *directions):
     return active & ~finite
 
 
+@dr.syntax
 def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
 
     ``visit(vertex, state, walk)`` returns the new state; ``walk`` as it was before it arrived.
     """
-
-    def body(walk, state):
-        vertex = _vertex(kernel, side, walk)
-        step = _interact(kernel, side, walk, vertex, stream)
-        if kernel.observer is not None:
-            kernel.observer.vertex(side, walk, vertex, step)
-        state = visit(vertex, state, walk)
-        return _leave(kernel, side, walk, vertex, step, stream), state
-
-    if kernel.observer is not None:
-        kernel.observer.started(kernel, side, walk, stream)
-    walk, state = dr.while_loop(
-        (walk, state),
-        lambda walk, state: walk.active,
-        body,
+    kernel.observer.started(kernel, side, walk, stream)
+    while dr.hint(
+        walk.active,
         # Dr.Jit's kernel cache does not tell sizes of local memory apart; the label does.
         label=f"{side.name} subpath, {kernel.store_size} stored",
-    )
+        exclude=[kernel, side, stream, visit],  # what stays the same, see `Walk`
+    ):
+        vertex = _vertex(kernel, side, walk)
+        step = _interact(kernel, side, walk, vertex, stream)
+        kernel.observer.vertex(side, walk, vertex, step)
+        state = visit(vertex, state, walk)
+        walk = _leave(kernel, side, walk, vertex, step, stream)
     return state, walk
 
 
