@@ -33,7 +33,7 @@ class Halves:
                 self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
                 self.columns = list(kept["columns"])
                 whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
-                self.counts = kept["counts"] if "counts" in kept else whole
+                self.counts = kept.get("counts", whole)
                 self.sources = set(kept["sources"].tolist())
                 self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
         self.sources.add(source_digest())

@@ -335,10 +335,11 @@ class Recorder(Observer):
 
     def paths(self, i: int) -> list[Path]:
         """The paths of sample ``i``, those that add most first."""
-        found = []
-        for c in self.contributions:
-            if c["active"][i] and c["value"][:, i].any():
-                found.append(self._path(i, {name: x[..., i] for name, x in c.items()}))
+        found = [
+            self._path(i, {name: x[..., i] for name, x in c.items()})
+            for c in self.contributions
+            if c["active"][i] and c["value"][:, i].any()
+        ]
         return sorted(found, key=lambda path: -path.value.max())
 
     def _path(self, i: int, c) -> Path:

@@ -178,7 +178,7 @@ class Render:
         """The passes of `schedule` that are not done; under ``timeout`` cut to about a tenth of it."""
         if self._small_first is None:
             plan, decisions = self.plan, self.settings.decisions
-            known = self.planner.threshold is not None or decisions and decisions[0].first_pass == 0
+            known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
             self._small_first = bool(plan.roulette and plan.light and not known)
         earlier = sum(self.passes)
         for step in schedule(self.prepared.camera, self.spp, self.settings, self._small_first):
