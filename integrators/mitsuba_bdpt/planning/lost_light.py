@@ -70,14 +70,14 @@ class _Ends:
     travelled (of what is seen: the radius of its disk, see `_seen`), ``active``: there is such an end.
     """
 
-    p: object
-    n: object
-    through: object
-    weight: object
-    edges: object
-    distance: object
-    reflectance: object
-    active: object
+    p: mi.Point3f
+    n: mi.Normal3f
+    through: mi.Bool
+    weight: mi.UnpolarizedSpectrum
+    edges: mi.UInt32
+    distance: mi.Float
+    reflectance: mi.UnpolarizedSpectrum
+    active: mi.Bool
 
     def some(self):
         """Of the active ones `COMPARED` at most, evenly chosen.
@@ -104,11 +104,11 @@ class _Walk:
     """A subpath on its way: its ray, what it carries, its edges, the distance that it has come; whether it
     goes on."""
 
-    ray: object
-    weight: object
-    edges: object
-    distance: object
-    active: object
+    ray: mi.Ray3f
+    weight: mi.Spectrum
+    edges: mi.UInt32
+    distance: mi.Float
+    active: mi.Bool
 
 
 def is_possible(prepared, plan, settings) -> bool:

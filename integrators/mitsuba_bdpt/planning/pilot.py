@@ -115,7 +115,9 @@ class Pilot:
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
-        joined = total["joined"] + one(counted.shadow_inner > 0)
+        # Which `connect_all` has counted.
+        rays = counted.shadow_inner
+        joined = total["joined"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
         # In the order of `begin`, as a loop's state has to be.
         found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
         return total | found, counted
