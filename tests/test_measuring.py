@@ -260,7 +260,7 @@ def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
     """Expected: no traceback, and the exit status of an interrupted process."""
     parsed = build_parser().parse_args(["report", "x"])
     monkeypatch.setattr(parsed, "measuring", lambda options: (_ for _ in ()).throw(KeyboardInterrupt))
-    assert measuring.run(parsed) == measuring.INTERRUPTED
+    assert measuring.run(parsed) == measuring.mistakes.INTERRUPTED
     assert capsys.readouterr().err == "interrupted; what was finished is kept\n"
 
 

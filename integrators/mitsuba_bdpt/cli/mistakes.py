@@ -21,6 +21,10 @@ from collections.abc import Callable
 from ..errors import UnsupportedError, UsageError, message
 
 STATUS = 2
+"""The exit status after a mistake."""
+
+INTERRUPTED = 130
+"""The exit status of a process that SIGINT has ended."""
 
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
