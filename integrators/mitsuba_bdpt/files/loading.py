@@ -275,9 +275,12 @@ def _rejected(error: str, options: Namespace) -> str | None:
 
 
 def parameters(scene: Path) -> dict[str, str]:
-    """The parameters that ``-D`` can set in a scene file and those that it includes, with their defaults,
-    empty if there are none."""
-    found, files, done = {}, [scene], set()
+    """The parameters that ``-D`` can set in a scene file, with their defaults.
+
+    Those that the file, or one that it includes, uses: Mitsuba takes a default that nothing uses for a
+    mistake of the command line's. A default is empty if there is none.
+    """
+    used, defaults, files, done = [], {}, [scene], set()
     while files:
         file = files.pop(0)
         if file in done or not file.is_file():
@@ -288,14 +291,12 @@ def parameters(scene: Path) -> dict[str, str]:
         except ValueError:  # Mitsuba takes more for XML
             continue
         for element in there:
-            for value in element.attrib.values():
-                found |= {name: found.get(name, "") for name in re.findall(r"\$(\w+)", value)}
+            used += [name for value in element.attrib.values() for name in re.findall(r"\$(\w+)", value)]
             if element.tag == "default":
-                name = element.get("name", "")
-                found[name] = found.get(name) or element.get("value", "")
+                defaults.setdefault(element.get("name", ""), element.get("value", ""))
             if element.tag == "include":
                 files.append(scene.parent / element.get("filename", ""))
-    return found
+    return {name: defaults.get(name, "") for name in dict.fromkeys(used)}
 
 
 def plugins() -> list[str]:
