@@ -280,7 +280,7 @@ def parameters(scene: Path) -> dict[str, str]:
     Those that the file, or one that it includes, uses: Mitsuba takes a default that nothing uses for a
     mistake of the command line's. A default is empty if there is none.
     """
-    used, defaults, files, done = [], {}, [scene], set()
+    found, used, files, done = {}, set(), [scene], set()
     while files:
         file = files.pop(0)
         if file in done or not file.is_file():
@@ -291,12 +291,15 @@ def parameters(scene: Path) -> dict[str, str]:
         except ValueError:  # Mitsuba takes more for XML
             continue
         for element in there:
-            used += [name for value in element.attrib.values() for name in re.findall(r"\$(\w+)", value)]
+            names = [name for value in element.attrib.values() for name in re.findall(r"\$(\w+)", value)]
+            used |= set(names)
+            found |= {name: found.get(name, "") for name in names}
             if element.tag == "default":
-                defaults.setdefault(element.get("name", ""), element.get("value", ""))
+                name = element.get("name", "")
+                found[name] = found.get(name) or element.get("value", "")
             if element.tag == "include":
                 files.append(scene.parent / element.get("filename", ""))
-    return {name: defaults.get(name, "") for name in dict.fromkeys(used)}
+    return {name: default for name, default in found.items() if name in used}
 
 
 def plugins() -> list[str]:
