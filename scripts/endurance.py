@@ -31,8 +31,7 @@ from pathlib import Path
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import repository
-from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.cli.render import INTERRUPTED
+from mitsuba_bdpt.cli.mistakes import INTERRUPTED, answered
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_json, write_text
 from mitsuba_bdpt.measure import reference

@@ -260,7 +260,7 @@ def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
     """Expected: no traceback, and the exit status of an interrupted process."""
     parsed = build_parser().parse_args(["report", "x"])
     monkeypatch.setattr(parsed, "measuring", lambda options: (_ for _ in ()).throw(KeyboardInterrupt))
-    assert measuring.run(parsed) == measuring.INTERRUPTED
+    assert measuring.run(parsed) == measuring.mistakes.INTERRUPTED
     assert capsys.readouterr().err == "interrupted; what was finished is kept\n"
 
 
@@ -268,3 +268,12 @@ def test_the_frame_of_the_page_is_in_the_package():
     """Expected: the file lies beside the module, where the wheel, which takes the whole package, has it."""
     frame = importlib.resources.files("mitsuba_bdpt.measure").joinpath("page.html")
     assert "@DATA@" in frame.read_text()
+
+
+def test_a_default_that_nothing_uses_is_no_parameter(here):
+    """Rationale: Mitsuba refuses a value for a parameter that the file declares and does not use. Expected: a
+    scene file with such a ``resolution`` is loaded at any size all the same."""
+    file = here / "elsewhere" / "room.xml"
+    declared = '<default name="resolution" value="64"/>'
+    file.write_text(ROOM.format(height=32, sampler="").replace("<integrator", f"{declared}<integrator", 1))
+    assert SceneFile("room", file).size(16) == (16, 8)

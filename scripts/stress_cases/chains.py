@@ -156,7 +156,7 @@ class Recursion:
         return mis.scatter(self.h, partial, coefficient, step)
 
     def _along_light(self):
-        """Light subpath (kernel._light_subpath, walk._vertex and _leave): the partial sums at y_e = x_e,
+        """Light subpath (kernel._light_walk, walk._vertex and _leave): the partial sums at y_e = x_e,
         and those with which the last edge sets out."""
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * x.second)

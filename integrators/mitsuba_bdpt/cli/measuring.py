@@ -22,8 +22,6 @@ NEEDED = ("flip_evaluator", "matplotlib", "pyarrow", "scipy")
 RESOLUTION = 128
 """Width of a reference unless said, as in `measure.project`."""
 
-INTERRUPTED = 130
-
 WHOLE = number(int, 1)
 
 
@@ -33,7 +31,7 @@ def run(options: Namespace) -> int:
         return mistakes.answered(lambda: _run(options))
     except KeyboardInterrupt:
         print("interrupted; what was finished is kept", file=sys.stderr)
-        return INTERRUPTED
+        return mistakes.INTERRUPTED
 
 
 def _run(options: Namespace) -> int:

@@ -22,6 +22,10 @@ from typing import TypeVar
 from ..errors import UnsupportedError, UsageError, message
 
 STATUS = 2
+"""The exit status after a mistake."""
+
+INTERRUPTED = 130
+"""The exit status of a process that SIGINT has ended."""
 
 Status = TypeVar("Status", int, int | None)
 

@@ -22,6 +22,7 @@ from ..files.images import check_png, prepare_output, write_images
 from ..files.loading import check_file, choose_sensor, load
 from ..host.versions import versions
 from . import checkpoints, cluster
+from .mistakes import INTERRUPTED
 
 UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""
@@ -31,9 +32,6 @@ PASS_SPP = 16
 
 SETS = {"time": {"timeout"}, "target_error": {"target_error", "until_error", "variance"}}
 """The integrator's parameters that an option sets, see `loading.load`."""
-
-INTERRUPTED = 130
-"""The exit status of a process that SIGINT has ended."""
 
 
 @dataclass

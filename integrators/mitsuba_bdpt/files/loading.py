@@ -278,9 +278,12 @@ def _rejected(error: str, options: Namespace) -> str | None:
 
 
 def parameters(scene: Path) -> dict[str, str]:
-    """The parameters that ``-D`` can set in a scene file and those that it includes, with their defaults,
-    empty if there are none."""
-    found, files, done = {}, [scene], set()
+    """The parameters that ``-D`` can set in a scene file, with their defaults.
+
+    Those that the file, or one that it includes, uses: Mitsuba takes a default that nothing uses for a
+    mistake of the command line's. A default is empty if there is none.
+    """
+    found, used, files, done = {}, set(), [scene], set()
     while files:
         file = files.pop(0)
         if file in done or not file.is_file():
@@ -291,14 +294,15 @@ def parameters(scene: Path) -> dict[str, str]:
         except ValueError:  # Mitsuba takes more for XML
             continue
         for element in there:
-            for value in element.attrib.values():
-                found |= {name: found.get(name, "") for name in re.findall(r"\$(\w+)", value)}
+            names = [name for value in element.attrib.values() for name in re.findall(r"\$(\w+)", value)]
+            used |= set(names)
+            found |= {name: found.get(name, "") for name in names}
             if element.tag == "default":
                 name = element.get("name", "")
                 found[name] = found.get(name) or element.get("value", "")
             if element.tag == "include":
                 files.append(scene.parent / element.get("filename", ""))
-    return found
+    return {name: default for name, default in found.items() if name in used}
 
 
 def plugins() -> list[str]:
