@@ -72,6 +72,6 @@ def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool
     return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 
-def size_of(value: mi.Spectrum) -> mi.Float:
+def size_of(value: mi.Spectrum):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
     return bsdf.brightest(value)

@@ -23,12 +23,12 @@ class Coefficients:
     """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`; the Python
     number 0 for classes that are not in use."""
 
-    hit: mis.Coefficient
-    direct: mis.Coefficient
-    splat: mis.Coefficient
-    endpoints: mis.Coefficient
-    arrival: mis.Coefficient
-    inner: mis.Coefficient
+    hit: mi.Float | mi.Vector4f | int
+    direct: mi.Float | mi.Vector4f | int
+    splat: mi.Float | mi.Vector4f | int
+    endpoints: mi.Float | mi.Vector4f | int
+    arrival: mi.Float | mi.Vector4f | int
+    inner: mi.Float | mi.Vector4f | int
 
 
 @dataclass

@@ -34,6 +34,7 @@ from ..settings import HEURISTICS
 
 if TYPE_CHECKING:
     # One number, under `ByClass` one for each class; the Python number 0 for classes that are not in use.
+    # (Records that loops carry write it out: Dr.Jit evaluates their annotations.)
     PartialSum = mi.Float | mi.Vector4f | int
     Coefficient = PartialSum
 
@@ -49,8 +50,8 @@ SATURATION = 1e37
 class Partial:
     """Partial sums of one subpath; see the module's description."""
 
-    d_vcm: PartialSum
-    d_vc: PartialSum
+    d_vcm: mi.Float | mi.Vector4f | int
+    d_vc: mi.Float | mi.Vector4f | int
 
 
 def is_absent(x) -> bool:

@@ -114,7 +114,7 @@ class Side:
     reference: mi.Float
     adjoint: bool
     last_edge: mi.UInt32
-    coefficient: mis.Coefficient
+    coefficient: mi.Float | mi.Vector4f | int
     complete: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Float] | None = None
     alpha: bool = False
     parallel: bool = False
