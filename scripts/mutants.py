@@ -72,8 +72,8 @@ MUTANTS = (
     Mutant(
         "pilots of an edited scene",
         "planning/findings.py",
-        "key = self._scene_state(), key",
-        "pass",
+        "(self._scene_state(), key), look",
+        "key, look",
         ("tests/test_edits.py::test_edits_are_seen",),
     ),
     Mutant(

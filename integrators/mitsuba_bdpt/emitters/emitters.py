@@ -40,7 +40,7 @@ class Emitters:
     where light subpaths from infinity start, if any do; ``shape_errors`` of the scene, for rays.
     """
 
-    def __init__(self, scene):
+    def __init__(self, scene: mi.Scene):
         self.scene = scene
         self.shape_errors = rounding.ShapeErrors(scene)
         emitters = scene.emitters()
@@ -85,7 +85,9 @@ class Emitters:
         far = sum(w for w, t in of_groups if t.at_infinity)
         self.far_share = far / sum(w for w, t in of_groups if t.supports_emission) if far > 0 else 0.0
         self.evaluated = any(needs_evaluation(name) for name in registered_emitters())
-        self.left_out = [text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)]
+        self.left_out: list[tuple[str, str]] = [
+            text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)
+        ]
 
     def _cannot_be_asked(self) -> bool:
         """Whether `sample_position` cannot be called on emitters: a call visits every living one, those of
@@ -105,7 +107,7 @@ class Emitters:
 
     # -- selection and dispatch -------------------------------------------------------------
 
-    def _select(self, u: mi.Float, active: mi.Bool) -> tuple[Chosen, mi.Float]:
+    def _select(self, u, active: mi.Bool):
         """Choose an emitter; also returns the reused part of ``u``."""
         index = mi.UInt32(0)
         if self.count > 1:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from .introspection import all_parameters
@@ -24,11 +27,11 @@ class State:
     ``kept``: what is known by its number.
     """
 
-    marks: tuple
-    kept: tuple = field(compare=False, repr=False)
+    marks: tuple[Any, ...]
+    kept: tuple[Any, ...] = field(compare=False, repr=False)
 
     @classmethod
-    def of(cls, owners) -> State:
+    def of(cls, owners: Iterable[mi.Object]) -> State:
         """The present state of ``owners`` and of all that they hold."""
         marks, kept = [], []
         for value in all_parameters(owners):

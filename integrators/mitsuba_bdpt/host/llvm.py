@@ -163,7 +163,7 @@ def wheel_libraries(prefix: Path) -> list[Path]:
 
 def system_libraries(directories: Iterable[Path]) -> list[Path]:
     """The libLLVM files in `directories`, every file once."""
-    found = []
+    found: list[Path] = []
     for directory in directories:
         names = sorted(directory.glob("libLLVM*")) if directory.is_dir() else []
         found += [path for path in names if _LIBRARY.fullmatch(path.name)]
@@ -217,7 +217,7 @@ def _versions() -> str:
 
 def _describe(paths: Iterable[Path]) -> str:
     """Name the libraries that were found and why none of them is taken."""
-    texts = []
+    texts: list[str] = []
     for path in paths:
         version = major_version(path)
         if version is None:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from functools import cache
+from typing import Any, TypeVar
 
 import mitsuba as mi
 
@@ -19,8 +21,10 @@ FINDINGS = 16
 
 _scenes: OrderedDict[int, tuple] = OrderedDict()
 
+Found = TypeVar("Found")
 
-def notes(scene, sensor) -> dict:
+
+def notes(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, Any]:
     """A dictionary that belongs to ``scene`` as long as it lives; ``sensor`` is one that it is rendered with.
 
     A scene cannot be referred to weakly, and one that is kept alive would take part in the virtual calls of
@@ -50,7 +54,9 @@ def _alone() -> int:
     return _references((mi.load_dict({"type": "box"}), {}))
 
 
-def remembered(scene, sensor, kind: str, key, find):
+def remembered(
+    scene: mi.Scene, sensor: mi.Sensor, kind: str, key: Hashable, find: Callable[[], Found]
+) -> tuple[Found, bool]:
     """Return what ``find()`` returned for this ``key``, and whether it is remembered from an earlier call.
 
     Of each ``kind`` the latest `FINDINGS` are kept.
@@ -63,7 +69,7 @@ def remembered(scene, sensor, kind: str, key, find):
     return found, is_known
 
 
-def warn_once(scene, sensor, text: str, about=None):
+def warn_once(scene: mi.Scene, sensor: mi.Sensor, text: str, about: Hashable = None):
     """Log a warning, unless it was logged for the ``scene`` before.
 
     The same warning is one of the same ``text``, or one ``about`` the same where the text has numbers that

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 from ..settings import Settings
+from ..transport.bsdf import Traits
 from ..transport.plan import Plan
 
 # Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
@@ -42,7 +43,7 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 
-def least_samples(traits) -> int:
+def least_samples(traits: Traits) -> int:
     """How many samples a render needs for a pilot; `bsdf.Traits` of its scene."""
     return LEAST_OF_MANY if traits.asked.many else LEAST_SAMPLES
 

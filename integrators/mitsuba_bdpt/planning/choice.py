@@ -7,6 +7,7 @@ not timed (see `costs`), so that the same seed leads to the same decision on eve
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,7 +125,7 @@ def _without_doubtful(table: list[Prediction], uniform: bool) -> list[Prediction
     """
     usual, gain = (SKY_DIRECT, UNIFORM_GAIN) if uniform else (1, DIRECT_GAIN)
 
-    def is_usual(candidate):
+    def is_usual(candidate: Configuration) -> bool:
         return bool(candidate.light_paths) or candidate.kappa_direct == usual
 
     alone = (row.variance for row in table if not row.candidate.light_paths and is_usual(row.candidate))
@@ -132,7 +133,7 @@ def _without_doubtful(table: list[Prediction], uniform: bool) -> list[Prediction
     return [row for row in table if is_usual(row.candidate) or row.variance <= most]
 
 
-def _put_first(table: list, row):
+def _put_first(table: list[Prediction], row: Prediction):
     table.remove(row)
     table.insert(0, row)
 
@@ -153,7 +154,7 @@ def certainty(moments: Moments, alternatives: Alternatives) -> float:
     return agree / RESAMPLINGS
 
 
-def _trimmed_mean(draw):
+def _trimmed_mean(draw: np.ndarray) -> np.ndarray:
     """What the draw of a connection adds: the mean of the groups but for the largest quarter.
 
     Few samples show its outliers (the unshadowed 1 / dist^2), but not yet those of all else, beside which
@@ -163,7 +164,7 @@ def _trimmed_mean(draw):
     return np.broadcast_to(calm, draw.shape)
 
 
-def _robust_mean(values):
+def _robust_mean(values: np.ndarray) -> np.ndarray:
     """Mean over the groups (rows), of which the worst quarter counts as much as the next one.
 
     Each is scaled down until the candidate (column) that suffers least there does so. An outlier that no
@@ -182,10 +183,13 @@ def _robust_mean(values):
     return (values * scale[:, None]).mean(axis=0)
 
 
-def left_out(table: list[Prediction]) -> list[dict]:
+def left_out(table: list[Prediction]) -> list[dict[str, str]]:
     """What the best of `choose` does without, and why, as in ``statistics["skipped"]``."""
-    skipped = []
-    without = {"t<=1": lambda c: not c.light_paths, "inner": lambda c: c.connections == "none"}
+    skipped: list[dict[str, str]] = []
+    without: dict[str, Callable[[Configuration], bool]] = {
+        "t<=1": lambda c: not c.light_paths,
+        "inner": lambda c: c.connections == "none",
+    }
     for name, lacks in without.items():
         others = [row for row in table if not lacks(row.candidate)]
         if others and lacks(table[0].candidate):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 from .configuration import Configuration
 
@@ -29,7 +30,7 @@ FIXED = {"start": 180e3, "light": 250e3, "inner": 20e3}
 FEW_BSDFS, MANY_BSDFS = 4, 16
 
 
-def cost(candidate: Configuration, rays: dict, samples: float = math.inf) -> float:
+def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = math.inf) -> float:
     """Cost of a sample in a render of so many ``samples``; that of path tracing alone is 1.
 
     What is `FIXED` is included. ``rays`` per sample of the pilot, see `moments.Moments`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from typing import Any, TypeGuard
 
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
@@ -34,20 +35,22 @@ class Decision(Configuration):
     mean: float
 
     @classmethod
-    def of(cls, chosen: Configuration, first_pass: int, **predicted: float) -> Decision:
+    def of(
+        cls, chosen: Configuration, first_pass: int, *, cost: float, variance: float, mean: float
+    ) -> Decision:
         """The decision for a configuration of which ``cost``, ``variance`` and ``mean`` are predicted.
 
         They have six digits: further ones depend on the order in which a pilot's lanes were added up.
         """
-        predicted = {name: float(f"{number:.6g}") for name, number in predicted.items()}
-        return cls(**asdict(chosen), first_pass=first_pass, **predicted)
+        cost, variance, mean = (float(f"{number:.6g}") for number in (cost, variance, mean))
+        return cls(**asdict(chosen), first_pass=first_pass, cost=cost, variance=variance, mean=mean)
 
     @property
     def threshold(self) -> float:
         """The size below which contributions play roulette."""
         return self.mean * min(MOST_ROULETTE, ROULETTE_PER_VARIANCE * self.variance)
 
-    def record(self) -> dict:
+    def record(self) -> dict[str, Any]:
         """As in ``statistics["decisions"]``."""
         return {
             "pass": self.first_pass,
@@ -66,10 +69,11 @@ def read_decisions(text: str) -> tuple[Decision, ...]:
     An empty list means a render without a pilot. Raises `UsageError` saying what is wrong, and in which
     entry.
     """
-    where, made = "", []
+    where = ""
+    made: list[Decision] = []
     try:
         entries = json.loads(text)
-        if not isinstance(entries, list):
+        if not _is_list(entries):
             raise TypeError("a list of decisions is needed")
         for number, entry in enumerate(entries):
             where = f"entry {number}"
@@ -87,8 +91,17 @@ def read_decisions(text: str) -> tuple[Decision, ...]:
         ) from error
 
 
-def _read_decision(entry: dict) -> Decision:
-    if not isinstance(entry, dict) or not isinstance(entry.get("coefficients", {}), dict):
+def _is_list(value: Any) -> TypeGuard[list[Any]]:
+    return isinstance(value, list)
+
+
+def _is_object(value: Any) -> TypeGuard[dict[str, Any]]:
+    """Whether a value of JSON is an object."""
+    return isinstance(value, dict)
+
+
+def _read_decision(entry: Any) -> Decision:
+    if not _is_object(entry) or not _is_object(entry.get("coefficients", {})):
         raise TypeError(f"{entry!r} is no decision")
     light_paths, connections = _number(entry, "light_paths"), entry["connections"]
     if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
@@ -97,22 +110,22 @@ def _read_decision(entry: dict) -> Decision:
         raise ValueError(f"connections={connections!r} without light paths")
     if unknown := set(entry) - set(ENTRIES):
         raise ValueError(f"{min(unknown)} is no part of a decision")
-    if isinstance(entry["pass"], bool) or not isinstance(entry["pass"], int):
-        raise TypeError(f"pass={entry['pass']!r}")
+    first_pass = entry["pass"]
+    if isinstance(first_pass, bool) or not isinstance(first_pass, int):
+        raise TypeError(f"pass={first_pass!r}")
     numbers = {
-        "first_pass": entry["pass"],
         "kappa_light": _number(entry["coefficients"], "t<=1"),
         "kappa_direct": _number(entry["coefficients"], "s=1"),
         **{name: _number(entry, name) for name in ("cost", "variance", "mean")},
     }
-    for name, value in numbers.items():
+    for name, value in {"first_pass": first_pass, **numbers}.items():
         least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
         if not least <= value <= LARGEST:
             raise ValueError(f"{name}={value!r}")
-    return Decision(light_paths=light_paths, connections=connections, **numbers)
+    return Decision(light_paths=light_paths, connections=connections, first_pass=first_pass, **numbers)
 
 
-def _number(entry: dict, name: str) -> float:
+def _number(entry: dict[str, Any], name: str) -> float:
     """A number of JSON: neither a boolean, which Python takes for one, nor text that holds one."""
     value = entry[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -120,7 +133,7 @@ def _number(entry: dict, name: str) -> float:
     return float(value)
 
 
-def replayed(decision: Decision) -> list[dict]:
+def replayed(decision: Decision) -> list[dict[str, str]]:
     """What a replayed decision leaves out, as in ``statistics["skipped"]``."""
     names = ["t<=1"] * (not decision.light_paths) + ["inner"] * (decision.connections == "none")
     return [{"class": name, "level": "by hand", "why": "decisions"} for name in names]

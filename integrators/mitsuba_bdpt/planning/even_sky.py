@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
 from .budget import CHEAP_SAMPLES
@@ -23,7 +24,7 @@ EVEN = 100
 SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_GAIN = 1 / 2, 2, 1 << 20, 1.1
 
 
-def decision(prepared, full: Plan, settings: Settings, samples: int) -> Decision | None:
+def decision(prepared: PreparedScene, full: Plan, settings: Settings, samples: int) -> Decision | None:
     """The decision for a render of so many ``samples`` for which the scene alone suffices.
 
     A pilot would take too much of it: under an even sky, path tracing alone. (Camera subpaths meet such a sky

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
-from .choice import LIGHT_GAIN
+from .choice import LIGHT_GAIN, Prediction
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 _STARTS = {Start.DELTA_EMITTER: "delta emitter, delta surfaces", Start.BEAM: "directionalarea"}
@@ -31,7 +32,12 @@ def subpaths(count: int) -> str:
 
 
 def explain(
-    prepared, p: Plan, settings: Settings, table, certainty: float = 0.0, lost_by_pilot: int = 0
+    prepared: PreparedScene,
+    p: Plan,
+    settings: Settings,
+    table: list[Prediction],
+    certainty: float = 0.0,
+    lost_by_pilot: int = 0,
 ) -> str:
     """Text about the strategies in use and those that are skipped.
 
@@ -69,7 +75,7 @@ def explain(
     return "\n".join(lines + _pilot(settings, table, certainty))
 
 
-def _pilot(settings: Settings, table, certainty: float) -> list[str]:
+def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> list[str]:
     """What the pilot found: the best of each combination and number of light subpaths."""
     if not table:
         return []
@@ -78,7 +84,7 @@ def _pilot(settings: Settings, table, certainty: float) -> list[str]:
         "what points take off it):"
     )
     lines = [head]
-    shown = set()
+    shown: set[tuple[str, str, int]] = set()
     for row in table:
         candidate = row.candidate
         key = candidate.weighting.combination, candidate.connections, candidate.camera_paths_per_light_path

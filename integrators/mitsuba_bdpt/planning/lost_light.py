@@ -19,8 +19,11 @@ import numpy as np
 from ..geometry import rays
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
+from ..scene.prepared import PreparedScene
+from ..settings import Settings
 from ..transport import bsdf
 from ..transport.inputs import Shared
+from ..transport.plan import Plan
 from .possible import unreachable_paths
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
@@ -111,12 +114,12 @@ class _Walk:
     active: mi.Bool
 
 
-def is_possible(prepared, plan, settings) -> bool:
+def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
     return not plan.arrival and bool(unreachable_paths(prepared, plan, settings))
 
 
-def lost_radiance(prepared, plan, max_depth: int) -> dict[int, float]:
+def lost_radiance(prepared: PreparedScene, plan: Plan, max_depth: int) -> dict[int, float]:
     """Mean radiance over the film that is lost, by the index of the emitter.
 
     ``max_depth`` see `Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says
@@ -158,7 +161,7 @@ def _warn_of_not_finite(prepared, indices):
     warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
-def in_words(prepared, plan, shares: dict[int, float]) -> str:
+def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float]) -> str:
     """What is missing, and what to do, if it is `WORTH_A_WORD`; else empty.
 
     ``shares`` of the image's light by the index of the emitter.

@@ -7,6 +7,7 @@ Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. T
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -60,10 +61,10 @@ class Moments:
     draw: np.ndarray
     gain: np.ndarray
     mean: float
-    rays: dict
+    rays: dict[str, float]
     lanes: int
 
-    def variance(self, draw, stratified: bool = False) -> np.ndarray:
+    def variance(self, draw: np.ndarray | float, stratified: bool = False) -> np.ndarray:
         """Relative variance per sample, shape (`GROUPS`, 2, weightings).
 
         First what does not depend on S, ``draw`` (`Moments.draw`, or 0 for all connections) included, then
@@ -79,7 +80,7 @@ class Moments:
             base = self.rare + self._left_by_points() * (base - self.rare)
         return np.stack([base + draw, self.light], axis=1)
 
-    def _left_by_points(self):
+    def _left_by_points(self) -> np.ndarray:
         """What the points of a pixel leave of the variance, by weighting.
 
         Of what nets of `NET` leave, see `OWN_GAIN`, what 64 leave. (Fitted to pilots with nets of 64 points
@@ -91,7 +92,7 @@ class Moments:
         gain = self.gain**OWN_GAIN * common ** (1 - OWN_GAIN)
         return gain ** (1.35 + gain)
 
-    def of(self, groups) -> Moments:
+    def of(self, groups: np.ndarray) -> Moments:
         """The moments of these of its groups, by number."""
         return replace(self, **{n: getattr(self, n)[groups] for n in _OF_GROUPS})
 
@@ -99,7 +100,7 @@ class Moments:
         """This pilot and another, of which each counts by its number of ``lanes``."""
         share = self.lanes / (self.lanes + other.lanes)
 
-        def mean(a, b):
+        def mean(a: Any, b: Any) -> Any:
             return share * a + (1 - share) * b
 
         rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
@@ -148,7 +149,7 @@ def group(lane):
     return lane // PER_PIXEL % GROUPS
 
 
-def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) -> Moments:
+def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict[str, float]) -> Moments:
     """The moments of a pilot of independent ``samples``, and ``nets``.
 
     ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample.
@@ -162,7 +163,7 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
     weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
     of_sample = inverse[groups % 2, samples.tile][:, None]
 
-    def summed(values, of_splats=None):
+    def summed(values: np.ndarray | None, of_splats: str | None = None) -> np.ndarray:
         """By group, one column per weighting: those that have no use for ``values`` come first."""
         total = SPLAT.of(weighted, of_splats) if of_splats else weighted[:, :0]
         if values is not None:
@@ -185,12 +186,12 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict) 
     )
 
 
-def _other(estimate):
+def _other(estimate: np.ndarray) -> np.ndarray:
     """For each sample another one of its pixel."""
     return estimate.reshape(-1, PER_PIXEL, estimate.shape[1])[:, ::-1].reshape(estimate.shape)
 
 
-def _by_group(values):
+def _by_group(values: np.ndarray) -> np.ndarray:
     """Sums of the samples' ``values`` by group, shape (`GROUPS`, columns)."""
     whole = -(-len(values) // (GROUPS * PER_PIXEL)) * GROUPS * PER_PIXEL
     padded = np.zeros((whole, values.shape[1]))
@@ -198,7 +199,7 @@ def _by_group(values):
     return padded.reshape(-1, GROUPS, PER_PIXEL, values.shape[1]).sum(axis=(0, 2))  # see `group`
 
 
-def _norms(samples: Samples, half, splats):
+def _norms(samples: Samples, half: np.ndarray, splats: np.ndarray) -> np.ndarray:
     """What squared errors are divided by, of each fine tile.
 
     The squared brightness, and a hundredth of that of the image, as relMSE has it.
@@ -220,32 +221,32 @@ def _norms(samples: Samples, half, splats):
     first = (coarse**2 + floor).ravel()[samples.tile]
     noise = np.sum(square / np.where(first > 0, first, np.inf)) / len(last)
     least = 2 * max(noise, 1e-3)
-    norms = []
+    found: list[np.ndarray] = []
     for other in (1, 0):
         near = _with_neighbours(counts[other])
         own = _with_neighbours(sums[other]) / np.maximum(near, 1)
         own += 2 * _with_neighbours(splats[other]) / _with_neighbours(np.ones_like(coarse))
         brightness = (near * own + least * coarse) / (near + least)
-        norms.append(brightness**2 + floor)
-    norms = np.stack(norms).reshape(2, -1)
+        found.append(brightness**2 + floor)
+    norms = np.stack(found).reshape(2, -1)
     return np.where(norms > 0, norms, np.inf)
 
 
-def _over_blocks(values):
+def _over_blocks(values: np.ndarray) -> np.ndarray:
     """Sums over the larger tiles, in place of each fine one."""
     many = FINE // TILES
     blocks = values.reshape(TILES, many, TILES, many).sum(axis=(1, 3))
     return np.kron(blocks, np.ones((many, many)))
 
 
-def _with_neighbours(values):
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
     """Sums over squares of 3 x 3 tiles."""
     padded = np.pad(values, 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
 
 
-def _gain(estimate, inverse):
+def _gain(estimate: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Variance of a sample among points of a net over that of an independent one, by weighting; 1 at most.
 
     ``estimate`` of the samples in nets, ``inverse`` of the norm of their places. The square of the difference

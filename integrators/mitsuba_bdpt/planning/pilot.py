@@ -34,11 +34,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..sampling.points import Points
+from ..scene.prepared import PreparedScene
+from ..settings import Settings
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
 from ..transport.counters import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
+from ..transport.plan import Plan
 from . import moments
 from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
@@ -215,7 +218,14 @@ class Pilot:
         return xy.y * FINE + xy.x
 
 
-def measure(prepared, plan, settings, seed, lanes: int, stands_for: float = RAREST) -> Moments:
+def measure(
+    prepared: PreparedScene,
+    plan: Plan,
+    settings: Settings,
+    seed: mi.UInt32,
+    lanes: int,
+    stands_for: float = RAREST,
+) -> Moments:
     """Run a pilot of about ``lanes`` camera samples, spread over the image.
 
     Each of them ``stands_for`` so many of the render.

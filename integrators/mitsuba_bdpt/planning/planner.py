@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import mitsuba as mi
 
 from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
+from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
 from . import budget, choice, even_sky, pilot
@@ -67,13 +69,13 @@ class Planner:
     # whose choices have the least time times error in the scenes of docs/reports/choices.json.)
     pilot_seed = 30
 
-    def __init__(self, prepared, settings: Settings, spp: int, findings: Findings):
+    def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: Findings):
         self._prepared, self._settings, self._spp, self._findings = prepared, settings, spp, findings
         self._pixels = int(prepared.camera.region.size.prod())
         self.full = self.plan = budget.first_plan(plan(prepared, settings), settings, self._pixels)
         self.threshold, self.changes, self.decided = None, 0, Decided()
 
-    def begin(self, passes: tuple) -> bool:
+    def begin(self, passes: tuple[int, ...]) -> bool:
         """Adopt what the scene alone decides, before the first pass.
 
         Returns whether a pilot is to be asked about what is still to come.
@@ -146,7 +148,7 @@ class Planner:
     def _lost(self, p: Plan):
         return unreachable_paths(self._prepared, p, self._settings)
 
-    def adopt(self, decision: Decision, left_out):
+    def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on.
 
         If that differs from before, with points of their own: lanes serve other samples, and what was half

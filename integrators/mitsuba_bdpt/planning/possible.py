@@ -5,22 +5,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from ..emitters.emitters import Emitters
+from ..scene.prepared import PreparedScene
+from ..sensors.records import Sensor
 from ..settings import DEFAULT_STORED, Settings
 from ..transport.plan import Plan
 
 
-def plan(prepared, settings: Settings) -> Plan:
+def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     """Decide from the scene alone what is impossible, and apply the parameters given by hand."""
     emitters, camera = prepared.emitters, prepared.camera
-    skipped = []
+    skipped: list[dict[str, str]] = []
 
-    def skip(name, level, why):
+    def skip(name: str, level: str, why: str) -> bool:
         skipped.append({"class": name, "level": level, "why": why})
         return False
 
     hit = emitters.hittable or skip("s=0", "impossible", "no emitter that a ray can hit")
 
-    def possible(name, needed, where, why):
+    def possible(name: str, needed: int, where: bool, why: str) -> bool:
         """A class that joins surfaces, on paths of ``needed`` edges or more."""
         why = _why_not(prepared, settings.max_depth, needed) or ("" if where else why)
         return skip(name, "impossible", why) if why else True
@@ -64,11 +67,11 @@ def plan(prepared, settings: Settings) -> Plan:
     )
 
 
-def _defaults(settings: Settings):
+def _defaults(settings: Settings) -> tuple[float, str]:
     """``light_paths`` and ``connections`` in effect: given by hand, or by ``skip``."""
     everything = settings.skip == "none"
     light_paths, connections = settings.light_paths, settings.connections
-    if light_paths == "auto":
+    if isinstance(light_paths, str):  # "auto"
         light_paths = 1 if everything else 1 / 4
     if connections == "auto":
         connections = "all" if everything else "one"
@@ -80,7 +83,7 @@ def _defaults(settings: Settings):
 _UNTRACED = "no light subpath can start from the emitters"
 
 
-def _why_not(prepared, depth, needed) -> str:
+def _why_not(prepared: PreparedScene, depth: int, needed: int) -> str:
     """Why no path of ``needed`` edges can be made by joining surfaces; empty if nothing forbids it."""
     if depth < needed:
         return f"max_depth={depth} allows no such path"
@@ -91,14 +94,14 @@ def _why_not(prepared, depth, needed) -> str:
     return "" if prepared.smooth else "no surface has a lobe that is not delta"
 
 
-def _why_no_light(emitters, settings: Settings) -> str:
+def _why_no_light(emitters: Emitters, settings: Settings) -> str:
     """Why no path reaches the sensor at all; empty if one may."""
     if settings.max_depth < 1:
         return "max_depth=0 allows no path"
     return "" if emitters.count else "the scene has no emitter"
 
 
-def _why_not_endpoints(emitters, camera, settings: Settings) -> str:
+def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -> str:
     """Why (1,1) is impossible; empty if it is not."""
     if not camera.connectible:
         return camera.reason
@@ -113,7 +116,7 @@ def _why_not_endpoints(emitters, camera, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
-def _why_not_arrival(emitters, camera, settings: Settings) -> str:
+def _why_not_arrival(emitters: Emitters, camera: Sensor, settings: Settings) -> str:
     """Why t=0 is impossible; empty if it is not."""
     if not camera.area:
         return camera.no_area
@@ -155,13 +158,13 @@ class UnreachablePaths:
     longest: int = 0
 
 
-def unreachable_paths(prepared, p: Plan, settings: Settings) -> tuple[UnreachablePaths, ...]:
+def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnreachablePaths, ...]:
     """Paths that no strategy in use can make.
 
     The order is always the same, so that two answers can be compared. In words: `explain.words`.
     """
     emitters, camera = prepared.emitters, prepared.camera
-    lost = []
+    lost: list[UnreachablePaths] = []
     deltas = prepared.delta and emitters.unhittable
     starts = (Start.DELTA_EMITTER,) * deltas + (Start.BEAM,) * emitters.beams
     if not p.arrival:  # t = 0 finds all that follow

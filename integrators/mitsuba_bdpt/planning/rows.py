@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +34,7 @@ class Layout:
         """A part of all rows; their numbers lie along the last axis."""
         return rows[..., self.place(name)]
 
-    def row(self, values: dict) -> list:
+    def row(self, values: Mapping[str, list[Any]]) -> list[Any]:
         """The numbers of one row, from lists by the names of its parts."""
         return [x for name in self.parts for x in values[name]]
 

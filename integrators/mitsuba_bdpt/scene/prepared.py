@@ -18,7 +18,7 @@ class PreparedScene:
     whether some BSDF has such a lobe; ``traits`` see `bsdf.Traits`.
     """
 
-    def __init__(self, scene, sensor):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
         self.scene = scene
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene)
@@ -48,7 +48,7 @@ def _prepare_bitmaps(found):
                 continue
 
 
-def bsdfs(scene):
+def bsdfs(scene: mi.Scene) -> list[mi.BSDF]:
     """The BSDFs of all shapes, those of shape groups included; that of an instance is never met."""
     found = [s.bsdf() for s in all_shapes(scene) if not is_instance(s)]
     return [b for b in found if b is not None]

@@ -83,8 +83,8 @@ class Region:
     the filter is one; ``share``: area over that of the crop window.
     """
 
-    def __init__(self, film):
-        self.border = film.rfilter().border_size() if film.sample_border() else 0
+    def __init__(self, film: mi.Film):
+        self.border: int = film.rfilter().border_size() if film.sample_border() else 0
         self.box = film.rfilter().is_box_filter()
         self.crop_size = np.array(film.crop_size(), dtype=int)
         self.crop_offset = np.array(film.crop_offset(), dtype=int)
@@ -98,30 +98,30 @@ class Region:
         self._size = dr.opaque(mi.Point2f, self.crop_size.astype(float).tolist())
         self._offset = dr.opaque(mi.Point2f, self.crop_offset.astype(float).tolist())
 
-    def pixel(self, index):
+    def pixel(self, index: mi.UInt32) -> mi.Point2i:
         """Film pixel of the ``index``-th pixel of the region (row by row), as ``mi.Point2i``."""
         y = index // self._width
         x = index - y * self._width
         return mi.Point2i(mi.Int32(x), mi.Int32(y)) + self._first
 
-    def to_uv(self, position):
+    def to_uv(self, position: mi.Point2f) -> mi.Point2f:
         """Film position in the unit square of the crop window (beyond it in the border)."""
         return (position - self._offset) / self._size
 
-    def to_position(self, uv):
+    def to_position(self, uv: mi.Point2f) -> mi.Point2f:
         """The reverse of `to_uv`."""
         return mi.Point2f(uv) * self._size + self._offset
 
-    def anywhere(self, u):
+    def anywhere(self, u: mi.Point2f) -> mi.Point2f:
         """Film position that ``u`` in [0, 1)^2 chooses uniformly."""
         return self.to_position(self.low + u * (self.high - self.low))
 
-    def contains(self, uv):
+    def contains(self, uv: mi.Point2f):
         """Mask: within the region."""
         return dr.all((uv >= self.low) & (uv < self.high))
 
 
-def view_at(x, count: int):
+def view_at(x: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
     """Which of ``count`` views side by side ``x`` in [0, 1) is in, and its place within that view."""
     index = dr.minimum(mi.UInt32(x * count), count - 1)
     return index, x * count - mi.Float(index)
@@ -146,11 +146,11 @@ class Sensor:
     reason = ""
     no_area = "the sensor has no area that light could hit"
 
-    def __init__(self, sensor):
+    def __init__(self, sensor: mi.Sensor):
         self.sensor = sensor
         self.region = Region(sensor.film())
 
-    def start(self, pixel, u_film, u_lens, shared) -> CameraStart:
+    def start(self, pixel: mi.Point2i, u_film: mi.Point2f, u_lens: mi.Point2f, shared) -> CameraStart:
         """Start of a camera subpath through ``pixel``; ``shared`` carries time and wavelengths."""
         position = mi.Point2f(pixel) + u_film
         start = self._start(self.region.to_uv(position), u_lens, shared)
@@ -161,11 +161,11 @@ class Sensor:
         """`start` at a point of the crop window's unit square, without ``position`` and ``counted``."""
         raise NotImplementedError
 
-    def join(self, p, u_lens, u_film) -> CameraJoin:
+    def join(self, p: mi.Point3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraJoin:
         """Join the scene point ``p`` with z_0, chosen by ``u_lens`` and, if it is needed, ``u_film``."""
         raise NotImplementedError
 
-    def join_direction(self, d, u_lens, u_film) -> CameraJoin:
+    def join_direction(self, d: mi.Vector3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraJoin:
         """As `join`, with light that travels along ``d`` from infinity; ``dist2`` is 1."""
         raise NotImplementedError
 

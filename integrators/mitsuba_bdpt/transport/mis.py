@@ -31,6 +31,7 @@ import mitsuba as mi
 
 from ..errors import UsageError
 from ..settings import HEURISTICS
+from .bsdf import Step
 
 if TYPE_CHECKING:
     # One number, under `ByClass` one for each class; the Python number 0 for classes that are not in use.
@@ -54,17 +55,17 @@ class Partial:
     d_vc: mi.Float | mi.Vector4f | int
 
 
-def is_absent(x) -> bool:
+def is_absent(x: PartialSum) -> bool:
     """Whether ``x`` stands for classes of strategies that are not in use."""
     return isinstance(x, (int, float)) and x == 0
 
 
-def choose(mask, a, b):
+def choose(mask: mi.Bool, a: PartialSum, b: PartialSum) -> PartialSum:
     """``dr.select`` of two coefficients or partial sums; 0 where both classes are not in use."""
     return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
 
 
-def times(coefficient, pdf):
+def times(coefficient: Coefficient, pdf: mi.Float) -> PartialSum:
     """A coefficient times a density (in any measure) that enter a partial sum together."""
     return 0 if is_absent(coefficient) else coefficient * pdf
 
@@ -80,7 +81,7 @@ class Heuristic:
             raise UsageError(f"heuristic={name!r} is not known; use one of {', '.join(HEURISTICS)}")
         self.name = name
 
-    def scale(self, x, factor):
+    def scale(self, x: PartialSum, factor: PartialSum) -> PartialSum:
         """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
         if is_absent(x) or is_absent(factor):
             return 0
@@ -89,7 +90,7 @@ class Heuristic:
         # The factor as well: 0 times an infinite product of densities would be NaN.
         return dr.minimum(x * dr.minimum(factor, SATURATION), SATURATION)
 
-    def combine(self, a, b):
+    def combine(self, a: PartialSum, b: PartialSum) -> PartialSum:
         """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
         if is_absent(a) or is_absent(b):
             return b if is_absent(a) else a
@@ -101,25 +102,25 @@ class Heuristic:
             total = a + b
         return dr.minimum(total, SATURATION)
 
-    def zero(self):
+    def zero(self) -> mi.Float | mi.Vector4f:
         """An empty partial sum."""
         return mi.Float(0)
 
-    def present(self, x):
+    def present(self, x: PartialSum) -> PartialSum:
         """A partial sum to which classes in use may be added."""
         return self.zero() if is_absent(x) else x
 
-    def start(self, inverse_pdf):
+    def start(self, inverse_pdf: mi.Float):
         """Partial sum of one strategy whose ratio is ``inverse_pdf`` so far: 1 / a density in any measure."""
         if self.name == "uniform":
             return dr.select(inverse_pdf > 0, 1.0, 0.0)
         return dr.minimum(inverse_pdf, SATURATION)
 
-    def weigh(self, coefficient, light_side, camera_side):
+    def weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
         """`weight`, and the classes' shares of it, which only `ByClass` knows."""
         return self.weight(coefficient, light_side, camera_side), None
 
-    def weight(self, coefficient, light_side, camera_side):
+    def weight(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
         """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
 
         ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
@@ -150,17 +151,17 @@ class ByClass(Heuristic):
     def __init__(self):
         super().__init__("balance")
 
-    def zero(self):
+    def zero(self) -> mi.Vector4f:
         return mi.Vector4f(0)
 
-    def weigh(self, coefficient, light_side, camera_side):
+    def weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
         """Weight of the strategy at hand, and the share of each class in the sum of all strategies."""
         total = self.combine(self.combine(light_side, camera_side), coefficient)
         shares = total / dr.sum(total)
         return dr.sum(coefficient) / dr.sum(total), shares
 
 
-def to_area(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
+def to_area(heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float) -> Partial:
     """Convert to the area measure at a new vertex (the part of eqs. 31-35 that is known at the hit).
 
     ``dist2`` squared length of the edge (1 where the edge keeps another measure: the first edge
@@ -172,7 +173,7 @@ def to_area(heuristic: Heuristic, partial: Partial, dist2, cos) -> Partial:
     )
 
 
-def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partial:
+def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step) -> Partial:
     """Fold the newest alternative and take a sampled direction (eqs. 34, 35; delta events 53, 54).
 
     ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
@@ -200,7 +201,9 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient, step) -> Partia
     )
 
 
-def alternatives(heuristic: Heuristic, partial: Partial, coefficient, pdf_rev_w, pdf_a):
+def alternatives(
+    heuristic: Heuristic, partial: Partial, coefficient: Coefficient, pdf_rev_w: mi.Float, pdf_a: mi.Float
+) -> PartialSum:
     """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40, 41, 44-47).
 
     ``coefficient`` of the newest alternative's class; ``pdf_rev_w`` solid-angle density of sampling

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Plan:
     kappa_direct: float
     roulette: bool
     hide_emitters: bool
-    skipped: tuple = field(default=())
+    skipped: tuple[dict[str, str], ...] = ()
 
     @property
     def light(self) -> bool:
