@@ -65,7 +65,9 @@ class Snapshot:
 
     def check(self, identity: dict, apart_from=()):
         """Raise ``ValueError`` naming the first entry in which this is another render than ``identity``."""
-        for name in sorted(set(identity) | set(self.identity)):
+        # The version first: parameters of another one may differ in name only.
+        names = sorted(set(identity) | set(self.identity), key=lambda name: (name != "version", name))
+        for name in names:
             mine, given = self.identity.get(name), identity.get(name)
             if name not in apart_from and mine != given:
                 raise UsageError(
