@@ -65,7 +65,7 @@ def times(coefficient, pdf):
 class Heuristic:
     """How alternatives are combined: ``balance``, ``power`` (exponent 2), ``maximum``, ``uniform``.
 
-    Raises ``ValueError`` for any other name.
+    Raises ``UsageError`` for any other name.
     """
 
     def __init__(self, name: str):
