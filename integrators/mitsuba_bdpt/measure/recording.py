@@ -134,7 +134,8 @@ def _outlier(launch: Launch, row, slot: int) -> Outlier:
 
 def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it: all samples larger than ``least`` (of the
-    image's shape) in one of the colours, largest first. Raises ``CommandError`` for a film of other colours."""
+    image's shape) in one of the colours, largest first. Raises ``CommandError`` for a film of other colours.
+    """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise CommandError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
