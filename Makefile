@@ -93,9 +93,12 @@ benchmark: $(INSTALLED)
 	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/reports/benchmark
 	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
 
+# Style, format, the order of the rooms, types.
 lint: $(INSTALLED)
 	$(VENV)/bin/python -m ruff check .
 	$(VENV)/bin/python -m ruff format --check .
+	$(VENV)/bin/lint-imports --no-cache
+	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
 # Install again only when the requirements change; the package itself is installed editable.
 $(INSTALLED): pyproject.toml

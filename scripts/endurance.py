@@ -25,7 +25,7 @@ import resource
 import signal
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
@@ -98,10 +98,8 @@ def empty() -> dict:
 def reset_peak() -> None:
     """Let `peak` begin anew, where the system can."""
     dr.detail.malloc_clear_statistics()
-    try:
+    with suppress(OSError):  # then it is that of all renders of this process
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        pass  # then it is that of all renders of this process
 
 
 def peak() -> int:

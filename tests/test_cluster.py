@@ -62,8 +62,15 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
     assert "samples are too few" in image(tmp_path / "short.exr")[1]["no_pilot"]
     scene = mi.load_file(str(SCENE), resolution=32)
     options = Namespace(
-        **{"scene": SCENE, "defines": [("resolution", "32")], "properties": [], "variant": mi.variant()},
-        **{"integrator": None, "sensor": 0, "time": None, "target_error": None, "seed": 0},
+        scene=SCENE,
+        defines=[("resolution", "32")],
+        properties=[],
+        variant=mi.variant(),
+        integrator=None,
+        sensor=0,
+        time=None,
+        target_error=None,
+        seed=0,
     )
     job = cluster._job(scene, scene.integrator(), options, 256)
     assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]
@@ -188,9 +195,9 @@ def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
 
 def test_a_failing_part_is_named(workers):
     """Expected: what a worker raises ends the render with one message, not with silence."""
-    with distributed.Client(workers.scheduler_address) as client:
-        with pytest.raises(RuntimeError, match="part 0 failed on the cluster: math domain error"):
-            list(results(client, math.sqrt, [(-1.0,)]))
+    failed = pytest.raises(RuntimeError, match="part 0 failed on the cluster: math domain error")
+    with distributed.Client(workers.scheduler_address) as client, failed:
+        list(results(client, math.sqrt, [(-1.0,)]))
 
 
 def test_an_edited_scene_is_loaded_anew(workers, tmp_path):

@@ -4,6 +4,8 @@ The reference for images is Mitsuba's `path`; where it is wrong or blind, a clos
 image comparisons: Welch's t-test of tile means over seeds with Sidak's correction (`agree`).
 """
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -279,7 +281,7 @@ def test_directions_of_a_spot():
     _, w = lamp.sample_direction(it, mi.Point2f(0.5))
     power = np.array(w, dtype=np.float64)[0] * 4 * np.pi
     other = np.rad2deg(np.arccos(np.clip(axis @ d, -1, 1)))
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         a = weight * ((angle >= low) & (angle < high))
         b = power * ((other >= low) & (other < high))
         error = np.hypot(a.std() / np.sqrt(len(a)), b.std() / np.sqrt(len(b)))
@@ -342,7 +344,7 @@ def test_several_emitters_of_unequal_weight():
     lamps = {}
     for i, name in enumerate(("rectangle", "sphere", "point", "spot", "directional", "envmap")):
         lamp = EMITTERS[name]()
-        (lamp["emitter"] if "emitter" in lamp else lamp)["sampling_weight"] = 0.3 + i * i / 4
+        lamp.get("emitter", lamp)["sampling_weight"] = 0.3 + i * i / 4
         lamps[name.replace(" ", "_")] = lamp
     same_image(mi.load_dict(room() | lamps), 0.05, spp=(256, 512), max_depth=3)
 
@@ -550,14 +552,14 @@ def test_thin_lens_at_its_default_focus_distance():
 
 
 TEXTURED = {
-    "cube": lambda: EMITTERS["cube"](),
-    "thin cylinder": lambda: EMITTERS["cylinder"](),
+    "cube": EMITTERS["cube"],
+    "thin cylinder": EMITTERS["cylinder"],
     "smooth mesh": lambda: {
         "type": "ply",
         "to_world": T().translate([0.6, 1.6, 0.3]).scale(0.5).translate([2.4, -2.6, 0.8]),
         "bsdf": grey(0.1),
     },
-    "sphere": lambda: EMITTERS["sphere"](),
+    "sphere": EMITTERS["sphere"],
     "disk": lambda: (
         EMITTERS["disk"]() | {"to_world": T().translate([0.5, 1.8, 0]).rotate([1, 0, 0], 45).scale(0.4)}
     ),
@@ -892,7 +894,7 @@ def test_a_lamp_of_the_users_on_a_surface(height):
     unit). Expected: a user's class that repeats `area` gives the image of `area` by `path`, with the floor
     near and far. Tolerance: the confidence interval, below 3 %. Statistic: Welch over tiles.
     """
-    mi.register_emitter("own_area", lambda properties: own_area_class()(properties))
+    mi.register_emitter("own_area", own_area_class())
     lamp = {
         "type": "rectangle",
         "to_world": T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.6),

@@ -75,7 +75,7 @@ def test_an_interrupted_run_goes_on(tmp_path):
             stdout=log,
             stderr=log,
             # A shell's background jobs ignore SIGINT, and Python keeps what it inherits.
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 (no threads here)
         )
         try:
             deadline = time.monotonic() + 240
@@ -128,7 +128,7 @@ def test_what_is_wrong_is_kept(tmp_path, monkeypatch):
     def poisoned(name, **definitions):
         scene = load(name, **definitions)
         params = mi.traverse(scene)
-        (radiance,) = [key for key in params.keys() if key.endswith("radiance.value")]  # noqa: SIM118
+        (radiance,) = [key for key in params.keys() if key.endswith("radiance.value")]
         params[radiance] = mi.Color3f(np.nan, 1, 1)
         params.update()
         return scene

@@ -37,7 +37,9 @@ def render(scene, **parameters):
 
 def functions(kernel: str) -> int:
     """Number of functions of BSDFs in a kernel."""
-    return len(re.findall(r"^define [^\n]*\n(?:[^\n]*\n)?[^\n]*; Call: (?:BSDF::|drjit)", kernel, re.M))
+    return len(
+        re.findall(r"^define [^\n]*\n(?:[^\n]*\n)?[^\n]*; Call: (?:BSDF::|drjit)", kernel, re.MULTILINE)
+    )
 
 
 def test_functions_of_materials(kernels):

@@ -1,8 +1,16 @@
-"""Imports inside the package go one way: the rooms of pyproject.toml."""
+"""Imports inside the package go one way, and annotations of records name what there is."""
 
+import dataclasses
+import importlib
+import pkgutil
+import typing
 from pathlib import Path
 
+import mitsuba_bdpt
+import pytest
 from importlinter import cli
+
+import mitsuba as mi  # isort: skip
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -11,3 +19,28 @@ def test_imports_go_one_way(capsys):
     """Expected: every room is in the contract, which is exhaustive, and imports from later rooms."""
     done = cli.lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
     assert done == cli.EXIT_STATUS_SUCCESS, capsys.readouterr().out
+
+
+def _records():
+    """All dataclasses of the package."""
+    for module in pkgutil.walk_packages(mitsuba_bdpt.__path__, "mitsuba_bdpt."):
+        if not module.name.endswith("__main__"):
+            held = vars(importlib.import_module(module.name)).values()
+            own = (c for c in held if isinstance(c, type) and c.__module__ == module.name)
+            yield from filter(dataclasses.is_dataclass, own)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_annotations_of_records_can_be_evaluated(variant):
+    """Rationale: Dr.Jit evaluates the annotations of records that a loop or call carries: a name that is
+    imported for type checkers alone ends a render. Expected: those of all records can be evaluated.
+    """
+    before = mi.variant()
+    mi.set_variant(variant)
+    try:
+        records = list(_records())
+        assert len(records) > 50
+        for record in records:
+            typing.get_type_hints(record)
+    finally:
+        mi.set_variant(before)

@@ -154,13 +154,9 @@ def test_every_path_length_in_the_unit_sphere(kind, name):
             continue
         off = (
             t == 0  # a pinhole
-            or (s == 0 or (s == 1 and t == 1))
-            and kind == "point"
-            or (s >= 2 or (s, t) == (1, 1))
-            and (name == "light_paths=0" or k > stored)
-            or name == "no connections"
-            and s >= 2
-            and t >= 2
+            or ((s == 0 or (s == 1 and t == 1)) and kind == "point")
+            or ((s >= 2 or (s, t) == (1, 1)) and (name == "light_paths=0" or k > stored))
+            or (name == "no connections" and s >= 2 and t >= 2)
         )
         if off:
             assert np.all(values == 0), (s, t)

@@ -24,7 +24,7 @@ def test_own_parameters_are_those_of_traverse(kind):
     made = mi.load_dict(OBJECTS[kind])
     everything = mi.traverse(made)
     found = own_parameters(made)
-    assert found and set(found) == {name for name in everything.keys() if "." not in name}  # noqa: SIM118
+    assert found and set(found) == {name for name in everything.keys() if "." not in name}
     for name, value in found.items():
         expected = everything[name]
         a, b = (x.matrix if hasattr(x, "matrix") else x for x in (value, expected))

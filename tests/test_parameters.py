@@ -1224,8 +1224,10 @@ def test_variants_on_metal_are_not_called_scalar(monkeypatch, variant):
     [
         "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb')",
         "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import mitsuba_bdpt",
-        "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.set_variant('scalar_rgb');"
-        " mi.set_variant('llvm_ad_rgb')",
+        (
+            "import mitsuba_bdpt, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.set_variant('scalar_rgb');"
+            " mi.set_variant('llvm_ad_rgb')"
+        ),
     ],
     ids=["import first", "import last", "back and forth"],
 )

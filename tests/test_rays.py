@@ -413,7 +413,7 @@ def test_lamps_on_spheres_however_small(radius, parameters):
 
 def small_lamp(radius):
     """A floor seen from near by in the light of a lamp on a sphere, of radiance 1 / radius^2."""
-    T = mi.ScalarTransform4f
+    T = mi.ScalarTransform4f  # noqa: N806 (as formulas name a transform)
     film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     return mi.load_dict(
         {

@@ -19,6 +19,7 @@ Roulette is off (``rr_depth`` 100) except where it is the subject.
 
 from __future__ import annotations
 
+import itertools
 from functools import cache
 
 import mitsuba as mi
@@ -220,7 +221,7 @@ def unweighted_family(a, b, name):
         usable = [s for s in range(k + 1) if possible(name, k, s)]
         family += [
             st.compare_images(a[k, s, k + 1 - s][1], b[k, u, k + 1 - u][1], f"k={k} s={s} vs s={u}")
-            for s, u in zip(usable, usable[1:], strict=False)
+            for s, u in itertools.pairwise(usable)
         ]
     return st.Comparisons.join(family)
 

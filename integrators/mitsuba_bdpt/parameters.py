@@ -80,7 +80,7 @@ def _number(value, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
         raise UsageTypeError(f"{name}={value!r} must be a number: {parameter.what}")
     # Without bounds infinity is a number like any other.
-    if not parameter.low <= value or parameter.low > -math.inf and value == math.inf:
+    if not parameter.low <= value or (parameter.low > -math.inf and value == math.inf):
         raise UsageError(f"{name}={value!r} is out of range; it is {parameter.what}")
     return float(value)
 

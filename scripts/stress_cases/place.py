@@ -156,7 +156,7 @@ class Subject:
     samples: int = 1
     moved: float = 0.03
 
-    def load(self, place: Place = Place(), size: int = SIZE):  # noqa: B008 (frozen)
+    def load(self, place: Place = Place(), size: int = SIZE):
         """The scene in its place."""
         root = ElementTree.parse(repository.scene_file(self.scene)).getroot()
         if self.edit is not None:

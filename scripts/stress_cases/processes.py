@@ -218,7 +218,7 @@ def _edit(key: str, change) -> Callable:
     """Set what `mi.traverse` calls so; ``change`` makes the value of the one that is there."""
 
     def edit(params):
-        (name,) = [name for name in params.keys() if name.endswith(key)]  # noqa: SIM118 (not a dict)
+        (name,) = [name for name in params.keys() if name.endswith(key)]
         params[name] = change(params[name])
         params.update()
 

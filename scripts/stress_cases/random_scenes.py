@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 import mitsuba as mi  # isort: skip
 
 
-def T():
+def T():  # noqa: N802 (as formulas name a transform)
     """The identity; there is no such type before a variant is set."""
     return mi.ScalarTransform4f()
 

@@ -388,8 +388,10 @@ def glass_cases():
                 (1.0, "tiles of 16 pixels to 2e-3, two samples of 64 in one of these"),
                 (
                     0.98,
-                    f"means of tiles over 8 seeds to {OFF:g}, since rays start 2e-4 of the width off "
-                    "a mirror and so bounce the sooner (under `path` tiles are off by 4e-3)",
+                    (
+                        f"means of tiles over 8 seeds to {OFF:g}, since rays start 2e-4 of the width off "
+                        "a mirror and so bounce the sooner (under `path` tiles are off by 4e-3)"
+                    ),
                 ),
             )
         ),

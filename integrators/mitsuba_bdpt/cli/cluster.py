@@ -38,7 +38,7 @@ def check_settings(settings) -> None:
     """Raise ``CommandError`` for parameters that would mean something else in each part."""
     for name in ("timeout", "target_error"):
         value = getattr(settings, name)
-        if value > 0 or name == "timeout" and value == 0:
+        if value > 0 or (name == "timeout" and value == 0):
             raise CommandError(
                 f"scheduler with {name}={value} is not possible: each part would end by itself."
             )

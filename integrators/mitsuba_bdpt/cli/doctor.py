@@ -92,7 +92,7 @@ def versions() -> list[Finding]:
 def llvm_library() -> Finding:
     """Which LLVM library was chosen and why, or why the package cannot be imported."""
     failure, choice = mitsuba_bdpt.failure, mitsuba_bdpt.llvm_choice
-    if failure is not None:
+    if failure is not None or choice is None:
         subject = "LLVM" if isinstance(failure, llvm.LLVMNotFoundError) else "import"
         return Finding("FAIL", subject, str(failure))
     if choice.version in llvm.KNOWN_GOOD or choice.origin == "none":
@@ -153,6 +153,7 @@ def judge(child: subprocess.CompletedProcess, said: dict, variant: str) -> Findi
 
 def crash_remedy() -> str:
     """What to do after a crash: another LLVM."""
-    if os.environ.get(llvm.VARIABLE) and mitsuba_bdpt.llvm_choice.origin == "variable":
-        return f"Unset {llvm.VARIABLE}; it names {os.environ[llvm.VARIABLE]!r}."
+    named, choice = os.environ.get(llvm.VARIABLE), mitsuba_bdpt.llvm_choice
+    if named and choice is not None and choice.origin == "variable":
+        return f"Unset {llvm.VARIABLE}; it names {named!r}."
     return llvm.remedy(llvm.Machine.here())

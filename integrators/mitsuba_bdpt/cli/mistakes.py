@@ -17,6 +17,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable
+from typing import TypeVar
 
 from ..errors import UnsupportedError, UsageError, message
 
@@ -26,10 +27,12 @@ STATUS = 2
 INTERRUPTED = 130
 """The exit status of a process that SIGINT has ended."""
 
+Status = TypeVar("Status", int, int | None)
+
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
 
-def answered(main: Callable[[], int | None]) -> int | None:
+def answered(main: Callable[[], Status]) -> Status | int:
     """The exit status of ``main``; that of a mistake if there was one, which is printed."""
     try:
         return main()

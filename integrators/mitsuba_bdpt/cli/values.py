@@ -5,19 +5,22 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from typing import TypeVar
 
 PropertyValue = bool | int | float | str
 
+Number = TypeVar("Number", int, float)
 
-def number(kind: type, minimum: float, maximum: float = math.inf) -> Callable[[str], int | float]:
+
+def number(kind: type[Number], minimum: float, maximum: float = math.inf) -> Callable[[str], Number]:
     """An argparse type: a finite `kind` between `minimum` and `maximum`."""
 
-    def parse(text: str) -> int | float:
+    def parse(text: str) -> Number:
         try:
             value = kind(text)
         except ValueError:
-            value = math.nan
-        if not (minimum <= value <= maximum and math.isfinite(value)):
+            value = None
+        if value is None or not (minimum <= value <= maximum and math.isfinite(value)):
             most = maximum if kind is int else f"{maximum:g}"
             limit = "" if maximum == math.inf else f" and at most {most}"
             name = "a whole number" if kind is int else "a number"

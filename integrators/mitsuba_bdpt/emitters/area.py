@@ -33,9 +33,9 @@ class _Sphere:
     the radius of one that may be so small that Mitsuba's own is wrong. 0 where that does not concern an
     emitter."""
 
-    center: object = (0, 0, 0)
-    inner_radius: object = 0.0
-    cone_radius: object = 0.0
+    center: mi.Vector3f | tuple = (0, 0, 0)
+    inner_radius: mi.Float | float = 0.0
+    cone_radius: mi.Float | float = 0.0
 
     @staticmethod
     def of(emitter, sphere, extent) -> _Sphere:

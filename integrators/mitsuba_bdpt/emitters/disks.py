@@ -38,8 +38,8 @@ class BoundingSphere:
     """A sphere whose outline is a disk: ``center`` and ``radius``, which Dr.Jit may exchange without
     compiling anew."""
 
-    center: object
-    radius: object
+    center: mi.Point3f
+    radius: mi.Float
 
     @staticmethod
     def about(sphere) -> BoundingSphere:

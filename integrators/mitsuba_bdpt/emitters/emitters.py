@@ -6,7 +6,9 @@ See the head of the room for the densities, `group.Group` for what a group answe
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +16,7 @@ import mitsuba as mi
 from ..geometry import rounding
 from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
-from .group import Context
+from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party, needs_evaluation
 from .records import Chosen, Direct, Emission, Hit
@@ -103,7 +105,7 @@ class Emitters:
 
     # -- selection and dispatch -------------------------------------------------------------
 
-    def _select(self, u, active) -> tuple[Chosen, object]:
+    def _select(self, u: mi.Float, active: mi.Bool) -> tuple[Chosen, mi.Float]:
         """Choose an emitter; also returns the reused part of ``u``."""
         index = mi.UInt32(0)
         if self.count > 1:
@@ -116,25 +118,37 @@ class Emitters:
         pmf = dr.gather(mi.Float, self._pmf, index, active) if self.count > 1 else mi.Float(1)
         return Chosen(emitter, index, pmf)
 
-    def _ask(self, question, answering, index, active, possible=None):
+    def _ask(
+        self,
+        question: Callable[[Group, mi.Bool], Any],
+        answering: Sequence[Group],
+        index: mi.UInt32,
+        active: mi.Bool,
+        possible: Sequence[Group] | None = None,
+    ):
         """The answer of each lane's group to ``question(group, mask)``.
 
         ``answering``: groups that have one; for emitters of other groups the answer has no meaning.
         ``possible``: those that the emitters ``index`` can be of, all if left out. What only one group can
-        answer is recorded without a choice, and nothing is recorded of groups that the scene has not. None
-        where no group has an answer.
+        answer is recorded without a choice, and nothing is recorded of groups that the scene has not. Raises
+        ``ValueError`` where no group has an answer.
         """
         possible = self.groups if possible is None else possible
-        found = None
-        for group in answering:
+
+        def lanes_of(group: Group) -> mi.Bool:
             mask = mi.Bool(active)
             if len(possible) > 1:
                 mask &= dr.gather(mi.UInt32, self._group, index, active) == self.groups.index(group)
-            answer = question(group, mask)
-            found = answer if found is None else dr.select(mask, answer, found)
+            return mask
+
+        first, *others = answering
+        found = question(first, lanes_of(first))
+        for group in others:
+            mask = lanes_of(group)
+            found = dr.select(mask, question(group, mask), found)
         return found
 
-    def _supporting(self, capability: str) -> list:
+    def _supporting(self, capability: str) -> list[Group]:
         """The scene's groups with this attribute."""
         return [group for group in self.groups if getattr(group, capability)]
 

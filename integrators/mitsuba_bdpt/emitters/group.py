@@ -17,7 +17,7 @@ class Context:
     """What groups are made in: the ``scene``, the `rounding.ShapeErrors` of its shapes, and whether points on
     shapes are asked of the shapes (``ask_shapes``) since emitters cannot be asked."""
 
-    scene: object
+    scene: mi.Scene
     shape_errors: rounding.ShapeErrors
     ask_shapes: bool
 

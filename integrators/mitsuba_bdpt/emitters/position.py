@@ -23,12 +23,12 @@ class _Cone:
     cosine of that's half angle, and the density ``pdf_w`` of a direction within (solid angle). All directions
     for a point light. Of a projector ``position`` alone counts."""
 
-    position: object = (0, 0, 0)
-    x: object = (1, 0, 0)
-    y: object = (0, 1, 0)
-    z: object = (0, 0, 1)
-    cos_cutoff: object = -1.0
-    pdf_w: object = 1.0
+    position: mi.Vector3f | tuple = (0, 0, 0)
+    x: mi.Vector3f | tuple = (1, 0, 0)
+    y: mi.Vector3f | tuple = (0, 1, 0)
+    z: mi.Vector3f | tuple = (0, 0, 1)
+    cos_cutoff: mi.Float | float = -1.0
+    pdf_w: mi.Float | float = 1.0
 
 
 class PositionEmitters(Group):

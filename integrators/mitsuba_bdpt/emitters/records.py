@@ -15,9 +15,9 @@ class Chosen:
     """The emitters of the lanes: ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` the
     probability of the selection."""
 
-    emitter: object
-    index: object
-    pmf: object
+    emitter: mi.EmitterPtr
+    index: mi.UInt32
+    pmf: mi.Float
 
 
 @dataclass
@@ -32,17 +32,17 @@ class Emission:
     emitting point for Mitsuba's calls.
     """
 
-    weight: object
-    d: object
+    weight: mi.Spectrum
+    d: mi.Vector3f
     anchor: rays.Anchor
-    cos: object
-    pdf_first: object
-    pdf_second: object
-    infinite: object
-    delta: object
-    beam: object
-    index: object
-    si: object
+    cos: mi.Float
+    pdf_first: mi.Float
+    pdf_second: mi.Float
+    infinite: mi.Bool
+    delta: mi.Bool
+    beam: mi.Bool
+    index: mi.UInt32
+    si: mi.SurfaceInteraction3f
 
 
 @dataclass
@@ -57,14 +57,14 @@ class Direct:
     geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
     """
 
-    weight: object
-    pdf_w: object
-    d: object
+    weight: mi.Spectrum
+    pdf_w: mi.Float
+    d: mi.Vector3f
     anchor: rays.Anchor
-    infinite: object
-    delta: object
-    emission_ratio: object
-    met: object = None
+    infinite: mi.Bool
+    delta: mi.Bool
+    emission_ratio: mi.Float
+    met: mi.UInt32 | None = None
 
 
 @dataclass
@@ -72,9 +72,9 @@ class Hit:
     """An emitter point ``si`` that a camera subpath has hit, or missed into, from its vertex ``previous``
     (both as Mitsuba's calls take them), in the ``scene``."""
 
-    scene: object
-    si: object
-    previous: object
+    scene: mi.Scene
+    si: mi.SurfaceInteraction3f
+    previous: mi.Interaction3f
 
     def direction(self) -> mi.DirectionSample3f:
         """The hit as a sample of next-event estimation from ``previous``."""

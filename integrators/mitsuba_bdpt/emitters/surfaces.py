@@ -24,8 +24,8 @@ class _Turned:
     """A sphere whose sampled normals are turned with its points: ``outward`` see `Sphere`, 0 where normals
     are right as they are."""
 
-    center: object = (0, 0, 0)
-    outward: object = 0.0
+    center: mi.Vector3f | tuple = (0, 0, 0)
+    outward: mi.Float | float = 0.0
 
 
 class Surfaces:

@@ -6,10 +6,13 @@ All have one row for each emitter of the scene, be it of the group that asks or 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+Record = TypeVar("Record")
 
 
 def rows(emitters, default, row) -> list:
@@ -17,8 +20,11 @@ def rows(emitters, default, row) -> list:
     return [default if emitter is None else row(emitter) for emitter in emitters]
 
 
-def table(records: list):
-    """Dataclasses of scalars and points as one of opaque columns for `look_up`."""
+def table(records: list[Record]) -> Record:
+    """Dataclasses of scalars and points as one of opaque columns for `look_up`.
+
+    So their fields are numbers and tuples, those of the table ``mi.Float`` and ``mi.Vector3f``.
+    """
 
     def column(name):
         # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
@@ -32,7 +38,7 @@ def table(records: list):
     return made
 
 
-def look_up(columns, index, active):
+def look_up(columns: Record, index: mi.UInt32, active: mi.Bool) -> Record:
     """The row ``index`` of a `table`."""
     return replace(columns, **{k: dr.gather(type(v), v, index, active) for k, v in vars(columns).items()})
 

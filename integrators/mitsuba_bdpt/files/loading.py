@@ -136,16 +136,17 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
                 f"target_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
             )
         overrides |= {"target_error": options.target_error, "variance": True}
-    if options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator):
-        if options.integrator != "aov" or not overrides.get("aovs"):
-            raise CommandError(
-                f"integrator={options.integrator} is for one around another, which the command line cannot "
-                "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
-            )
+    around = options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator)
+    if around and (options.integrator != "aov" or not overrides.get("aovs")):
+        raise CommandError(
+            f"integrator={options.integrator} is for one around another, which the command line cannot "
+            "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
+        )
     if node is not None:
         replace_integrator(state.nodes, node, options.integrator, overrides)
     mi.parser.transform_all(config, state)
-    scene = mi.parser.instantiate(config, state)
+    # The stub says object; `_check_root` has seen that it is a scene.
+    scene: mi.Scene = mi.parser.instantiate(config, state)  # pyright: ignore[reportAssignmentType]
     if node is not None:
         return scene, scene.integrator()
     kind = options.integrator or "bdpt"
@@ -225,7 +226,9 @@ def _files_near(scene: Path, name: str) -> str:
 def _in_words(error: str, options: Namespace) -> str | None:
     """What to say instead of Mitsuba's ``error`` about a name that it does not know, which is alike; None
     for other errors."""
-    unused = [name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.M)]
+    unused = [
+        name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.MULTILINE)
+    ]
     if "unused parameters" in error and unused:
         known = parameters(options.scene)
         named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
@@ -243,7 +246,7 @@ def _in_words(error: str, options: Namespace) -> str | None:
         return f"{error}{_files_near(options.scene, missing[1])}"
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
     given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
-    if given:
+    if strange and given:
         return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
     other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
     if other and other[1] == options.integrator:
@@ -350,7 +353,7 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
 
 def _nested(nodes: Sequence, node) -> tuple[str, object]:
     """Name and node of the one integrator inside of ``node``, which is around it."""
-    held = {key: node.props[key] for key in node.props.keys()}  # noqa: SIM118 (not a dict)
+    held = {key: node.props[key] for key in node.props.keys()}
     held = {key: value for key, value in held.items() if isinstance(value, mi.Properties.ResolvedReference)}
     found = [(key, nodes[reference.index()]) for key, reference in held.items()]
     found = [(key, inner) for key, inner in found if inner.type == mi.ObjectType.Integrator]

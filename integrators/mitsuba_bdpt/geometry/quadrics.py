@@ -32,7 +32,7 @@ class Sphere:
     ``turned``: Mitsuba's ``sample_position`` rotates the point, but not its normal (and
     ``eval_parameterization``, by which it samples a texture, does not rotate the point)."""
 
-    center: object
+    center: mi.ScalarPoint3f
     radius: float
     outward: float
     turned: bool

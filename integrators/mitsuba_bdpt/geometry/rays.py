@@ -29,10 +29,10 @@ class Anchor:
     1 / radius on spheres and cylinders, negative where normals point inwards, 0 elsewhere.
     """
 
-    p: object
-    n: object
-    offset: object
-    curvature: object
+    p: mi.Point3f
+    n: mi.Normal3f
+    offset: mi.Float
+    curvature: mi.Float
 
     def towards(self, d):
         """The start of a ray that leaves into direction ``d`` (any length)."""
@@ -113,8 +113,8 @@ class Own:
     Its number (see `met`), and the distance ``t`` from which on the ray may meet it.
     """
 
-    number: object
-    t: object
+    number: mi.UInt32
+    t: mi.Float
 
 
 def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, shared):

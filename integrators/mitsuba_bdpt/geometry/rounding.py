@@ -50,9 +50,9 @@ class Errors:
     asked, see `FAR`); ``starts``, that of shapes whose hits lie off their surface for the same reason:
     cylinders, and all that is round within instances; ``reach``, the largest of `reaches`."""
 
-    ends: object
-    starts: object
-    reach: object
+    ends: mi.Float | float
+    starts: mi.Float | float
+    reach: mi.Float | float
 
 
 class ShapeErrors:

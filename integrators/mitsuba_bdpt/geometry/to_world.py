@@ -121,10 +121,12 @@ def check_angles(emitter):
 _ANGLES = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}
 
 
-def _plugin(emitter) -> str:
-    return {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}.get(
-        emitter.class_name(), emitter.class_name().removesuffix("Emitter").lower()
-    )
+_PLUGINS = {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}
+
+
+def _plugin(emitter: mi.Emitter) -> str:
+    name = emitter.class_name()
+    return _PLUGINS.get(name) or name.removesuffix("Emitter").lower()
 
 
 def _lengths(matrix) -> str:

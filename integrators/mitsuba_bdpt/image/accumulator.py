@@ -21,6 +21,7 @@ from .block import Block
 from .channels import Channels
 from .layers import layer_names, strategies, strategy_count, strategy_index
 from .replicates import Replicates
+from .spread import Spread
 
 # The blocks of sums, as `Snapshot.arrays` calls them.
 _NAMES = ("camera", "light", "strategies")
@@ -42,7 +43,7 @@ class Accumulator:
         self.size = [int(x) for x in film.crop_size()]
         self.offset = [int(x) for x in film.crop_offset()]
         self.rfilter = film.rfilter()
-        self.replicates = Replicates() if variance else None
+        self.variance, self.replicates = variance, Replicates()
         names = features.names if features else []
         colour.prepare(layer_names(depth, variance, names, colour.names))
         self._channels = Channels.of(film, len(colour.names), len(names))
@@ -53,7 +54,7 @@ class Accumulator:
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         rows = strategy_count(depth) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if depth else None
-        self._done = (None, ())
+        self._done: tuple[list, tuple[int, ...]] = ([], ())  # sums and passes
         self._share = [self._covered(n) for n in self.size]
 
     def _block(self, channels: int, mode, packet, height: int | None = None):
@@ -75,6 +76,8 @@ class Accumulator:
 
     def put_strategy(self, position, weighted, unweighted, s, t, active):
         """Add to the technique images of the strategy (s, t)."""
+        if self.strategies is None:
+            raise ValueError("an accumulator of depth 0 has no strategy images")
         values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
         self.strategies.put(position, values, active, strategy_index(s, t) * self._stride)
 
@@ -86,7 +89,7 @@ class Accumulator:
         return [b for b in (self.camera, self.light, self.strategies) if b is not None]
 
     @property
-    def passes(self) -> tuple:
+    def passes(self) -> tuple[int, ...]:
         """Samples per pixel of each pass that is in the sums."""
         return self._done[1]
 
@@ -95,36 +98,35 @@ class Accumulator:
         blocks = self._blocks()
         sums = [mi.Float64(b.data) for b in blocks]
         before, passes = self._done
-        if before is not None:
+        if before:
             sums = [a + b for a, b in zip(before, sums, strict=True)]
         dr.eval(sums)
         self._done = (sums, (*passes, spp))  # at once: Ctrl-C may come between any two steps
         for b in blocks:
             b.clear()
 
-    def store(self) -> tuple[tuple, dict]:
+    def store(self) -> tuple[tuple[int, ...], dict]:
         """Passes and raw sums for a `Snapshot`: arrays of Dr.Jit or NumPy, none of which changes any more."""
         sums, passes = self._done
-        last = self.replicates.store() if self.replicates else {}
-        return passes, last | dict(zip(_NAMES, sums or [], strict=False))
+        return passes, self.replicates.store() | dict(zip(_NAMES, sums, strict=False))
 
     @property
-    def halves(self) -> tuple | None:
+    def halves(self) -> tuple[Spread, Spread] | None:
         """The `Spread` of either half of the replicates, ``None`` without the variance."""
-        return self.replicates.halves if self.replicates else None
+        return self.replicates.halves if self.variance else None
 
     def ends_replicates(self) -> bool:
         """Whether all passes belong to whole replicates."""
-        return self.replicates is not None and self.replicates.spp == sum(self.passes) > 0
+        return self.variance and self.replicates.spp == sum(self.passes) > 0
 
-    def restore(self, passes: tuple, arrays: dict, halves: tuple | None):
+    def restore(self, passes: tuple[int, ...], arrays: dict, halves: tuple[Spread, Spread] | None):
         """Go on from what `store` and `halves` gave after these ``passes``."""
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
             if len(s) != len(block.data):
                 raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
         self._done = (sums, tuple(passes))
-        if self.replicates is not None:
+        if halves is not None:
             self.replicates.restore(halves, arrays)
 
     def close_replicate(self):
@@ -196,7 +198,7 @@ class Accumulator:
         to_film = pixels.weight / self._splat_weight(spp)[..., None]
         colours = np.concatenate([pixels.colours + pixels.light * to_film, pixels.alpha], axis=-1)
         layers = [pixels.features]
-        if self.replicates is not None:
+        if self.variance:
             layers.append(self.replicates.variance(spp, pixels.colours.shape) * pixels.weight)
         if self.depth:
             layers += self._strategy_layers(sums[2], to_film)

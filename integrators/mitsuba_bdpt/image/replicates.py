@@ -19,7 +19,8 @@ class Replicates:
     """
 
     def __init__(self):
-        self.halves, self._sums = (Spread(), Spread()), None
+        self.halves: tuple[Spread, Spread] = (Spread(), Spread())
+        self._sums: list[np.ndarray] | None = None
 
     @property
     def count(self) -> int:
@@ -38,16 +39,18 @@ class Replicates:
         the difference.
         """
         new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
-        n, halves = spp - self.spp, list(self.halves)
-        which = self.count % 2
-        halves[which] = halves[which].joined(Spread.of(develop(*new, n), n))
-        self.halves, self._sums = tuple(halves), sums
+        n = spp - self.spp
+        image = Spread.of(develop(*new, n), n)
+        first, second = self.halves
+        even = self.count % 2 == 0
+        self.halves = (first.joined(image), second) if even else (first, second.joined(image))
+        self._sums = sums
 
     def store(self) -> dict:
         """Sums after the last image, which `restore` needs beside the halves."""
         return {f"{_LAST}{i}": sums for i, sums in enumerate(self._sums or ())}
 
-    def restore(self, halves: tuple, arrays: dict):
+    def restore(self, halves: tuple[Spread, Spread], arrays: dict):
         """Go on from these ``halves`` and what `store` gave."""
         self.halves = halves
         if self.count:

@@ -20,8 +20,8 @@ class Spread:
 
     count: int = 0
     spp: int = 0
-    mean: np.ndarray | None = None
-    squares: np.ndarray | None = None
+    mean: np.ndarray | float = 0.0
+    squares: np.ndarray | float = 0.0
 
     @staticmethod
     def of(image: np.ndarray, spp: int) -> Spread:
@@ -44,6 +44,6 @@ class Spread:
             self.squares + other.squares + apart**2 * (self.spp * other.spp / spp),
         )
 
-    def variance(self) -> np.ndarray:
+    def variance(self) -> np.ndarray | float:
         """Of the mean; there must be two images."""
         return self.squares / (self.spp * (self.count - 1))

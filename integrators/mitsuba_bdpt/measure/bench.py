@@ -82,7 +82,7 @@ class Bench:
         if cell.match == "spp" or cell.method == first.method:
             return self._possible(cell.sampler, cell.budget)
         if cell.method not in self._spp:
-            one = [c for c in self.cells.of(largest, 0) if c.method == cell.method][0]
+            one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
             kept = self.output / "ratios" / f"{one.key}.json"
             if not kept.exists():
                 for one_of_both in (first, cell):

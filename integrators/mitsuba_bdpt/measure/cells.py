@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..host.versions import versions
-from .preset import Preset, Subject
+from .preset import More, Preset, Subject
 from .project import Project
 from .reference import source_digest
 
@@ -64,7 +64,10 @@ class Cells:
     """The cells of a scene of a preset, integrators innermost."""
 
     def __init__(self, project: Project, preset: Preset, subject: Subject):
-        self.project, self.subject, self.more = project, subject, preset.more
+        self.project, self.subject = project, subject
+        self.more: More | None = None  # of [more], if the scene is among its own
+        if preset.more is not None and subject.name in preset.more.scenes:
+            self.more = preset.more
         self.methods = [m for m in preset.methods if m.scenes is None or subject.name in m.scenes]
         self.common = {
             "scene": subject.name,
@@ -109,11 +112,13 @@ class Cells:
         return self.project, self.subject.scene, self.common["resolution"], self.subject.max_depth
 
     def fewest(self) -> int:
-        """Seeds that [more] takes at least, 0 if the scene is not among its own."""
-        return self.more.at_least if self.more and self.subject.name in self.more.scenes else 0
+        """Seeds that [more] takes at least, 0 without it."""
+        return 0 if self.more is None else self.more.at_least
 
     def further(self, index: int) -> list[Cell]:
-        """The cells of [more] with its ``index``-th seed."""
+        """The cells of [more] with its ``index``-th seed; none without it."""
+        if self.more is None:
+            return []
         return self._turn(self.of(self.more.spp, FIRST_SEED + index, self.more.methods))
 
     @staticmethod

@@ -39,8 +39,8 @@ HEADS = (
 class Side:
     """A plugin with parameters, and the scene with the sampler that it is given."""
 
-    made: object
-    scene: object
+    made: mi.Integrator
+    scene: mi.Scene
 
     @staticmethod
     def of(parameters: dict, job: Job) -> Side:

@@ -43,14 +43,14 @@ class Lamp:
     ``radius`` of a sphere that shines outwards (0 of other shapes), solid angle ``cone`` into which it shines
     from a point, direction of an environment map's ``pole``."""
 
-    emitter: object
+    emitter: mi.Emitter
     kind: int
     probability: float
     area: float = 1.0
-    center: object = None
+    center: np.ndarray | None = None
     radius: float = 0.0
     cone: float = 4 * np.pi
-    pole: object = None
+    pole: np.ndarray | None = None
 
     def of_direction(self, towards):
         """Density of the direction ``towards`` an environment, without the choice."""

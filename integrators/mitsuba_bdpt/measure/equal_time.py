@@ -28,9 +28,9 @@ from .scenes import SceneFile, depth_of, integrator_of
 from .timing import timed
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-from matplotlib.colors import LogNorm  # noqa: E402
-from matplotlib.patches import Rectangle  # noqa: E402
+import matplotlib.pyplot as plt
+from matplotlib.colors import LogNorm
+from matplotlib.patches import Rectangle
 
 WINDOW = 6  # a window's side is this part of the image's
 COLOURS = ("#E69F00", "#56B4E9")  # of the two windows

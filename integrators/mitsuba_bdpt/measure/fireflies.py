@@ -129,8 +129,12 @@ def coefficients(plan, k: int) -> np.ndarray:
 
 
 def in_use(firefly: Firefly) -> np.ndarray:
-    """Densities of the strategies in use, in which each has its coefficient, over that of the one that made
-    the path."""
+    """Densities of the strategies in use, each with its coefficient, over that of the one that made the path.
+
+    Raises ``ValueError`` for a path that was not found anew.
+    """
+    if firefly.rebuilt is None:
+        raise ValueError(f"a path that was not found anew: {firefly.doubt}")
     return firefly.kappa * firefly.rebuilt.relative(firefly.path.s)
 
 

@@ -23,8 +23,10 @@ class Halves:
     between runs."""
 
     def __init__(self, path: Path, key: str):
-        self.path, self.key, self.rounds, self.sums, self.columns = path, key, 0, None, []
-        self.sources, self.counts, self.earlier = set(), None, None
+        self.path, self.key, self.rounds, self.columns = path, key, 0, []
+        self.sums = self.counts = np.zeros(0)  # of no shape before the first round
+        self.sources: set[str] = set()
+        self.earlier: Means | None = None
         if path.is_file():
             kept = np.load(path)
             if str(kept["key"]) != key:
@@ -33,7 +35,7 @@ class Halves:
                 self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
                 self.columns = list(kept["columns"])
                 whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
-                self.counts = kept["counts"] if "counts" in kept else whole
+                self.counts = kept.get("counts", whole)
                 self.sources = set(kept["sources"].tolist())
                 self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
         self.sources.add(source_digest())
@@ -65,7 +67,7 @@ class Halves:
         ``CommandError`` for values that are not finite, and leaves the sums as they are."""
         if not all(np.isfinite(image).all() for image in images):
             raise CommandError(f"{self.path.name}: round {self.rounds} has values that are not finite")
-        if self.sums is None:
+        if not self.rounds:
             self.sums, self.counts = np.zeros((2, *images[0].shape)), np.zeros((*images[0].shape[:2], 1))
         self.sums[:, *(window or ())] += times * np.stack(images)
         self.counts[window or ...] += times

@@ -289,7 +289,7 @@ class Window:
 
     def is_behind(self, halves: Halves) -> bool:
         """Whether it has fewer than `FOCUS_TIMES` the samples of the rest."""
-        if halves.counts is None:
+        if not halves.rounds:
             return False
         return halves.counts[self.slices].min() < FOCUS_TIMES * halves.counts.min()
 

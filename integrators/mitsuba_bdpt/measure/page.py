@@ -24,6 +24,7 @@ from . import figures, report
 from .analysis import NOTHING, Biased, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
+from .tables import ratio
 
 FRAME = Path(__file__).with_suffix(".html")
 
@@ -60,10 +61,10 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
     except Refused as why:
         return math.nan, f"No figure: {str(why).rstrip('.')}."
     if found.median >= 1:
-        span = f"({report.ratio(found.smallest)[:-1]} to {report.ratio(found.largest)})"
-        return found.median, f"path takes {report.ratio(found.median)} the time for the same error {span}."
-    span = f"({report.ratio(1 / found.largest)[:-1]} to {report.ratio(1 / found.smallest)})"
-    return found.median, f"path is ahead: its efficiency is {report.ratio(1 / found.median)} ours {span}."
+        span = f"({ratio(found.smallest)[:-1]} to {ratio(found.largest)})"
+        return found.median, f"path takes {ratio(found.median)} the time for the same error {span}."
+    span = f"({ratio(1 / found.largest)[:-1]} to {ratio(1 / found.smallest)})"
+    return found.median, f"path is ahead: its efficiency is {ratio(1 / found.median)} ours {span}."
 
 
 def why(results: Results, scene: str) -> str:

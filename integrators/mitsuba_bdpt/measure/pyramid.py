@@ -25,7 +25,7 @@ from .project import Project
 from .scenes import SceneFile, integrator_of
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 KINDS = ("weighted", "unweighted")
 

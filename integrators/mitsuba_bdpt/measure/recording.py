@@ -18,10 +18,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
+from ..host.jit import gc_paused
 from ..image import sink
 from ..run import rendering
+from ..sampling.points import Points
 from ..transport import connections, kernel
+from ..transport.batch import Batch
 from ..transport.counters import Counters
+from ..transport.inputs import Kernel
 from ..transport.observer import Observer
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
@@ -35,9 +39,9 @@ MOST_LANES = 1 << 24
 class Launch:
     """The arguments of `kernel.trace`, with the kernel as it was then, and the width of the film."""
 
-    kernel: object
-    batch: object
-    points: object
+    kernel: Kernel
+    batch: Batch
+    points: Points
     spp: int
     width: int
 
@@ -202,7 +206,7 @@ class _Subpath:
     vertices."""
 
     start: np.ndarray
-    infinite: np.ndarray | None = None
+    infinite: np.ndarray
     visits: list = field(default_factory=list)
 
     def ends_at(self, s: int, i: int):
@@ -227,7 +231,8 @@ class Recorder(Observer):
 
     def __init__(self, count: int):
         self._count, self._drawn = count, None
-        self.camera = self.light = self.pdf_w = None
+        self.camera, self.light = self._begun(np.zeros((3, count))), self._begun(np.zeros((3, count)))
+        self.pdf_w = np.zeros(count)
         self.contributions = []
 
     def emitted(self, emission):
@@ -238,7 +243,11 @@ class Recorder(Observer):
     def started(self, traced, side, walk, stream):
         """The camera subpath begins; of the light subpath `emitted` knows more."""
         if not side.adjoint:
-            self.camera = _Subpath(self._numbers(walk.previous, 3))
+            self.camera = self._begun(self._numbers(walk.previous, 3))
+
+    def _begun(self, start) -> _Subpath:
+        """A subpath from finite points ``start``, without further vertices."""
+        return _Subpath(start, np.zeros(self._count, dtype=bool))
 
     def vertex(self, side, walk, vertex, step):
         """A subpath has reached a vertex."""
@@ -252,7 +261,7 @@ class Recorder(Observer):
     @staticmethod
     def _survival(subpath, count: int, i: int) -> float:
         """The probability with which roulette let the first ``count`` vertices of a subpath come about."""
-        visits = [] if subpath is None else subpath.visits[: count - 1] if count else []
+        visits = subpath.visits[: count - 1] if count else []
         found = 1.0
         for a, b in pairwise(visits):
             found *= (a.throughput[:, i] * a.weight[:, i]).max() / b.throughput[:, i].max()
@@ -336,10 +345,11 @@ class Recorder(Observer):
 
     def paths(self, i: int) -> list[Path]:
         """The paths of sample ``i``, those that add most first."""
-        found = []
-        for c in self.contributions:
-            if c["active"][i] and c["value"][:, i].any():
-                found.append(self._path(i, {name: x[..., i] for name, x in c.items()}))
+        found = [
+            self._path(i, {name: x[..., i] for name, x in c.items()})
+            for c in self.contributions
+            if c["active"][i] and c["value"][:, i].any()
+        ]
         return sorted(found, key=lambda path: -path.value.max())
 
     def _path(self, i: int, c) -> Path:
@@ -376,13 +386,13 @@ class Recorder(Observer):
 def replay(outliers: list[Outlier]) -> list[list[Path]]:
     """The paths in each outlier, those that add most first: of camera samples all that have t >= 2, of splats
     those of the same strategy."""
-    found = [None] * len(outliers)
+    found: list[list[Path]] = [[] for _ in outliers]
     for launch in {id(o.launch): o.launch for o in outliers}.values():
         numbers = [i for i, o in enumerate(outliers) if o.launch is launch]
         slots = [outliers[i].slot for i in numbers]
         slots += slots[:1]  # Dr.Jit takes arrays of width 1 for constants
         recorder = Recorder(len(slots))
-        with rendering.gc_paused(), stepwise():
+        with gc_paused(), stepwise():
             drawn = launch.kernel, recorder, launch.batch, launch.points, launch.spp
             dr.eval(kernel.retrace(*drawn, mi.UInt32(slots), recorder))
         for lane, i in enumerate(numbers):

@@ -179,12 +179,13 @@ def _slope(results, scene, notes) -> str:
 
 def _chosen(row) -> str:
     """What the pilot of a render chose last, as parameters; empty without a pilot."""
-    decisions = json.loads(row["decisions"] or "null") or [None]
-    if decisions[-1] is None:
+    decisions = json.loads(row["decisions"] or "null")
+    last = decisions[-1] if decisions else None
+    if last is None:
         return ""
-    share = decisions[-1]["light_paths"]
+    share = last["light_paths"]
     light_paths = f"1/{round(1 / share)}" if share else "0"
-    return f"light_paths={light_paths}, connections={decisions[-1]['connections']}"
+    return f"light_paths={light_paths}, connections={last['connections']}"
 
 
 def _pilot_share(row) -> float:

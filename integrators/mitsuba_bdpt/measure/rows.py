@@ -98,7 +98,7 @@ def rows(project: Project, preset: Preset, output: Path) -> list[dict]:
     for subject in preset.subjects:
         cells = Cells(project, preset, subject)
         wanted = {c.key: c for c in cells.planned()}
-        if cells.fewest():
+        if cells.more is not None:
             wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
         found += read_rows(output, cells, wanted.values())
     return [row | {"first": preset.methods[0].name} for row in found]

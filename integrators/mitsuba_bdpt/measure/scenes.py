@@ -107,7 +107,7 @@ def _with_sampler(file: Path, kind: str, definitions: dict):
 def _replace_sampler(nodes, sensor, kind: str) -> None:
     """Give a ``sensor``, one of the ``nodes`` of a scene file, a sampler of another ``kind``."""
     properties = mi.Properties(kind)
-    for key in sensor.props.keys():  # noqa: SIM118 (not a dict)
+    for key in sensor.props.keys():
         held = sensor.props[key]
         if isinstance(held, mi.Properties.ResolvedReference):
             node = nodes[held.index()]

@@ -20,7 +20,7 @@ from itertools import groupby
 from pathlib import Path
 
 import mitsuba as mi
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from .. import workers
 from ..errors import CommandError, message
@@ -43,7 +43,8 @@ class Sweep:
         self.project, self.preset, self.output, self.failed = project, preset, output, []
         self._scenes = [Cells(project, preset, subject) for subject in preset.subjects]
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self._scenes]
-        self._judges, self._tried, self._progress, self._task = {}, set(), None, None
+        self._judges, self._tried = {}, set()
+        self._progress, self._task = Progress(), TaskID(0)  # those of `run`, until then shown nowhere
 
     def prepare(self, seconds: float):
         """Make references that are missing, each for at most about so many ``seconds``, and complain of those
@@ -126,26 +127,26 @@ class Sweep:
 
     def _more(self, cells: Cells) -> list[Cell]:
         """The cells of a further seed, none if the interval is narrow enough, or there are enough of them."""
-        if not cells.fewest():
+        more, seeds = cells.more, cells.fewest()
+        if more is None:
             return []
-        seeds = cells.fewest()
-        while seeds < cells.more.at_most and self._are_there(cells.further(seeds)):
+        while seeds < more.at_most and self._are_there(cells.further(seeds)):
             seeds += 1
         found = [c for seed in range(seeds) for c in cells.further(seed)]
         if not self._are_there(found):
             return []  # one of them failed
         try:
-            widths = analysis.widths(read_rows(self.output, cells, found), cells.more.methods)
+            widths = analysis.widths(read_rows(self.output, cells, found), more.methods)
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
             return []
-        if max(widths.values()) < cells.more.width or seeds == cells.more.at_most:
+        if max(widths.values()) < more.width or seeds == more.at_most:
             return []
         missing = [c for c in cells.further(seeds) if not self._is_there(c)]
         if not self._tried.isdisjoint(keys := {c.key for c in missing}):
             return []  # one of them failed
         self._tried |= keys
-        total = self._progress.tasks[self._task].total
+        total = self._progress.tasks[self._task].total or 0
         self._progress.update(self._task, total=total + len(missing))
         return missing
 

@@ -28,7 +28,7 @@ def candidates(prepared, full: Plan, settings: Settings) -> list[Configuration]:
     # A sensor with area sees delta emitters by light subpaths alone.
     tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
     for weighting in WEIGHTINGS:
-        if weighting.inner and full.connections == "none" or tied and not weighting.light:
+        if (weighting.inner and full.connections == "none") or (tied and not weighting.light):
             continue
         connections = "one" if weighting.inner else "none"
         if lost_without_arrival(Configuration.weighted(weighting, 1, connections).plan(full)) != lost:

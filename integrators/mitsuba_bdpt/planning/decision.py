@@ -96,7 +96,7 @@ def _read_decision(entry: dict) -> Decision:
     if not light_paths and connections != "none":
         raise ValueError(f"connections={connections!r} without light paths")
     if unknown := set(entry) - set(ENTRIES):
-        raise ValueError(f"{sorted(unknown)[0]} is no part of a decision")
+        raise ValueError(f"{min(unknown)} is no part of a decision")
     if isinstance(entry["pass"], bool) or not isinstance(entry["pass"], int):
         raise TypeError(f"pass={entry['pass']!r}")
     numbers = {

@@ -73,10 +73,11 @@ def _pilot(settings: Settings, table, certainty: float) -> list[str]:
     """What the pilot found: the best of each combination and number of light subpaths."""
     if not table:
         return []
-    lines = [
+    head = (
         "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, with "
         "what points take off it):"
-    ]
+    )
+    lines = [head]
     shown = set()
     for row in table:
         candidate = row.candidate

@@ -20,7 +20,7 @@ from ..geometry import rays
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..transport import bsdf
-from ..transport.kernel import Shared
+from ..transport.inputs import Shared
 from .possible import unreachable_paths
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
@@ -70,14 +70,14 @@ class _Ends:
     travelled (of what is seen: the radius of its disk, see `_seen`), ``active``: there is such an end.
     """
 
-    p: object
-    n: object
-    through: object
-    weight: object
-    edges: object
-    distance: object
-    reflectance: object
-    active: object
+    p: mi.Point3f
+    n: mi.Normal3f
+    through: mi.Bool
+    weight: mi.UnpolarizedSpectrum
+    edges: mi.UInt32
+    distance: mi.Float
+    reflectance: mi.UnpolarizedSpectrum
+    active: mi.Bool
 
     def some(self):
         """Of the active ones `COMPARED` at most, evenly chosen.
@@ -104,11 +104,11 @@ class _Walk:
     """A subpath on its way: its ray, what it carries, its edges, the distance that it has come; whether it
     goes on."""
 
-    ray: object
-    weight: object
-    edges: object
-    distance: object
-    active: object
+    ray: mi.Ray3f
+    weight: mi.Spectrum
+    edges: mi.UInt32
+    distance: mi.Float
+    active: mi.Bool
 
 
 def is_possible(prepared, plan, settings) -> bool:
@@ -276,7 +276,7 @@ def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) 
     Where one has both, a coin decides. One kernel for both sides.
     """
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
-    last, adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
+    last, is_adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
 
     def body(walk, generator, ends):
         ray, weight = walk.ray, walk.weight
@@ -294,7 +294,7 @@ def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) 
         active = active & ~here & delta & (walk.edges < last)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        factor *= dr.select(adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
+        factor *= dr.select(is_adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
         active &= ~bsdf.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)

@@ -37,7 +37,8 @@ from ..sampling.points import Points
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
 from ..transport.counters import COUNTERS, Counters, one
-from ..transport.kernel import Kernel, trace
+from ..transport.inputs import Kernel
+from ..transport.kernel import trace
 from . import moments
 from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
@@ -114,7 +115,9 @@ class Pilot:
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
-        joined = total["joined"] + one(counted.shadow_inner > 0)
+        # Which `connect_all` has counted.
+        rays = counted.shadow_inner
+        joined = total["joined"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
         # In the order of `begin`, as a loop's state has to be.
         found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
         return total | found, counted

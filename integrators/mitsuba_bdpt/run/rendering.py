@@ -27,7 +27,8 @@ from ..planning.planner import Planner
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
-from ..transport.kernel import Kernel, trace
+from ..transport.inputs import Kernel
+from ..transport.kernel import trace
 from ..transport.plan import Plan
 from .pass_points import PassPoints
 from .progress import Progress
@@ -81,10 +82,11 @@ class Render:
         # Whether the first pass, of one sample, gives roulette the scale of the image; see `_steps`.
         self._small_first: bool | None = None
         self._error: float | None = None
-        self._state: tuple | None = None  # of the newest report, see `_freeze`
+        # Of the newest report, see `_freeze`.
+        self._state: tuple[tuple[int, ...], Progress, dict] | None = None
 
     @property
-    def passes(self) -> tuple:
+    def passes(self) -> tuple[int, ...]:
         """Samples per pixel of each pass that is done."""
         return self.accumulator.passes
 
@@ -176,7 +178,7 @@ class Render:
         """The passes of `schedule` that are not done; under ``timeout`` cut to about a tenth of it."""
         if self._small_first is None:
             plan, decisions = self.plan, self.settings.decisions
-            known = self.planner.threshold is not None or decisions and decisions[0].first_pass == 0
+            known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
             self._small_first = bool(plan.roulette and plan.light and not known)
         earlier = sum(self.passes)
         for step in schedule(self.prepared.camera, self.spp, self.settings, self._small_first):
@@ -229,7 +231,7 @@ class Render:
             sum(self.passes), self.spp, seconds, sum(rays(self).values()), self._error, snapshot
         )
 
-    def _freeze(self) -> tuple:
+    def _freeze(self) -> tuple[tuple[int, ...], Progress, dict]:
         """Passes, progress and arrays of a snapshot of now, also when the next pass has begun.
 
         An interruption may come between any two of its steps. Nothing is copied yet.
@@ -243,12 +245,13 @@ class Render:
 
         Raises `UsageError` if a later report was made: each would keep the sums of its time.
         """
-        passes, progress, arrays = self._state
-        if len(passes) != reported:
+        state = self._state
+        if state is None or len(state[0]) != reported:
             raise UsageError(
                 f"snapshot() of the report after {reported} passes came too late; only the newest "
                 "report has one"
             )
+        passes, progress, arrays = state
         arrays = {name: np.array(a, dtype=np.float64) for name, a in arrays.items()}
         return Snapshot(self._identity(), passes, progress, arrays)
 

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling import sobol
+from .inputs import Kernel
 
 # Points of a net of one pixel, and nets of a pixel: their means differ by what points leave of the variance.
 # (Longer nets gain more, and there are fewer of them: with 16 points in half as many pixels what is found in
@@ -47,7 +48,7 @@ class Batch:
 class Places:
     """Where a camera sample of the batch lies: pixel, and index in the image's sequence."""
 
-    def __init__(self, kernel, batch: Batch, spp: int):
+    def __init__(self, kernel: Kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
         self._pilot = batch.spread > 0
@@ -78,13 +79,13 @@ class Places:
         pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // parts)
         return pixel + self._first_pixel, sample
 
-    def index(self, slot):
+    def index(self, slot: mi.UInt32) -> mi.UInt64:
         if self._pilot:  # each sample, or net, is of a sequence of its own
             within = dr.select(slot >= self._first_net, (slot - self._first_net) % NET, 0)
             return (mi.UInt64(slot - within) << 32) | mi.UInt64(within)
         pixel, sample = self._split(slot)
         return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)
 
-    def pixel(self, slot):
+    def pixel(self, slot: mi.UInt32) -> mi.Point2i:
         pixel, _ = self._split(slot)
         return self._camera.region.pixel(pixel)

@@ -9,6 +9,7 @@ where Mitsuba's importance mode with Veach's correction (thesis, eq. 5.19) is no
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -33,23 +34,23 @@ class Evaluation:
     ``pdf_fwd_w`` of leaving into the new direction, ``pdf_rev_w`` of the reverse.
     """
 
-    value: object
-    pdf_fwd_w: object
-    pdf_rev_w: object
+    value: mi.Spectrum
+    pdf_fwd_w: mi.Float
+    pdf_rev_w: mi.Float
 
 
 @dataclass
 class Step:
     """A sampled direction. Densities in solid angle; ``pdf_*`` are unset where ``delta``."""
 
-    wo: object
-    weight: object
-    pdf_fwd_w: object
-    pdf_rev_w: object
-    cos_out: object
-    delta: object
-    null: object
-    eta: object
+    wo: mi.Vector3f
+    weight: mi.Spectrum
+    pdf_fwd_w: mi.Float
+    pdf_rev_w: mi.Float
+    cos_out: mi.Float
+    delta: mi.Bool
+    null: mi.Bool
+    eta: mi.Float
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Traits:
     asked: Asked
 
     @staticmethod
-    def of(bsdfs) -> Traits:
+    def of(bsdfs: Sequence[mi.BSDF]) -> Traits:
         """Of BSDFs that one virtual call may visit."""
         return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs))
 
@@ -79,7 +80,7 @@ class Asked:
     kernel holds a function for each of them: those inside of others, which no ray meets, and those of other
     scenes.)"""
 
-    def __init__(self, bsdfs):
+    def __init__(self, bsdfs: Iterable[mi.BSDF]):
         by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
         self._bsdfs = list(by_id.values())
         self.many = len(by_id) >= MANY
@@ -117,24 +118,26 @@ class Target:
     """A local direction ``wo`` in which a BSDF is evaluated where ``active``; ``cos_ratio``, for light
     vertices, |n.wo| / |n.wi| with the geometric normal."""
 
-    wo: object
-    active: object
-    cos_ratio: object = None
+    wo: mi.Vector3f
+    active: mi.Bool
+    cos_ratio: mi.Float | None = None
 
 
-def with_wi(si, wi):
+def with_wi(si: mi.SurfaceInteraction3f, wi: mi.Vector3f) -> mi.SurfaceInteraction3f:
     """A copy of ``si`` that is seen from ``wi``. (Assigning to ``si.wi`` changes aliases.)"""
     other = mi.SurfaceInteraction3f(si)
     other.wi = wi
     return other
 
 
-def connectible(bsdf):
+def connectible(bsdf: mi.BSDFPtr):
     """Mask: the BSDF has a lobe that is not delta."""
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
 
-def evaluate(bsdf, si, wo, active, traits: Traits) -> Evaluation:
+def evaluate(
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, traits: Traits
+) -> Evaluation:
     """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
     return _evaluation(*_evaluated(bsdf, si, wo, active, traits.asked))
 
@@ -178,7 +181,7 @@ def _adjoint(cos_ratio, value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
     return _evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
 
 
-def geometric_cos(si, w):
+def geometric_cos(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Float:
     """Absolute cosine between the local direction ``w`` and the geometric normal."""
     return dr.abs(dr.dot(si.n, si.to_world(w)))
 
@@ -246,11 +249,11 @@ class _Drawn:
     event where it is delta) and, if `Traits.round_trip`, the weight ``back`` of a delta event made from its
     other end, 0 if it does not lead back."""
 
-    bs: object
-    weight: object
-    pdf_fwd_w: object
-    pdf_rev_w: object
-    back: object
+    bs: mi.BSDFSample3f
+    weight: mi.Spectrum
+    pdf_fwd_w: mi.Float
+    pdf_rev_w: mi.Float
+    back: mi.Spectrum
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
@@ -272,17 +275,17 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
 
 
-def brightest(value):
+def brightest(value: mi.Spectrum):
     """The largest entry of a spectrum, in size; one that is NaN counts only where all others do."""
     return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
 
 
-def is_zero(value):
+def is_zero(value: mi.Spectrum):
     """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
     return dr.all(mi.unpolarized_spectrum(value) == 0)
 
 
-def is_finite(value):
+def is_finite(value: mi.Spectrum):
     """Mask: no entry of a spectrum is NaN or infinite."""
     return dr.all(dr.isfinite(mi.unpolarized_spectrum(value)))
 
@@ -323,7 +326,7 @@ def _step(si, drawn: _Drawn, weight) -> Step:
     )
 
 
-def needs_full_pdf(bsdfs) -> bool:
+def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
     """Whether some BSDF's sample() may report another density than its pdf().
 
     A mixture that reports the picked lobe's density gives an unbiased ``weight`` but cannot serve
@@ -332,7 +335,7 @@ def needs_full_pdf(bsdfs) -> bool:
     return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in nested(bsdfs))
 
 
-def needs_round_trip(bsdfs) -> bool:
+def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
     """Whether a delta event may exist from one end only: under a bump or normal map.
 
     Mitsuba's maps drop sampled directions (not incident ones) on different sides of the surface and
@@ -344,7 +347,7 @@ def needs_round_trip(bsdfs) -> bool:
     )
 
 
-def nested(bsdfs):
+def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
     """``bsdfs`` and every BSDF inside them (two-sided, mask, blend, bump and normal maps)."""
     found = list(bsdfs)
     for bsdf in found:  # grows on the way

@@ -8,15 +8,16 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays, rounding
-from ..sampling.points import Purpose
+from ..sampling.points import Purpose, Stream
 from . import bsdf, mis
 from .contribution import Contribution, finite, roulette, size_of, worth_a_ray
 from .counters import Counters, one
+from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
 
 
-def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
+def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41).
 
     ``active`` where the contribution is not zero. The throughputs of ``z`` and ``y`` contain the edges to
@@ -57,7 +58,7 @@ def inner(kernel, z: Vertex, y: StoredVertex) -> Contribution:
 
 
 @dr.syntax
-def connect_all(kernel, z: Vertex, path: LightPath, total, add):
+def connect_all(kernel: Kernel, z: Vertex, path: LightPath, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
     ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
@@ -78,7 +79,7 @@ def connect_all(kernel, z: Vertex, path: LightPath, total, add):
     return total, counted
 
 
-def connect_one(kernel, z: Vertex, path: LightPath, stream):
+def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> tuple[mi.Spectrum, Counters]:
     """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
 
     The estimate is that of all of them. Returns what it adds to the sample, weighted, and `Counters`.
@@ -114,16 +115,16 @@ class _Drawn:
     ``end`` of the visibility ray to it (its slot, if `ShapeErrors.small`), what is left of the random number
     ``u``, and how many are not zero, and ``lost`` for want of a finite value."""
 
-    value: object
-    total: object
-    end: object
-    u: object
-    nonzero: object
-    lost: object
+    value: mi.Spectrum
+    total: mi.Float
+    end: mi.Point3f | mi.UInt32
+    u: mi.Float
+    nonzero: mi.UInt32
+    lost: mi.UInt32
 
 
 @dr.syntax
-def _draw(kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
+def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     """Draw one of the inner connections of ``z`` in proportion to its size.
 
     The draw is a running one. One random number serves all of it: what is left of it after each decision is
@@ -155,12 +156,12 @@ def _draw(kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     return _Drawn(value, total, end, u, nonzero, lost)
 
 
-def _sight(kernel, z: Vertex, y: StoredVertex):
+def _sight(kernel: Kernel, z: Vertex, y: StoredVertex):
     """`rays.sight` from ``z`` to the light vertex ``y``."""
     return rays.sight(kernel.shape_errors, z.anchor, y.anchor, rounding.met(y.si.shape, y.si.instance), z.si)
 
 
-def candidate_count(kernel, z: Vertex, path: LightPath):
+def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to try at ``z``: slot i holds y_{i+1} or a later one, and paths have at
     most `Kernel.last_inner` edges."""
     possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)

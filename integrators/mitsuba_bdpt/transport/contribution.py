@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from . import bsdf
 from .counters import Counters, one
+from .inputs import Kernel
 
 # Least probability of surviving roulette: random numbers are multiples of 2^-24.
 LEAST_SURVIVAL = 2.0**-20
@@ -24,17 +25,17 @@ class Contribution:
     was done for it.
     """
 
-    value: object
-    weight: object
-    s: object
-    t: object
-    active: object
-    shares: object = None
+    value: mi.Spectrum
+    weight: mi.Float
+    s: mi.UInt32
+    t: mi.UInt32
+    active: mi.Bool
+    shares: mi.Vector4f | None = None
     kind: str = ""
-    position: object = None
+    position: mi.Point2f | None = None
     counted: Counters = field(default_factory=Counters)
 
-    def weighted(self):
+    def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""
         return dr.select(self.active, self.value * self.weight, 0)
 
@@ -49,7 +50,9 @@ def finite(c: Contribution) -> Contribution:
     return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))
 
 
-def roulette(kernel, value, u, active):
+def roulette(
+    kernel: Kernel, value: mi.Spectrum, u: mi.Float, active: mi.Bool
+) -> tuple[mi.Bool, mi.Float, Counters]:
     """Unbiased roulette on a weighted contribution before its visibility is tested.
 
     Returns where it survived, the probability of that, and `Counters`."""
@@ -63,12 +66,12 @@ def roulette(kernel, value, u, active):
     return active & survived, survival, Counters(rouletted=one(active & ~survived))
 
 
-def worth_a_ray(kernel, value, weight):
+def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool:
     """Mask: a strategy of this ``value`` and weight is worth a ray, or has to be counted by `finite` (of what
     is not finite the weight may be 0). Technique images show unweighted ones too."""
     return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 
-def size_of(value):
+def size_of(value: mi.Spectrum):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
     return bsdf.brightest(value)

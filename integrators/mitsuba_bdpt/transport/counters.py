@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import drjit as dr
 import mitsuba as mi
 
+from .plan import Plan
+
 
 @dataclass
 class Counters:
@@ -21,15 +23,15 @@ class Counters:
     Records are added up, never changed: Dr.Jit's loops would not see it.
     """
 
-    camera: object = None
-    light: object = None
-    shadow_s1: object = None
-    shadow_t1: object = None
-    shadow_inner: object = None
-    evaluated: object = None
-    zero: object = None
-    rouletted: object = None
-    non_finite: object = None
+    camera: mi.UInt32 | None = None
+    light: mi.UInt32 | None = None
+    shadow_s1: mi.UInt32 | None = None
+    shadow_t1: mi.UInt32 | None = None
+    shadow_inner: mi.UInt32 | None = None
+    evaluated: mi.UInt32 | None = None
+    zero: mi.UInt32 | None = None
+    rouletted: mi.UInt32 | None = None
+    non_finite: mi.UInt32 | None = None
 
     @staticmethod
     def zeros(*names: str) -> Counters:
@@ -42,7 +44,7 @@ class Counters:
 
         return Counters(*(added(getattr(self, name), getattr(other, name)) for name in COUNTERS))
 
-    def summed(self):
+    def summed(self) -> mi.UInt64:
         """The lanes' counters added up: ``UInt64``, in the order of `COUNTERS`."""
         total = dr.zeros(mi.UInt64, len(COUNTERS))
         for i, name in enumerate(COUNTERS):
@@ -56,18 +58,18 @@ class Counters:
 COUNTERS = tuple(field.name for field in fields(Counters))
 
 
-def one(mask):
+def one(mask: mi.Bool) -> mi.UInt32:
     """1 in lanes where ``mask`` holds, else 0."""
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
-def counted_by_light(plan) -> Counters:
+def counted_by_light(plan: Plan) -> Counters:
     """What the vertices of light subpaths count."""
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
     return Counters.zeros(*names, *["non_finite"] * (plan.splat or plan.arrival))
 
 
-def counted_by_camera(plan) -> Counters:
+def counted_by_camera(plan: Plan) -> Counters:
     """What the vertices of camera subpaths count."""
     one = plan.connections == "one"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..settings import MAX_STORED
+from ..sampling.points import Points
+from ..settings import MAX_STORED, Settings
 from . import mis
 from .observer import Observer
+from .plan import Plan
 
 # Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
 STORE_SIZES = (64, MAX_STORED)
@@ -21,12 +23,12 @@ class Coefficients:
     """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`; the Python
     number 0 for classes that are not in use."""
 
-    hit: object
-    direct: object
-    splat: object
-    endpoints: object
-    arrival: object
-    inner: object
+    hit: mi.Float | mi.Vector4f | int
+    direct: mi.Float | mi.Vector4f | int
+    splat: mi.Float | mi.Vector4f | int
+    endpoints: mi.Float | mi.Vector4f | int
+    arrival: mi.Float | mi.Vector4f | int
+    inner: mi.Float | mi.Vector4f | int
 
 
 @dataclass
@@ -34,16 +36,21 @@ class Shared:
     """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves; ``u_wavelength``
     chose the wavelengths, ``weight`` is 1 / their density."""
 
-    time: object
-    wavelengths: object
-    weight: object
-    u_wavelength: object
+    time: mi.Float
+    wavelengths: mi.Color0f | mi.Spectrum
+    weight: mi.Spectrum
+    u_wavelength: mi.Float
 
 
 class Kernel:
     """Everything that a pass needs besides its batch. Holds the scene for one render only."""
 
-    def __init__(self, prepared, plan, settings, heuristic):
+    # What `bound` adds for one batch.
+    points: Points
+    count_light: mi.Float
+    observer: Observer
+
+    def __init__(self, prepared, plan: Plan, settings: Settings, heuristic: mis.Heuristic):
         self.scene, self.camera, self.emitters = prepared.scene, prepared.camera, prepared.emitters
         self.plan, self.heuristic = plan, heuristic
         self.shape_errors = prepared.emitters.shape_errors
@@ -64,7 +71,7 @@ class Kernel:
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
 
-    def bound(self, points, count_light: float, observer: Observer) -> Kernel:
+    def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
         camera subpath, which the estimates of t <= 1 are divided by (weights keep the nominal one)."""
         other = copy(self)
@@ -72,11 +79,11 @@ class Kernel:
         other.observer = observer
         return other
 
-    def within_store(self, k):
+    def within_store(self, k: mi.UInt32) -> mi.Bool:
         """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
         return k <= self._reach
 
-    def set_threshold(self, size):
+    def set_threshold(self, size: mi.Float64):
         """Contributions below this size play roulette (a power of two near it, so that the order of atomic
         sums rarely changes a decision), none if it is 0. ``size``: ``Float64`` of width 1."""
         rounded = dr.exp2(dr.round(dr.log2(size)))
@@ -84,7 +91,7 @@ class Kernel:
         dr.eval(self.inverse_threshold)
 
 
-def _coefficients(plan, by_class: bool) -> Coefficients:
+def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
     """Run-time values, or ``by_class`` those of a pilot: 1 in the place of the class, see `mis.ByClass`."""
 
     def entry(kind, value, used):

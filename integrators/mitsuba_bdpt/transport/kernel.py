@@ -60,7 +60,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
-from ..sampling.points import Points, Purpose
+from ..sampling.points import Points, Purpose, Stream
+from ..sensors.records import CameraStart
 from . import bsdf, contribution, light_path, mis, techniques
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, one
@@ -83,13 +84,13 @@ class _Lane:
 class _Sample:
     """A camera sample: its `CameraStart`, random numbers, point of the lens, and whether there is one."""
 
-    start: object
-    stream: object
-    u_lens: object
-    covered: object
+    start: CameraStart
+    stream: Stream
+    u_lens: mi.Point2f
+    covered: mi.Bool
 
 
-def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
+def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UInt64:
     """Trace one batch and put its contributions into ``sink`` (see `sink`).
 
     ``spp`` is the render's total, which places the batch in the image's point sequence. Returns
@@ -111,7 +112,9 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int):
     return (of_light + of_camera).summed()
 
 
-def retrace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot, observer: Observer):
+def retrace(
+    kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot: mi.UInt32, observer: Observer
+) -> mi.UInt64:
     """Trace some camera samples of a batch again, as `trace` does, and show an ``observer`` how.
 
     The samples of these ``slot``s (``UInt32``), with the light subpath of the lane that each is in. (For
@@ -139,7 +142,7 @@ def _count_light(batch: Batch, sharing: Sharing) -> float:
     return 1.0 if batch.spread else sharing.lanes / batch.size
 
 
-def _begin(kernel, sink, place: Places, index) -> tuple[_Lane, Counters]:
+def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[_Lane, Counters]:
     """The lanes of these numbers with their light subpaths, which are traced."""
     stream = kernel.points.stream("light", place.index(index), index)
     shared = _shared(kernel, stream)
@@ -150,7 +153,7 @@ def _begin(kernel, sink, place: Places, index) -> tuple[_Lane, Counters]:
     return _Lane(place, shared, path), counters
 
 
-def _shared(kernel, stream) -> Shared:
+def _shared(kernel: Kernel, stream) -> Shared:
     sensor, points = kernel.camera.sensor, kernel.points
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -166,7 +169,7 @@ def _shared(kernel, stream) -> Shared:
 # -- the light subpath ------------------------------------------------------------------------
 
 
-def _light_subpath(kernel, sink, stream, shared, path) -> tuple[light_path.LightPath, Counters]:
+def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[light_path.LightPath, Counters]:
     """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections."""
     plan = kernel.plan
     e = _emission(kernel, stream, shared)
@@ -193,7 +196,7 @@ def _light_subpath(kernel, sink, stream, shared, path) -> tuple[light_path.Light
     return path, counters + Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
 
 
-def _emission(kernel, stream, shared):
+def _emission(kernel: Kernel, stream, shared):
     """y_0 and the first direction, an `emitters.Emission`."""
     points = kernel.points
     e = kernel.emitters.sample_emission(
@@ -206,7 +209,7 @@ def _emission(kernel, stream, shared):
     return e
 
 
-def _light_walk(kernel, e, shared) -> Walk:
+def _light_walk(kernel: Kernel, e, shared) -> Walk:
     """A light subpath on its first edge."""
     h = kernel.heuristic
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
@@ -222,7 +225,7 @@ def _light_walk(kernel, e, shared) -> Walk:
     return replace(walk, broken=broken)
 
 
-def _light_side(kernel, e, stream, shared, walk) -> Side:
+def _light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
     return Side(
         "light",
         shared,
@@ -235,7 +238,7 @@ def _light_side(kernel, e, stream, shared, walk) -> Side:
     )
 
 
-def _splat(kernel, sink, c, shared) -> Counters:
+def _splat(kernel: Kernel, sink, c, shared) -> Counters:
     """Hand a contribution with t <= 1 to the sink."""
     c = contribution.finite(c)
     return c.counted + sink.splat(kernel, c, shared)
@@ -245,7 +248,7 @@ def _splat(kernel, sink, c, shared) -> Counters:
 
 
 @dr.syntax
-def _serve_all(kernel, sharing: Sharing, seat, serve) -> Counters:
+def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
     counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
     served = mi.UInt32(0)
@@ -259,7 +262,7 @@ def _serve_all(kernel, sharing: Sharing, seat, serve) -> Counters:
     return counters
 
 
-def _camera_subpath(kernel, sink, lane: _Lane, slot, active) -> Counters:
+def _camera_subpath(kernel: Kernel, sink, lane: _Lane, slot, active) -> Counters:
     """Trace a camera subpath and join it with the lane's light subpath."""
     sample = _camera_sample(kernel, lane, slot, active)
     active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
@@ -272,7 +275,7 @@ def _camera_subpath(kernel, sink, lane: _Lane, slot, active) -> Counters:
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 
-def _camera_sample(kernel, lane: _Lane, slot, active) -> _Sample:
+def _camera_sample(kernel: Kernel, lane: _Lane, slot, active) -> _Sample:
     """z_0 and the first direction."""
     points = kernel.points
     stream = points.stream("camera", lane.place.index(slot), slot)
@@ -284,7 +287,7 @@ def _camera_sample(kernel, lane: _Lane, slot, active) -> _Sample:
     return _Sample(start, stream, u_lens, active)
 
 
-def _camera_walk(kernel, start, active) -> Walk:
+def _camera_walk(kernel: Kernel, start, active) -> Walk:
     """A camera subpath on its first edge."""
     ray = start.ray
     if kernel.plan.hide_emitters:
@@ -295,7 +298,7 @@ def _camera_walk(kernel, start, active) -> Walk:
     return Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active)
 
 
-def _first_partial(kernel, start):
+def _first_partial(kernel: Kernel, start):
     """Partial sums of a camera subpath's first edge: t = 1 is its newest alternative, t = 0 an older one."""
     h = kernel.heuristic
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
@@ -304,7 +307,7 @@ def _first_partial(kernel, start):
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
 
 
-def _camera_side(kernel, sink, sample: _Sample, shared, walk) -> Side:
+def _camera_side(kernel: Kernel, sink, sample: _Sample, shared, walk) -> Side:
     def choose_emitter(z):
         return techniques.choose_emitter(kernel, z, sample.stream)
 
@@ -321,7 +324,7 @@ def _camera_side(kernel, sink, sample: _Sample, shared, walk) -> Side:
     )
 
 
-def _camera_visit(kernel, sink, lane: _Lane, sample: _Sample):
+def _camera_visit(kernel: Kernel, sink, lane: _Lane, sample: _Sample):
     """What is done at each vertex of a camera subpath: the strategies with t >= 2."""
     plan, start, shared = kernel.plan, sample.start, lane.shared
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..geometry import rays
 from . import bsdf, mis
+from .inputs import Kernel
 from .walk import Vertex
 
 
@@ -22,12 +23,12 @@ class StoredVertex:
     rays.
     """
 
-    si: object
-    bsdf: object
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
     anchor: rays.Anchor
-    throughput_over_cos: object
+    throughput_over_cos: mi.Spectrum
     partial: mis.Partial
-    edges: object
+    edges: mi.UInt32
 
     @staticmethod
     def of(vertex: Vertex) -> StoredVertex:
@@ -50,16 +51,16 @@ class LightPath:
     of which is in ``si``; ``s`` the number of light vertices up to and including each.
     """
 
-    si: object
-    throughput_over_cos: object
-    d_vcm: object
-    d_vc: object
-    rounding: object
-    s: object
-    count: object
+    si: dr.Local[mi.SurfaceInteraction3f]
+    throughput_over_cos: dr.Local[mi.Spectrum]
+    d_vcm: dr.Local[mi.Float]
+    d_vc: dr.Local[mi.Float] | dr.Local[mi.Vector4f]
+    rounding: dr.Local[mi.Vector2f]
+    s: dr.Local[mi.UInt32]
+    count: mi.UInt32
 
 
-def allocate_light_path(kernel, lanes: int) -> LightPath:
+def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     """Local memory for stored vertices; no field is a Bool (these abort LLVM code generation)."""
     size = kernel.store_size
     return LightPath(
@@ -74,7 +75,7 @@ def allocate_light_path(kernel, lanes: int) -> LightPath:
     )
 
 
-def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
+def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     """Keep a light vertex that inner connections can use."""
     keep = vertex.hit & (vertex.edges <= kernel.last_stored) & bsdf.connectible(vertex.bsdf)
     y, slot = StoredVertex.of(vertex), path.count
@@ -87,7 +88,7 @@ def store_light_vertex(kernel, vertex: Vertex, path: LightPath):
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
-def read_light_vertex(kernel, path: LightPath, slot) -> StoredVertex:
+def read_light_vertex(kernel: Kernel, path: LightPath, slot: mi.UInt32) -> StoredVertex:
     """The stored vertex ``slot``, the same in all lanes that use it."""
     si = path.si[slot]
     rounding = path.rounding[slot]

@@ -24,12 +24,19 @@ is the Python number 0 belongs to classes that are not in use: nothing is comput
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import UsageError
 from ..settings import HEURISTICS
+
+if TYPE_CHECKING:
+    # One number, under `ByClass` one for each class; the Python number 0 for classes that are not in use.
+    # (Records that loops carry write it out: Dr.Jit evaluates their annotations.)
+    PartialSum = mi.Float | mi.Vector4f | int
+    Coefficient = PartialSum
 
 # Classes whose coefficients a render may choose: s = 0, s = 1 (t >= 2), t <= 1, s and t >= 2.
 CLASSES = ("hit", "direct", "light", "inner")
@@ -43,8 +50,8 @@ SATURATION = 1e37
 class Partial:
     """Partial sums of one subpath; see the module's description."""
 
-    d_vcm: object
-    d_vc: object
+    d_vcm: mi.Float | mi.Vector4f | int
+    d_vc: mi.Float | mi.Vector4f | int
 
 
 def is_absent(x) -> bool:

@@ -45,11 +45,11 @@ class Seat:
     """A lane's place in a part: ``row`` and ``column`` of its run, ``pixel`` in the run, ``sample`` of the
     pixel."""
 
-    lane: object
-    row: object
-    column: object
-    pixel: object
-    sample: object
+    lane: mi.UInt32
+    row: mi.UInt32
+    column: mi.UInt32
+    pixel: mi.UInt32
+    sample: mi.UInt32
 
 
 class Sharing:
@@ -59,7 +59,7 @@ class Sharing:
     that in the mean of several renders no two pixels share much.
     """
 
-    def __init__(self, pixels: int, samples: int, served: int, seed):
+    def __init__(self, pixels: int, samples: int, served: int, seed: mi.UInt32):
         part = -(-pixels // served)
         self.total, self.lanes = pixels * samples, part * samples
         run = run_pixels(part)
@@ -70,14 +70,14 @@ class Sharing:
         self._last, self._bits = dr.opaque(u32, run - 1), dr.opaque(u32, run.bit_length() - 1)
         self._rows, self._columns = dr.opaque(u32, rows), dr.opaque(u32, columns)
 
-    def seat(self, lane) -> Seat:
+    def seat(self, lane: mi.UInt32) -> Seat:
         """What `slot` needs of a ``lane`` (``UInt32``), the same for all parts."""
         pixel = lane // self._samples
         run = pixel >> self._bits
         row = run // self._columns
         return Seat(lane, row, run - row * self._columns, pixel & self._last, lane - pixel * self._samples)
 
-    def slot(self, seat: Seat, part):
+    def slot(self, seat: Seat, part: mi.UInt32) -> mi.UInt32:
         """The sample of a ``part`` (``UInt32``) that a lane serves; there is none if this is not below
         ``total``."""
         keys = self._keys(part)
@@ -87,7 +87,7 @@ class Sharing:
         row = _turned(row, self._rows, hashed)
         return part * self._lanes + self._place(seat, part, row, column, hashed)
 
-    def lane(self, slot):
+    def lane(self, slot: mi.UInt32) -> mi.UInt32:
         """The lane that serves a sample, the inverse of `slot`."""
         part = slot // self._lanes
         seat, keys = self.seat(slot - part * self._lanes), self._keys(part)

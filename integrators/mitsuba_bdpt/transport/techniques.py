@@ -13,15 +13,18 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from ..emitters.records import Direct, Emission
 from ..geometry import rays
-from ..sampling.points import Purpose
+from ..sampling.points import Purpose, Stream
+from ..sensors.records import CameraJoin
 from . import bsdf, mis
 from .contribution import Contribution, roulette, worth_a_ray
 from .counters import Counters, one
+from .inputs import Kernel
 from .walk import Vertex, newest_coefficient
 
 
-def sees_emitter(kernel, z: Vertex):
+def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     """Mask: the camera subpath has hit an emitter that may be seen."""
     active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
     if kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
@@ -29,7 +32,7 @@ def sees_emitter(kernel, z: Vertex):
     return active
 
 
-def hit_emitter(kernel, z: Vertex) -> Contribution:
+def hit_emitter(kernel: Kernel, z: Vertex) -> Contribution:
     """s = 0: the camera subpath has hit an emitter (eqs. 42, 43)."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
@@ -63,7 +66,7 @@ def _known(value, *pdfs):
     return dr.select(finite, value, dr.nan)
 
 
-def choose_emitter(kernel, z: Vertex, stream):
+def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, bsdf.Target]:
     """Sample an emitter for the camera vertex ``z``: an `emitters.Direct` and the `bsdf.Target` in which it
     lies."""
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & bsdf.connectible(z.bsdf)
@@ -72,7 +75,7 @@ def choose_emitter(kernel, z: Vertex, stream):
     return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
 
 
-def next_event(kernel, z: Vertex) -> Contribution:
+def next_event(kernel: Kernel, z: Vertex) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
@@ -101,7 +104,7 @@ def next_event(kernel, z: Vertex) -> Contribution:
     return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", counted=counted)
 
 
-def join_endpoints(kernel, emission, stream, active) -> Contribution:
+def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
     """(1,1): a sampled emitter point seen directly by the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
@@ -141,7 +144,7 @@ def join_endpoints(kernel, emission, stream, active) -> Contribution:
     return Contribution(value, weight, *ends, active, shares, "light", join.position, counted)
 
 
-def look_at_sensor(kernel, y: Vertex, stream):
+def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoin, bsdf.Target]:
     """Join the light vertex ``y`` with the sensor: what `Sensor.join` returns, and the `bsdf.Target` in which
     that lies."""
     active = y.hit & bsdf.connectible(y.bsdf) & (y.edges <= kernel.last_splat)
@@ -153,7 +156,7 @@ def look_at_sensor(kernel, y: Vertex, stream):
     return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
 
 
-def splat(kernel, y: Vertex, stream) -> Contribution:
+def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47)."""
     h, scene, join, f = kernel.heuristic, kernel.scene, y.endpoint, y.f
     to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
@@ -182,7 +185,7 @@ def splat(kernel, y: Vertex, stream) -> Contribution:
     return replace(c, value=value / survival, active=active, counted=counted)
 
 
-def hit_sensor(kernel, emission, y: Vertex, walk) -> Contribution:
+def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     """t = 0: the last edge of a light subpath hits the sensor.
 
     ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
@@ -212,7 +215,7 @@ def hit_sensor(kernel, emission, y: Vertex, walk) -> Contribution:
     return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light", z.position)
 
 
-def _sensor_points(kernel, stream, edges=0):
+def _sensor_points(kernel: Kernel, stream, edges=0):
     """The random points with which the light vertex ``edges`` is joined with the sensor."""
     u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, edges)
     if not kernel.camera.needs_film_sample:

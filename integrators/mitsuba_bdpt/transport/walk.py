@@ -6,14 +6,19 @@ Vertices are numbered as in the field: y_0 / z_0 is the endpoint, ``edges`` the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ..emitters.records import Direct
 from ..geometry import rays
 from ..sampling.points import Purpose
+from ..sensors.records import CameraJoin
 from . import bsdf, mis
+from .inputs import Kernel, Shared
 from .mis import choose
 
 
@@ -31,20 +36,20 @@ class Walk:
     What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
     """
 
-    pi: object
-    o: object
-    d: object
-    previous: object
-    throughput: object
+    pi: mi.PreliminaryIntersection3f
+    o: mi.Point3f
+    d: mi.Vector3f
+    previous: mi.Point3f
+    throughput: mi.Spectrum
     partial: mis.Partial
-    eta: object
-    edges: object
-    seen: object
-    broken: object
-    active: object
+    eta: mi.Float | int
+    edges: mi.UInt32
+    seen: mi.Bool
+    broken: mi.Bool
+    active: mi.Bool
 
     @staticmethod
-    def begin(kernel, pi, ray, previous, throughput, partial, active) -> Walk:
+    def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active) -> Walk:
         """A subpath on its first edge."""
         return Walk(
             pi=pi,
@@ -60,7 +65,7 @@ class Walk:
             active=active,
         )
 
-    def traced(self):
+    def traced(self) -> mi.UInt32:
         """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
         return dr.maximum(self.edges, 2) - 1
 
@@ -72,20 +77,21 @@ class Vertex:
     starts rays; ``hit`` is false in the surroundings; ``endpoint`` with which it is to be joined and ``f``
     the BSDF towards it (a `bsdf.Evaluation`), where ``endpoint_active``, see `Side`."""
 
-    si: object
-    bsdf: object
-    cos: object
+    si: mi.SurfaceInteraction3f
+    bsdf: mi.BSDFPtr
+    cos: mi.Float
     anchor: rays.Anchor
-    throughput: object
+    throughput: mi.Spectrum
     partial: mis.Partial
-    edges: object
-    previous: object
-    seen: object
-    hit: object
-    active: object
-    endpoint: object = None
-    endpoint_active: object = None
-    f: object = None
+    edges: mi.UInt32
+    previous: mi.Point3f
+    seen: mi.Bool
+    hit: mi.Bool
+    active: mi.Bool
+    # Set where there is a `Side.join`, and nowhere else asked for: what it returns, and an `Evaluation`.
+    endpoint: Any = None
+    endpoint_active: Any = None
+    f: Any = None
 
 
 @dataclass(frozen=True)
@@ -104,18 +110,18 @@ class Side:
     """
 
     name: str
-    shared: object
-    reference: object
+    shared: Shared
+    reference: mi.Float
     adjoint: bool
-    last_edge: object
-    coefficient: object
-    complete: object = None
+    last_edge: mi.UInt32
+    coefficient: mi.Float | mi.Vector4f | int
+    complete: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Float] | None = None
     alpha: bool = False
     parallel: bool = False
-    join: object = None
+    join: Callable[[Vertex], tuple[Direct | CameraJoin, bsdf.Target]] | None = None
 
 
-def not_finite(active, throughput, *directions):
+def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
     """The walk's gate. Mask: active subpaths that end because ``throughput`` or a direction is not finite.
 
     Whatever finds a density from which no weight follows makes the throughput NaN (`bsdf._step`, `_vertex`).
@@ -127,7 +133,7 @@ def not_finite(active, throughput, *directions):
 
 
 @dr.syntax
-def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
+def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
     """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
 
     ``visit(vertex, state, walk)`` returns the new state; ``walk`` as it was before it arrived.
@@ -147,13 +153,13 @@ def random_walk(kernel, side: Side, walk: Walk, stream, visit, state):
     return state, walk
 
 
-def newest_coefficient(kernel, first, edges):
+def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
     """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1 (s = 0 differs,
     see `techniques.hit_emitter`); ``first`` is that at vertex 1, see `Side`."""
     return choose(edges == 1, first, kernel.kappa.inner)
 
 
-def _vertex(kernel, side: Side, walk: Walk) -> Vertex:
+def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the walk's edge; densities go over to the area measure."""
     h = kernel.heuristic
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
@@ -190,7 +196,7 @@ def _vertex(kernel, side: Side, walk: Walk) -> Vertex:
     )
 
 
-def _interact(kernel, side: Side, walk: Walk, vertex: Vertex, stream):
+def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     """Sample the direction of the next edge, and put into ``vertex`` what joins it with an endpoint."""
     if not kernel.surfaces:  # a virtual call needs somebody to call
         return None
@@ -216,7 +222,7 @@ def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
     return vertex.hit if side.alpha else _goes_on(side, walk, vertex)
 
 
-def _leave(kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
+def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
     """Take the sampled ``step`` and trace the next edge."""
     if step is None:
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
