@@ -23,7 +23,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files import images
 from mitsuba_bdpt.files.loading import in_proportion, load
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "render.py"
 
 SCENE = """
 <scene version="3.0.0">
