@@ -1,6 +1,6 @@
 """How good renders are that stop at an estimated error.
 
-    python scripts/stopping.py cornell_box uplight_room glass_caustics --until-error 0.01 --renders 32
+    python scripts/stopping.py cornell_box uplight_room glass_caustics --target-error 0.01 --renders 32
 
 Renders of different seeds stop at the first estimate (``statistics["error"]``) that is small enough. Shown
 are, as means over renders, the samples per pixel, that estimate, the relMSE against the scene's reference,
@@ -29,7 +29,7 @@ def line(name: str, error: float, renders: int) -> str:
     depth = benchmark_depth(name)
     target = repository.load_reference(name, RESOLUTION, depth).image
     scene = repository.load_scene(name, resolution=RESOLUTION)
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "variance": True, "until_error": error})
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "variance": True, "target_error": error})
     spp, estimates, found, means = [], [], [], []
     for seed in range(renders):
         image = np.array(bdpt.render(scene, seed=seed, spp=MOST_SPP), dtype=np.float64)[..., :3]
@@ -50,14 +50,14 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+")
-    parser.add_argument("--until-error", type=number(float, 1e-9), default=0.01)
+    parser.add_argument("--target-error", type=number(float, 1e-9), default=0.01)
     parser.add_argument("--renders", type=number(int, 2), default=32)
     args = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     print("| scene | asked | spp | estimate | relMSE (smallest–largest) | mean of the image |")
     print("| --- | --- | --- | --- | --- | --- |")
     for name in args.scenes:
-        print(line(name, args.until_error, args.renders), flush=True)
+        print(line(name, args.target_error, args.renders), flush=True)
     return 0
 
 

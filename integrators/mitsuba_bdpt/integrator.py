@@ -44,10 +44,10 @@ shares by the number of the emitter; what is lost is estimated at the first rend
 
 Layers of the film come in this order: colours and alpha, features, variance, strategies.
 
-``statistics["decisions"]`` is what the pilot chose, ``statistics["no_pilot"]`` why none was asked, or none
-decided: an empty text where one did, and where ``decisions`` were given. ``statistics["pilots"]``: how many
-were asked, and of how many it was remembered what they found. They draw the same numbers for all seeds, so
-that all renders of a scene decide alike.
+``statistics["decisions"]`` is what was decided, by a pilot, by the scene alone or as given, and
+``statistics["no_pilot"]`` why no pilot was asked, or none decided: an empty text where one did, and where
+``decisions`` were given. ``statistics["pilots"]``: how many were asked, and of how many it was remembered
+what they found. They draw the same numbers for all seeds, so that all renders of a scene decide alike.
 
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
@@ -187,10 +187,11 @@ class BDPTIntegrator:
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:
-        """What the pilot of such a render chooses, as in ``statistics["decisions"]``.
+        """What such a render decides before its first pass, as in ``statistics["decisions"]``.
 
-        An empty list without a pilot, about which ``statistics["no_pilot"]`` says why. The parameter
-        ``decisions`` of other renders of the scene takes it as JSON. All ``seed``s decide alike.
+        By a pilot or by the scene alone; an empty list where neither decides, about which
+        ``statistics["no_pilot"]`` says why. The parameter ``decisions`` of other renders takes it as JSON.
+        All ``seed``s decide alike.
         """
         check_made_for(self, scene)
         sensor = resolve_sensor(scene, sensor)

@@ -141,7 +141,7 @@ _READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice
 
 
 def _check_layers(settings: Settings):
-    """Raise ``ValueError`` if two layers of the film have the same name."""
+    """Raise ``UsageError`` if two layers of the film have the same name."""
     seen = set()
     names = features.feature_names(settings.aovs)
     for layer in layer_names(settings.strategy_depth, settings.variance, names):
@@ -216,7 +216,7 @@ def _check_together(settings: Settings):
 
 
 def check_variant():
-    """Raise ``NotImplementedError`` for variants that the method cannot serve, or is not known to."""
+    """Raise ``UnsupportedError`` for variants that the method cannot serve, or is not known to."""
     variant = mi.variant() or "none"
     if variant.startswith("scalar"):
         raise UnsupportedError(
@@ -236,7 +236,7 @@ def check_variant():
 
 
 def check_not_frozen():
-    """Raise ``NotImplementedError`` while a function is recorded by ``dr.freeze``."""
+    """Raise ``UnsupportedError`` while a function is recorded by ``dr.freeze``."""
     if dr.flag(dr.JitFlag.FreezingScope):
         raise UnsupportedError(
             "a render inside of a function under dr.freeze is not supported: its passes are planned "
@@ -246,7 +246,7 @@ def check_not_frozen():
 
 
 def check_scene(scene, sensor):
-    """Raise ``NotImplementedError`` for what the method cannot render."""
+    """Raise ``UnsupportedError`` for what the method cannot render."""
     if sensor.get_medium() is not None:
         raise UnsupportedError(
             f"sensor {named(sensor)} lies in a participating medium, which is not supported; "
@@ -261,7 +261,7 @@ def check_scene(scene, sensor):
 
 
 def check_film(sensor, settings: Settings):
-    """Raise ``NotImplementedError`` for layers that the film cannot have, ``ValueError`` for a film without
+    """Raise ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without
     pixels or too large; returns its colours."""
     colour = film_colours(sensor)
     if settings.strategy_images and isinstance(colour, Bands):
@@ -277,7 +277,7 @@ def check_film(sensor, settings: Settings):
 
 
 def _check_has_pixels(film):
-    """Raise ``ValueError`` for a film without pixels."""
+    """Raise ``UsageError`` for a film without pixels."""
     width, height = (int(x) for x in film.crop_size())
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"

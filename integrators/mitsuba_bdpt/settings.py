@@ -31,8 +31,7 @@ class Parameter:
 
     ``default`` as in a scene file; ``what``: its value, in a few words for error messages; ``meaning``: its
     entry in the manual, in reStructuredText; ``low`` and ``high`` bound numbers, both included (of a
-    ``float`` infinity is not); ``choices`` of a string, the default first. A ``decisive`` one is chosen by
-    the scene or a pilot unless it is given.
+    ``float`` infinity is not); ``choices`` of a string, the default first.
     """
 
     default: bool | int | float | str

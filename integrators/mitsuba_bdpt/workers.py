@@ -63,7 +63,7 @@ def worker_count(client) -> int:
 
 @contextmanager
 def connected(address: str):
-    """A ``distributed.Client`` of the scheduler at ``address``. Raises ``ValueError`` if distributed is not
+    """A ``distributed.Client`` of the scheduler at ``address``. Raises ``CommandError`` if distributed is not
     installed or the scheduler has no worker, ``OSError`` if there is no such scheduler."""
     try:
         from distributed import Client

@@ -1,4 +1,4 @@
-"""What was tried to break the method: cases by section, run by scripts/stress.py and tests/test_stress.py."""
+"""What was tried to break the method: cases by section, run by scripts/stress.py and as tests."""
 
 from importlib import import_module
 

@@ -1,6 +1,6 @@
 """Random chains of densities, and the weights of all strategies by the recursion.
 
-What tests/test_oracle.py and the stress cases share; the truth is in `oracle`.
+What tests/transport/test_oracle.py and the stress cases share; the truth is in `oracle`.
 """
 
 from __future__ import annotations

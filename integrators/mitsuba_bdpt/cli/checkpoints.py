@@ -31,7 +31,7 @@ def digest(options: Namespace) -> str:
 
 
 def check(options: Namespace, output: Path) -> None:
-    """Raise ``ValueError`` if a checkpoint would be overwritten unasked, ``OSError`` if none can be
+    """Raise ``CommandError`` if a checkpoint would be overwritten unasked, ``OSError`` if none can be
     written."""
     path = path_of(output)
     if options.checkpoint is not None:
@@ -43,7 +43,7 @@ def check(options: Namespace, output: Path) -> None:
 
 
 def start(options: Namespace, output: Path) -> Snapshot:
-    """The snapshot to go on from; raises ``ValueError`` if there is none, or one of another scene."""
+    """The snapshot to go on from; raises ``CommandError`` if there is none, or one of another scene."""
     path = path_of(output)
     if not path.exists():
         raise CommandError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")

@@ -35,7 +35,7 @@ STRIDE = 0x9E3779B9
 
 
 def check_settings(settings) -> None:
-    """Raise ``ValueError`` for parameters that would mean something else in each part."""
+    """Raise ``CommandError`` for parameters that would mean something else in each part."""
     for name in ("timeout", "target_error"):
         value = getattr(settings, name)
         if value > 0 or (name == "timeout" and value == 0):

@@ -40,7 +40,7 @@ def _run(options: Namespace) -> int:
 
 
 def check_installed(command: str) -> None:
-    """Raise ``ValueError`` if the extra ``[measure]`` is not there."""
+    """Raise ``CommandError`` if the extra ``[measure]`` is not there."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise CommandError(

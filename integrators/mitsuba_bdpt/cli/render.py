@@ -91,7 +91,7 @@ def explain(options: Namespace) -> int:
 
 
 def check_options(options: Namespace, output: Path) -> None:
-    """Raise ``ValueError`` for options that contradict one another."""
+    """Raise ``CommandError`` for options that contradict one another."""
     if options.resume and options.checkpoint is None:
         raise CommandError("resume needs --checkpoint MINUTES: how often to write the next ones.")
     if options.parts is not None and options.scheduler is None:
@@ -115,7 +115,7 @@ def check_options(options: Namespace, output: Path) -> None:
 
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
-    """Raise ``ValueError`` for options that only ``bdpt`` can follow, and for what these cannot."""
+    """Raise ``CommandError`` for options that only ``bdpt`` can follow, and for what these cannot."""
     for name in ("checkpoint", "scheduler"):
         if getattr(options, name) is not None and not hasattr(integrator, "assemble"):
             raise CommandError(

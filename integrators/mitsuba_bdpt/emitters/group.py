@@ -65,20 +65,20 @@ class Group:
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
         """Sample y_0 and the direction to y_1, given the emitter: `Emitters` adds the selection."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no sample_emission")
 
     def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
         """Density with which emission from y_0 goes along ``d`` to ``p``, in ``pdf_second``'s measure."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no direction_density")
 
     def connection_density(self, chosen: Chosen, emission: Emission, si, active):
         """Density, selection included, of next-event estimation making y_0 of ``emission`` from its first hit
         ``si``: in the measure of ``pdf_first``, times the squared length of the edge (1 at infinity)."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no connection_density")
 
     def radiance_towards(self, chosen: Chosen, emission: Emission, d, active):
         """Radiance (intensity, irradiance) that y_0 sends along ``d``."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no radiance_towards")
 
     # -- next-event estimation and hits -----------------------------------------------------
 
@@ -88,12 +88,12 @@ class Group:
         ``ds``, ``weight``: what Mitsuba's ``sample_direction`` returned, one call for all groups:
         they must not be changed. Densities of the result include the selection; ``met`` stays None.
         """
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no complete_direct")
 
     def hit_densities(self, chosen: Chosen, hit: Hit, active):
         """Densities, selection included, with which light-side strategies make the point that was hit, as
         `Emitters.hit_densities` returns them."""
-        raise NotImplementedError
+        raise NotImplementedError(f"{type(self).__name__} has no hit_densities")
 
 
 def emitting_point(p, shared):

@@ -1,4 +1,4 @@
-"""Which group of emitters each class of Mitsuba's belongs to."""
+"""Which group of emitters each class belongs to, by what its ``class_name()`` returns."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ KINDS: dict[str, type[Group]] = {
     "TimedSunskyEmitter": InfiniteEmitters,
 }
 
+# Classes of Mitsuba's own, which have all calls. (Virtual calls visit every emitter in the process: one of
+# another class that has a group above still need not have ``sample_position``.)
+MITSUBAS = frozenset(KINDS)
+
 # In the order in which a kernel asks them.
 GROUPS: tuple[type[Group], ...] = (*dict.fromkeys(KINDS.values()), HitOnlyEmitters, ThirdPartyEmitters)
 
@@ -35,7 +39,7 @@ def group_of(emitter) -> type[Group]:
 
 def is_third_party(class_name: str) -> bool:
     """Whether an emitter's class is not Mitsuba's."""
-    return class_name not in KINDS
+    return class_name not in MITSUBAS
 
 
 def third_party_elsewhere(scene) -> int:

@@ -41,6 +41,9 @@ class Surfaces:
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
         for emitter in filter(None, emitters):
             _check(emitter, context)
+        # Before areas are asked for: of a mesh whose faces have vertices that do not exist it is any number.
+        self._smooth_meshes = SmoothMeshes.of(emitters)
+        self.smooth = self._smooth_meshes is not None
         areas = rows(emitters, 1.0, lambda emitter: dr.slice(emitter.get_shape().surface_area()))
         if 0 in areas:
             emitter = emitters[areas.index(0)]
@@ -51,8 +54,6 @@ class Surfaces:
         self.inv_area = dr.rcp(mi.Float(areas))
         dr.make_opaque(self.inv_area)
         self._by_shape, self._context = by_shape, context
-        self._smooth_meshes = SmoothMeshes.of(emitters)
-        self.smooth = self._smooth_meshes is not None
         turned = [s is not None and s.turned for s in spheres]
         self._turned = None
         if any(turned):

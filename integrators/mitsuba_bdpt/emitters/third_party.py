@@ -21,6 +21,10 @@ class ThirdPartyEmitters(Group):
     limits = "its class is not Mitsuba's: only the calls that camera subpaths need are used"
 
     @classmethod
+    def left_out(cls, emitter) -> list[tuple[str, str]]:
+        return [(what, f"{why} ({emitter.class_name()})") for what, why in super().left_out(emitter)]
+
+    @classmethod
     def is_hittable(cls, emitter) -> bool:
         return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
 

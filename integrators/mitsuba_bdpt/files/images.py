@@ -18,7 +18,7 @@ PNG_SIDE = 1_000_000
 
 
 def check_png(film: mi.Film) -> None:
-    """Raise ``ValueError`` for an image that no PNG can hold, which would come out after the render."""
+    """Raise ``CommandError`` for an image that no PNG can hold, which would come out after the render."""
     width, height = film.crop_size()
     if max(width, height) > PNG_SIDE:
         raise CommandError(
@@ -115,7 +115,7 @@ def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
 
 def read_layers(path: Path, *layers: str):
     """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_layers`, and its header; raises
-    ``ValueError`` for another file."""
+    ``CommandError`` for another file."""
     with path.open("rb") as file:  # OpenEXR does not say what hinders it
         start = file.read(4)
     if start != MAGIC[".exr"]:

@@ -51,7 +51,7 @@ _STARTS = (
 
 
 def elements(file: Path) -> list[ElementTree.Element]:
-    """All elements of a scene file, in its order; raises ``ValueError`` if it is not XML."""
+    """All elements of a scene file, in its order; raises ``CommandError`` if it is not XML."""
     text = _decoded(file.read_bytes())
     try:
         # Mitsuba takes comments that hold two hyphens, XML does not.
@@ -157,8 +157,8 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
 
 
 def _check_kind(name: str) -> None:
-    """Raise ``ValueError`` if the plugin ``name`` is known to be no integrator. (What those in Python are is
-    known when they are made, and what is no plugin is answered then.)"""
+    """Raise ``CommandError`` if the plugin ``name`` is known to be no integrator. (What those in Python are
+    is known when they are made, and what is no plugin is answered then.)"""
     kind = mi.PluginManager.instance().plugin_type(name)
     if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
         raise CommandError(_no_integrator(name, f"of type {kind.name.lower()}"))
@@ -169,7 +169,7 @@ def _no_integrator(name: str, what: str) -> str:
 
 
 def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
-    """Raise ``ValueError`` if the file ``scene`` holds one object that is no scene."""
+    """Raise ``CommandError`` if the file ``scene`` holds one object that is no scene."""
     root = state.nodes[0]
     if root.type != mi.ObjectType.Scene:
         held = f"{root.type.name.lower()} {root.props.plugin_name()}"
@@ -180,7 +180,7 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
 
 
 def _check_film_sizes(state: mi.parser.ParserState) -> None:
-    """Raise ``ValueError`` for films without pixels, of which Mitsuba says that they see too much."""
+    """Raise ``CommandError`` for films without pixels, of which Mitsuba says that they see too much."""
     for node in state.nodes:
         for name in ("width", "height") if node.type == mi.ObjectType.Film else ():
             if isinstance(size := node.props.get(name, 1), int) and size < 1:
@@ -188,7 +188,7 @@ def _check_film_sizes(state: mi.parser.ParserState) -> None:
 
 
 def check_file(scene: Path) -> None:
-    """Raise ``ValueError`` if the ``scene`` file does not exist."""
+    """Raise ``CommandError`` if the ``scene`` file does not exist."""
     if not scene.is_file():
         raise CommandError(f"scene={str(scene)!r} is not a file; {_scenes_near(scene)}")
 
@@ -319,7 +319,7 @@ def replace_integrator(
     ``overrides``.
 
     Of integrators around another one (`AROUND`), with their layers, `bdpt` takes the place of all of them,
-    for it has layers of its own; others take the place of the innermost. Raises ``ValueError`` for layers
+    for it has layers of its own; others take the place of the innermost. Raises ``CommandError`` for layers
     that cannot be kept."""
     given = node.props
     if kind == "bdpt" and given.plugin_name() in AROUND:

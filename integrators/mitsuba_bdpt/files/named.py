@@ -10,8 +10,8 @@ from .loading import elements
 
 def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
     """Meshes, textures, spectra and scene files that a scene file names, and those that the latter name, as
-    far as they exist, each once; raises ``ValueError`` if one of the scene files is not XML. ``definitions``
-    of parameters, for names that hold some."""
+    far as they exist, each once; raises ``CommandError`` if one of the scene files is not XML.
+    ``definitions`` of parameters, for names that hold some."""
     found = {}
     _note_files(scene, dict(definitions), [Path()], found)
     return list(found)

@@ -12,7 +12,7 @@ from .whole import replacing
 
 
 def read_toml(path: Path) -> dict:
-    """A TOML file; raises ``ValueError`` naming it if it is none, ``OSError`` if it is not there."""
+    """A TOML file; raises ``CommandError`` naming it if it is none, ``OSError`` if it is not there."""
     try:
         return tomllib.loads(path.read_text())
     except ValueError as error:  # of TOML, or of text that is not UTF-8

@@ -17,8 +17,8 @@ def _temporary(path: Path) -> Path:
 
 
 def check_format(path: Path, output: Path) -> None:
-    """Raise ``ValueError`` if ``path``, which goes with ``output``, is a file of another format than the one
-    that its suffix names; an image of that format may be replaced."""
+    """Raise ``CommandError`` if ``path``, which goes with ``output``, is a file of another format than the
+    one that its suffix names; an image of that format may be replaced."""
     kind = path.suffix.lower()
     if kind not in MAGIC or not path.is_file():  # of a pipe nothing must be read
         return
@@ -32,7 +32,7 @@ def check_format(path: Path, output: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ``OSError`` now if `replacing` could not write `path` later, ``ValueError`` if it is something
+    """Raise ``OSError`` now if `replacing` could not write `path` later, ``CommandError`` if it is something
     else than a file."""
     if path.exists() and not path.is_file():
         raise CommandError(f"{str(path)!r} is no file; name another output.")

@@ -49,7 +49,7 @@ class SmoothMeshes:
         dr.make_opaque(self._normals, self._sums, self._area, self._first, self._count)
 
     def _check(self, index, owner, faces):
-        """Raise ``ValueError`` unless the points that Mitsuba samples are in the planes of the faces here."""
+        """Raise ``UsageError`` unless the points that Mitsuba samples are in the planes of the faces here."""
         u, shape = spread_points(CHECKED), owner.get_shape()
         p = np.array(shape.sample_position(0, u).p, dtype=np.float64).T
         face = np.array(self._face(mi.UInt32(index), u.y, mi.Bool(True))) - int(self._first[index])

@@ -18,7 +18,7 @@ _TOLERANCE = 1e-3
 
 
 def check_to_world(shape, owner: str):
-    """Raise ``ValueError`` if ``shape``, on which ``owner`` is, has a ``to_world`` with which Mitsuba samples
+    """Raise ``UsageError`` if ``shape``, on which ``owner`` is, has a ``to_world`` with which Mitsuba samples
     other points or normals than rays find, or with another density than it states: `path` is wrong there too.
     Meshes are right with every matrix."""
     check = _CHECKS.get(shape.shape_type())

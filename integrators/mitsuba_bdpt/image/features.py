@@ -39,7 +39,7 @@ KINDS = (
 
 
 def check_syntax(aovs: str):
-    """Raise ``ValueError`` unless ``aovs`` consists of pairs ``name:kind``, as ``aov`` has them."""
+    """Raise ``UsageError`` unless ``aovs`` consists of pairs ``name:kind``, as ``aov`` has them."""
     for pair in pairs(aovs):
         name, colon, kind = pair.partition(":")
         if not (name and colon and kind):

@@ -64,7 +64,7 @@ class Halves:
     def add(self, images, window=None, times: float = 1.0):
         """Add an image to each half, and keep the sums. ``window`` (slices of rows and columns): the images
         are of that part alone; ``times``: they have so many times the samples of a whole one. Raises
-        ``ValueError`` for values that are not finite, and leaves the sums as they are."""
+        ``CommandError`` for values that are not finite, and leaves the sums as they are."""
         if not all(np.isfinite(image).all() for image in images):
             raise CommandError(f"{self.path.name}: round {self.rounds} has values that are not finite")
         if not self.rounds:

@@ -76,7 +76,7 @@ class Recipe:
 
     @staticmethod
     def of(project: Project, name: str) -> Recipe:
-        """That of a scene; raises ``ValueError`` for one that cannot be followed."""
+        """That of a scene; raises ``CommandError`` for one that cannot be followed."""
         file = project.references / "scenes.toml"
         entry = (read_toml(file) if file.is_file() else {}).get(name, {})
         keys = {"by", "windows", "radiance"}
@@ -132,7 +132,7 @@ class Job:
 
 def obtained(job: Job) -> Reference:
     """The stored reference, made now if there is none, with renders enough for a bias check, and a word on
-    standard output. Raises ``ValueError`` if the stored one is of another scene."""
+    standard output. Raises ``CommandError`` if the stored one is of another scene."""
     if not reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
         print(
             f"{job.scene.name}: no reference at {job.resolution} and depth {job.depth} yet; making one, "
@@ -159,7 +159,7 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def check_size(job: Job) -> None:
-    """Raise ``ValueError`` for an image that the tiles of a bias check do not divide."""
+    """Raise ``CommandError`` for an image that the tiles of a bias check do not divide."""
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return

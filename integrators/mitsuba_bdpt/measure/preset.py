@@ -102,7 +102,7 @@ class Preset:
 
 
 def read_preset(path: Path, project: Project) -> Preset:
-    """Read and check a TOML file of a ``project``; raises ``ValueError`` naming the file and the key."""
+    """Read and check a TOML file of a ``project``; raises ``CommandError`` naming the file and the key."""
     data = read_toml(path)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")

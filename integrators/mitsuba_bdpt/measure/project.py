@@ -52,7 +52,7 @@ class Project:
 
     def scene(self, name: str) -> SceneFile:
         """A scene by its name, or by its file, seen from here or from the project's folder; raises
-        ``ValueError`` that says what there is if there is none."""
+        ``CommandError`` that says what there is if there is none."""
         for file in (Path(name), self.scenes / f"{name}.xml", self.root / name):
             if file.is_file():
                 return SceneFile(file.stem, file)

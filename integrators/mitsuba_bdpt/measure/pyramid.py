@@ -60,7 +60,7 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """The pyramid as a picture: rows of path lengths, s rising to the right; raises ``ValueError`` if no
+    """The pyramid as a picture: rows of path lengths, s rising to the right; raises ``CommandError`` if no
     strategy contributes."""
     if not found:
         raise CommandError(

@@ -63,7 +63,7 @@ class Outlier:
 
 class Collector(sink.Image):
     """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel). Raises
-    ``ValueError`` for a launch of too many ``lanes``."""
+    ``CommandError`` for a launch of too many ``lanes``."""
 
     def __init__(self, film, least, lanes: int):
         super().__init__(film)
@@ -101,7 +101,7 @@ class Collector(sink.Image):
         dr.scatter_reduce(dr.ReduceOp.Add, rows, packet, row, active & (row < CAPACITY))
 
     def found(self, launch: Launch) -> list[Outlier]:
-        """What was kept, the launch being over; raises ``ValueError`` if that was too much."""
+        """What was kept, the launch being over; raises ``CommandError`` if that was too much."""
         found = []
         for number, rows in self.kept:
             count = int(number[0])
@@ -138,7 +138,8 @@ def _outlier(launch: Launch, row, slot: int) -> Outlier:
 
 def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it: all samples larger than ``least`` (of the
-    image's shape) in one of the colours, largest first. Raises ``ValueError`` for a film of other colours."""
+    image's shape) in one of the colours, largest first. Raises ``CommandError`` for a film of other colours.
+    """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise CommandError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")

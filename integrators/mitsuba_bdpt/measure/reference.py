@@ -52,7 +52,7 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
 
 
 def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
-    """The stored reference; raises ``ValueError`` with the command that makes it, if there is none, and
+    """The stored reference; raises ``CommandError`` with the command that makes it, if there is none, and
     if it was made of another version of the scene's file."""
     path = reference_path(project, scene.name, resolution, max_depth)
     make = f"mitsuba-bdpt reference {project.called(scene)} --resolution {resolution} --max-depth {max_depth}"

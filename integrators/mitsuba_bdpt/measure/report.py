@@ -46,7 +46,7 @@ from .tables import ranged, ratio, said, table
 
 
 def load(project: Project, folder: Path) -> tuple[Results, dict]:
-    """The data of a folder, and the references of its scenes by name; raises ``ValueError`` if no sweep has
+    """The data of a folder, and the references of its scenes by name; raises ``CommandError`` if no sweep has
     filled it, and if the errors were taken against other references than those of the ``project``."""
     try:
         rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
@@ -447,7 +447,7 @@ def replace_part(text: str, name: str, part: str) -> str:
 
 
 def machine(results: Results) -> str:
-    """Where and with what it was measured; raises ``ValueError`` for rows of several machines or versions,
+    """Where and with what it was measured; raises ``CommandError`` for rows of several machines or versions,
     and for those of one scene by several sources of the plugin (a scene may be measured anew by itself)."""
     found, source_of, scenes = set(), {}, {}
     for row in results.rows:

@@ -28,8 +28,8 @@ class SceneFile:
         sensor's sampler of the type ``sampler``; what is None stays as in the file.
 
         Where the file has parameters ``$resolution`` and ``$sampler`` these are set, as are those of
-        ``definitions``; else film and sampler are changed. Raises ``ValueError`` for a scene without sensor,
-        ``RuntimeError`` (of Mitsuba) for a file that cannot be loaded.
+        ``definitions``; else film and sampler are changed. Raises ``CommandError`` for a scene without
+        sensor, ``RuntimeError`` (of Mitsuba) for a file that cannot be loaded.
         """
         asked = {"resolution": resolution, "sampler": sampler}
         known = parameters(self.file)

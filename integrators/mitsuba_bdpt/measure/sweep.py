@@ -162,7 +162,7 @@ def _description(cell: Cell) -> str:
 
 
 def chosen(preset: Preset, names) -> Preset:
-    """The part of a preset about the scenes ``names``, without probes; raises ``ValueError`` for others."""
+    """The part of a preset about the scenes ``names``, without probes; raises ``CommandError`` for others."""
     known = [subject.name for subject in preset.subjects]
     for name in names:
         if name not in known:

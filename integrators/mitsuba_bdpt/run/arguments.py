@@ -12,7 +12,7 @@ from .snapshot import Snapshot
 
 
 def check_made_for(integrator, scene):
-    """Raise ``TypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
+    """Raise ``UsageTypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
     for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
         if not isinstance(thing, kind):
             raise UsageTypeError(

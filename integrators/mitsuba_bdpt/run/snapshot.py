@@ -64,8 +64,10 @@ class Snapshot:
         return sum(self.passes)
 
     def check(self, identity: dict, apart_from=()):
-        """Raise ``ValueError`` naming the first entry in which this is another render than ``identity``."""
-        for name in sorted(set(identity) | set(self.identity)):
+        """Raise ``UsageError`` naming the first entry in which this is another render than ``identity``."""
+        # The version first: parameters of another one may differ in name only.
+        names = sorted(set(identity) | set(self.identity), key=lambda name: (name != "version", name))
+        for name in names:
             mine, given = self.identity.get(name), identity.get(name)
             if name not in apart_from and mine != given:
                 raise UsageError(
@@ -112,7 +114,7 @@ class Snapshot:
 
     @staticmethod
     def from_bytes(data: bytes) -> Snapshot:
-        """The snapshot of `to_bytes`; raises ``ValueError`` if it is none."""
+        """The snapshot of `to_bytes`; raises ``UsageError`` if it is none."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
@@ -130,7 +132,7 @@ class Snapshot:
 
 
 def read(path: Path) -> Snapshot:
-    """The snapshot in a file; raises ``ValueError`` naming it if it holds none, ``OSError``."""
+    """The snapshot in a file; raises ``UsageError`` naming it if it holds none, ``OSError``."""
     try:
         return Snapshot.from_bytes(path.read_bytes())
     except ValueError as error:

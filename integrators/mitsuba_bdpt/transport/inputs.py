@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points
-from ..settings import MAX_STORED, UNLIMITED, Settings
+from ..settings import MAX_STORED, Settings
 from . import mis
 from .observer import Observer
 from .plan import Plan
@@ -56,7 +56,7 @@ class Kernel:
         self.shape_errors = prepared.emitters.shape_errors
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
         self.traits = prepared.traits
-        depth = min(settings.max_depth, UNLIMITED)
+        depth = settings.max_depth
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
         self.strategy_images = settings.strategy_images

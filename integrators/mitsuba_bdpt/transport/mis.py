@@ -73,7 +73,7 @@ def times(coefficient: Coefficient, pdf: mi.Float) -> PartialSum:
 class Heuristic:
     """How alternatives are combined: ``balance``, ``power`` (exponent 2), ``maximum``, ``uniform``.
 
-    Raises ``ValueError`` for any other name.
+    Raises ``UsageError`` for any other name.
     """
 
     def __init__(self, name: str):

@@ -1,7 +1,7 @@
 """Values of users' plugins, textures and meshes that are not finite, and reflectances above 1.
 
 Families of such values are in scripts/stress_cases/non_finite.py and non_finite_shapes.py, with what is
-expected of each and the reason of each tolerance; the quick ones are run by tests/test_stress.py.
+expected of each and the reason of each tolerance; the quick ones are run by tests/repository/test_stress.py.
 """
 
 import math

@@ -11,7 +11,7 @@ import mitsuba as mi  # isort: skip
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SCENES = sorted((ROOT / "scenes").glob("*.xml"))
 NAMES = [path.stem for path in SCENES]
 WIDE = {"veach_mis"}  # 16:9: the height is a parameter of its own

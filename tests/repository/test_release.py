@@ -6,7 +6,7 @@ from pathlib import Path
 
 import mitsuba_bdpt
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def test_version_has_one_home():

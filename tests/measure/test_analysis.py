@@ -20,7 +20,7 @@ from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.scenes import digest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TRUE = np.full(51, 2.0)
 
 

@@ -12,7 +12,7 @@ from importlinter import cli
 
 import mitsuba as mi  # isort: skip
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_imports_go_one_way(capsys):

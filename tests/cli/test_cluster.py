@@ -25,7 +25,7 @@ SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <shape type="sphere"><transform name="to_world"><translate z="5"/></transform></shape>
 <emitter type="constant"><rgb name="radiance" value="$radiance"/></emitter></scene>"""
 
-SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
+SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 
 
 def arguments(workers, output, *others):

@@ -284,7 +284,7 @@ def test_decisions_do_not_depend_on_the_unit_of_radiance(name):
     the image times that factor: within 1e-5 of its mean (sums of atomics) but for a percent of the pixels,
     where what is too faint for single precision took part in a draw. No sample without finite value.
     """
-    scenes, images, records = Path(__file__).parents[1] / "scenes", [], []
+    scenes, images, records = Path(__file__).parents[2] / "scenes", [], []
     for factor in (1.0, 2.0**-66, 2.0**40, 2.0**66):
         scene = mi.load_file(str(scenes / f"{name}.xml"), resolution=32)
         params = mi.traverse(scene)
@@ -447,7 +447,7 @@ def test_small_caustics_get_their_light(name, monkeypatch):
     with 16 camera subpaths for a light subpath it was a dozen white dots, three to eight times less efficient
     than with one each (raw relMSE times time). Expected: for pilots of four seeds a light subpath per camera
     subpath, or for two, in place of 1/4 to 1/16."""
-    target = mi.load_file(str(Path(__file__).parents[1] / "scenes" / "small_casters" / f"{name}.xml"))
+    target = mi.load_file(str(Path(__file__).parents[2] / "scenes" / "small_casters" / f"{name}.xml"))
     for seed in range(4):
         monkeypatch.setattr(Planner, "pilot_seed", seed)
         render = rendering.Render(target, target.sensors()[0], bdpt(max_depth=8).settings, seed, 64)
@@ -545,7 +545,7 @@ def test_what_renders_do_not_meet_does_not_decide(monkeypatch):
     are in no render. Expected: in `window_room`, where the sun shines on gloss, path tracing alone is
     predicted to take at most 4 times as long as the best (renders show 1.1; without the bound of `RAREST`
     one of these seeds says 16)."""
-    file = Path(__file__).parents[1] / "scenes" / "window_room.xml"
+    file = Path(__file__).parents[2] / "scenes" / "window_room.xml"
     target = mi.load_file(str(file), resolution=128)
     integrator = bdpt(max_depth=target.integrator().max_depth)
     for seed in range(6):

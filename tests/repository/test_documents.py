@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from mitsuba_bdpt import settings
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
 
 

@@ -29,7 +29,7 @@ SAMPLES = 1 << 15  # of ours in a render; twice as many of `path`
 SAMPLES_OF_A_PIXEL = 1 << 14  # where there is one alone
 LEAST_SHARE = 0.9  # of the renders in which a tile must be lit to be compared
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 T = parts.T
 
 

@@ -20,7 +20,7 @@ from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.measure import compare, equal_time
 from mitsuba_bdpt.measure.scenes import depth_of
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
 ROOM = """<scene version="3.0.0">
     <integrator type="path"><integer name="max_depth" value="3"/></integrator>

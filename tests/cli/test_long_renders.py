@@ -17,7 +17,7 @@ from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.run import work
 from mitsuba_bdpt.run.snapshot import read
 
-SCENE = Path(__file__).parents[1] / "scenes" / "cornell_box.xml"
+SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 ARGUMENTS = ["render", str(SCENE), "-D", "resolution=16", "-P", "spp_per_pass=4", "--seed", "5"]
 
 

@@ -13,7 +13,7 @@ import pytest
 from mitsuba_bdpt.geometry import quadrics, rays, rounding
 from welch import assert_agree, compare_images, tile_means
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 # (scale of the unit-sized shape, distance by which it is moved in each coordinate)
 PLACES = {"small": (1e-3, 0.0), "unit": (1.0, 0.0), "large": (1e3, 0.0), "moved": (1.0, 1e3)}

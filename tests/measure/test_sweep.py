@@ -25,7 +25,7 @@ from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
 from mitsuba_bdpt.measure.rows import errors
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 PRESET = """
 resolution = 8
 max_depth = 3

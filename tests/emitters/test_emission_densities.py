@@ -41,6 +41,16 @@ def emission(name, **others):
     return scene, emitters, e
 
 
+def test_no_emitter_is_left_out():
+    """Rationale: a kind of emitter that is added later has to be looked at here. Expected: each one of
+    `scene_parts.EMITTERS` from which light subpaths start is in one of the lists above."""
+    parts.register_plugins()
+    ball = {"type": "sphere"}
+    scenes = {name: {"type": "scene", "ball": ball, "lamp": make()} for name, make in parts.EMITTERS.items()}
+    traced = {name for name, scene in scenes.items() if Emitters(mi.load_dict(scene)).traced}
+    assert traced == {*AT_A_POINT, *AT_INFINITY, *ON_SURFACES, "directional"}
+
+
 def numbers(rows, seed=11):
     return np.random.default_rng(seed).random((rows, COUNT), dtype=np.float32)
 

@@ -23,7 +23,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files import images
 from mitsuba_bdpt.files.loading import in_proportion, load
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "render.py"
+SCRIPT = Path(__file__).parents[2] / "scripts" / "render.py"
 
 SCENE = """
 <scene version="3.0.0">
@@ -490,7 +490,8 @@ MISTYPED = [
 def test_mistyped_names_are_answered_with_those_that_exist(scene, capsys, arguments, words):
     """Expected: of ``-D`` those of an included file too, with a default or without."""
     if "prat" in arguments[0]:
-        Path("part.xml").write_text('<scene version="3.0.0"><default name="part" value="3"/></scene>')
+        part = '<default name="part" value="3"/><emitter type="point" id="$part"/>'
+        Path("part.xml").write_text(f'<scene version="3.0.0">{part}</scene>')
         text = SCENE.replace("<default", '<include filename="part.xml"/><default', 1)
         scene.write_text(text.replace('name="width" value="6"', 'name="width" value="$width"'))
         arguments = [*arguments, "-Dwidth=6"]

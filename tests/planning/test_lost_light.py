@@ -12,7 +12,7 @@ from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f
 
-SCENES = Path(__file__).parents[1] / "scenes"
+SCENES = Path(__file__).parents[2] / "scenes"
 
 
 def film(width=32):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("MITSUBA_DATA") or ROOT.parent / "shared" / "regression")
 
 SCENES = [

@@ -16,7 +16,7 @@ import numpy as np
 
 T = mi.ScalarTransform4f
 
-EGG = Path(__file__).parents[1] / "scenes" / "meshes" / "veach_bidir_egg.ply"
+EGG = Path(__file__).parents[2] / "scenes" / "meshes" / "veach_bidir_egg.ply"
 
 # -- materials and textures -------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from welch import Comparisons, assert_agree, compare_images, tile_means
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TILES = 4
 
 

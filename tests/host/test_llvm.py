@@ -224,7 +224,7 @@ def test_remedies_of_an_import_after_drjit_help():
     done = run(lines, **{llvm.VARIABLE: path})
     assert done.stdout == f"{llvm.major_version(Path(path))}\n", done.stderr
 
-    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
     code = re.search(r"```python\n(import mitsuba_bdpt.*?)```", readme, re.DOTALL)[1]
     assert code.index("mitsuba_bdpt") < code.index("import mitsuba as mi")
     ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "I", "-"]

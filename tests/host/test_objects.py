@@ -102,7 +102,7 @@ def test_an_error_of_another_scenes_emitter_hints_at_it():
     assert done.returncode == 0, done.stderr[-500:]
     sound, refused, broken = done.stdout.splitlines()
     assert sound.startswith("RuntimeError bdpt: other scenes in this process have 1 foreign emitters")
-    assert (refused, broken) == ("ValueError ", "RuntimeError ")
+    assert (refused, broken) == ("UsageError ", "RuntimeError ")
 
 
 def test_what_has_no_id_is_named_by_its_class_or_shape():

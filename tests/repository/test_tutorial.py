@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TUTORIAL = Path(__file__).parents[1] / "docs" / "user" / "tutorial.py"
+TUTORIAL = Path(__file__).parents[2] / "docs" / "user" / "tutorial.py"
 
 
 def test_tutorial_runs():
