@@ -182,7 +182,7 @@ def test_an_arrival_is_a_start_in_reverse(name):
     np.testing.assert_allclose(cos / both, column(start.arrival)[keep], rtol=5e-3)
     join = camera.join(p, mi.Point2f(u[2], u[3]), camera.region.to_uv(start.position))
     ratio = column(join.arrival * join.dist2)[keep]
-    np.testing.assert_allclose(ratio, cos / column(arrival.pdf_area)[keep], rtol=5e-3)
+    np.testing.assert_allclose(ratio, cos / column(arrival.pdf_a)[keep], rtol=5e-3)
     if lens:
         for axis in "xy":
             found, known = (column(getattr(r.position, axis))[keep] for r in (arrival, start))
