@@ -45,7 +45,7 @@ class Sphere:
         return self.radius * (1 + RAY_EPSILON) if self.outward < 0 else 0.0
 
     @staticmethod
-    def of(shape) -> Sphere | None:
+    def of(shape: mi.Shape) -> Sphere | None:
         """Of a shape of Mitsuba's; None if it is not a sphere."""
         if shape.shape_type() != mi.ShapeType.Sphere.value:
             return None
@@ -66,7 +66,7 @@ def sphere_normal(p, center, outward):
     return mi.Normal3f(dr.normalize(p - center) * outward)
 
 
-def may_light_itself(shape, sphere: Sphere | None) -> bool:
+def may_light_itself(shape: mi.Shape, sphere: Sphere | None) -> bool:
     """Whether ``shape``, which is this ``sphere`` or none, shines outwards and lets light through.
 
     No point of it lights another, but rounding puts some outside, and Mitsuba samples the cone from there
@@ -79,7 +79,7 @@ def may_light_itself(shape, sphere: Sphere | None) -> bool:
     return any(mi.has_flag(flags, flag) for flag in through)
 
 
-def is_small(sphere: Sphere, extent) -> bool:
+def is_small(sphere: Sphere, extent: float) -> bool:
     """Whether a sphere may be narrow (`NARROW_SIN2`) as seen from a point at most ``extent`` away."""
     # Not `<`: the extent of a scene with a vertex at infinity is NaN.
     return sphere.outward > 0 and not sphere.radius**2 >= NARROW_SIN2 * extent**2
@@ -98,7 +98,7 @@ def cone_pdf_w(center, radius, p):
     return dr.select(narrow, (1 + dr.sqrt(1 - sin_2)) / (dr.two_pi * sin_2), 0)
 
 
-def outward_sign(shape, matrix) -> float:
+def outward_sign(shape: mi.Shape, matrix: np.ndarray) -> float:
     """1 if the normals of a sphere or cylinder point outwards, else -1: of a hit from its middle."""
     middle = matrix[:3] @ [0, 0, ROUND[shape.shape_type()], 1]
     radius = float(np.linalg.norm(matrix[:3, 0]))

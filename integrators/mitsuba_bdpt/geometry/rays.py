@@ -34,12 +34,12 @@ class Anchor:
     offset: mi.Float
     curvature: mi.Float
 
-    def towards(self, d):
+    def towards(self, d: mi.Vector3f) -> mi.Point3f:
         """The start of a ray that leaves into direction ``d`` (any length)."""
         return self.p + self.n * dr.mulsign(self.offset, dr.dot(self.n, d))
 
 
-def surface_anchor(si, ray, shape_errors: ShapeErrors) -> Anchor:
+def surface_anchor(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, shape_errors: ShapeErrors) -> Anchor:
     """Anchor of the hit ``si`` that ``ray`` found."""
     errors = shape_errors.at(si.shape, si.is_valid(), si.instance, si.prim_index)
     offset = rounding_offset(si.p, ray.o, si.t, errors.reach)
@@ -47,7 +47,7 @@ def surface_anchor(si, ray, shape_errors: ShapeErrors) -> Anchor:
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
 
 
-def sampled_anchor(p, n, reference, errors: Errors | None) -> Anchor:
+def sampled_anchor(p: mi.Point3f, n: mi.Normal3f, reference: mi.Point3f, errors: Errors | None) -> Anchor:
     """Return the anchor of a point sampled on a shape of these ``errors``, None off shapes.
 
     The point is to be connected to ``reference``.
@@ -56,17 +56,17 @@ def sampled_anchor(p, n, reference, errors: Errors | None) -> Anchor:
     return Anchor(mi.Point3f(p), mi.Normal3f(n), offset, mi.Float(errors.ends if errors else 0))
 
 
-def free_anchor(p) -> Anchor:
+def free_anchor(p: mi.Point3f) -> Anchor:
     """Anchor of a point without surface: a point light, a pinhole, a point of a lens."""
     return Anchor(mi.Point3f(p), mi.Normal3f(0), mi.Float(0), mi.Float(0))
 
 
-def spawn(anchor: Anchor, d, shared) -> mi.Ray3f:
+def spawn(anchor: Anchor, d: mi.Vector3f, shared) -> mi.Ray3f:
     """Unbounded ray from ``anchor`` along unit ``d``; time and wavelengths as in ``shared``."""
     return mi.Ray3f(anchor.towards(d), d, shared.time, shared.wavelengths)
 
 
-def end_point(a: Anchor, b: Anchor):
+def end_point(a: Anchor, b: Anchor) -> mi.Point3f:
     """Where a visibility ray from ``a`` to ``b`` ends: just before ``b``'s surface."""
     end = b.towards(a.p - b.p)
     # Known while the kernel is recorded: a scene without spheres and cylinders does none of what follows.
@@ -93,7 +93,7 @@ def _early(back, b: Anchor):
     return dr.select(behind, dr.minimum(early, dr.abs(along) / (dist * dist * curvature)), early)
 
 
-def segment_to(a: Anchor, end, shared) -> mi.Ray3f:
+def segment_to(a: Anchor, end: mi.Point3f, shared) -> mi.Ray3f:
     """Ray from ``a`` to the point ``end``; time and wavelengths as in ``shared``."""
     o = a.towards(end - a.p)
     between = end - o
@@ -117,7 +117,9 @@ class Own:
     t: mi.Float
 
 
-def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, shared):
+def sight(
+    shape_errors: ShapeErrors, a: Anchor, b: Anchor, number: mi.UInt32, shared
+) -> tuple[mi.Ray3f, Own | None]:
     """Return the visibility ray from ``a`` to ``b``, and an `Own` for `occluded`.
 
     ``b`` is on the shape of this ``number``. The `Own` is None unless ``shape_errors`` are small.
@@ -129,7 +131,7 @@ def sight(shape_errors: ShapeErrors, a: Anchor, b: Anchor, number, shared):
     return ray, Own(number, ray.maxt * (1 - _early(a.p - end, b)))
 
 
-def occluded(scene, ray, active, own: Own | None = None):
+def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None):
     """Return whether any surface blocks ``ray``, null surfaces included (as in ``path``).
 
     ``own`` is what the ray ends at, where it can be met too early.
@@ -140,7 +142,9 @@ def occluded(scene, ray, active, own: Own | None = None):
     return pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t))
 
 
-def intersect_past_emitters(scene, shape_errors, ray, active, coherent):
+def intersect_past_emitters(
+    scene: mi.Scene, shape_errors: ShapeErrors, ray: mi.Ray3f, active: mi.Bool, coherent: bool
+) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
     """First hit along ``ray`` on a shape that does not emit, and the ray that found it.
 
     This is how ``path`` treats camera rays under ``hide_emitters``.

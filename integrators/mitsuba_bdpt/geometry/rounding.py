@@ -59,7 +59,7 @@ class ShapeErrors:
     """`Errors` of the scene's shapes, by pointer. ``any``: one of them is a sphere or cylinder; ``small``:
     one of these is so small that rays ask what they meet, see `SMALL`."""
 
-    def __init__(self, scene):
+    def __init__(self, scene: mi.Scene):
         shapes = scene.shapes()
         extent = 2 * scene.bbox().bounding_sphere().radius
         with np.errstate(all="ignore"):  # numbers that are not finite are somebody else's business
@@ -138,7 +138,7 @@ def _stretch(shape) -> np.ndarray:
     return np.linalg.svd(linear, compute_uv=False) if np.isfinite(linear).all() else np.zeros(3)
 
 
-def reaches(shape) -> np.ndarray:
+def reaches(shape: mi.Shape) -> np.ndarray:
     """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: one
     number, of a mesh one for each triangle.
 

@@ -86,7 +86,7 @@ def _cylinder(matrix, inverse):
     )
 
 
-def check_rotation(emitter):
+def check_rotation(emitter: mi.Emitter):
     """Check that the ``to_world`` of an environment keeps lengths.
 
     With any other matrix Mitsuba's own calls disagree with each other (next-event estimation four times the
@@ -100,7 +100,7 @@ def check_rotation(emitter):
         )
 
 
-def check_angles(emitter):
+def check_angles(emitter: mi.Emitter):
     """Check that the ``to_world`` of a projector or spot keeps angles.
 
     What it sends into a direction is a function of the angles before, and densities of directions are those

@@ -29,12 +29,12 @@ def children(owner) -> dict:
     return _collector(mi.variant())().of(owner)
 
 
-def is_instance(shape) -> bool:
+def is_instance(shape: mi.Shape) -> bool:
     """Whether ``shape`` is an instance of a shape group."""
     return shape.class_name() == "Instance"
 
 
-def grouped_shapes(scene) -> list:
+def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes in the scene's shape groups.
 
     An instance does not tell which group it is of: groups are found among what the scene holds.
@@ -44,7 +44,7 @@ def grouped_shapes(scene) -> list:
     return [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
 
 
-def all_shapes(scene) -> list:
+def all_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """The scene's shapes, those in shape groups included."""
     return [*scene.shapes(), *grouped_shapes(scene)]
 

@@ -59,7 +59,7 @@ class Render:
     ``prepared`` scene; ``planner``, which decides the plan of the ``kernel``; ``points`` of the passes;
     ``accumulator`` of the image; ``meter`` of what is done."""
 
-    def __init__(self, scene, sensor, settings: Settings, seed, spp: int):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
         check_variant()
         check_not_frozen()
         check_scene(scene, sensor)
@@ -95,7 +95,9 @@ class Render:
         """What is traced, as decided so far."""
         return self.planner.plan
 
-    def run(self, on_pass, cancelled=lambda: False):
+    def run(
+        self, on_pass: Callable[[PassReport], object] | None, cancelled: Callable[[], bool] = lambda: False
+    ):
         """Trace the samples.
 
         Fewer under ``timeout``, when ``cancelled()`` after a pass, or when interrupted. ``on_pass``, or

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 
 from ..errors import UnsupportedError
+from ..geometry.rounding import ShapeErrors
 from ..geometry.to_world import check_to_world
 from ..host.introspection import children, named, number
 from . import cameras
@@ -14,7 +15,7 @@ from .records import Sensor
 UNTARGETED = "target = none"
 
 
-def prepare(sensor, shape_errors, bounded=True) -> Sensor:
+def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, bounded: bool = True) -> Sensor:
     """Return the sensor for one render.
 
     Of a scene that has surfaces (``bounded``) or none. Kinds that light vertices cannot be connected to take
