@@ -327,3 +327,32 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
     emitters = Emitters(mi.load_dict({"type": "scene", "dome": dome}))
     (group,) = emitters.groups
     assert group.by_texture.all
+
+
+def test_a_textured_cube_that_was_met_as_an_emitters_shape():
+    """Rationale: Python keeps the type under which it first met an object, and an emitter tells its shape as
+    a plain one, without the methods of meshes. Expected: the image is made all the same."""
+    lamp = {"type": "cube", "emitter": {"type": "area", "radiance": peaked(2)}}
+    film = {"type": "hdrfilm", "width": 8, "height": 8}
+    eye = T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": eye, "film": film}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, "sensor": sensor})
+    assert scene.emitters()[0].get_shape() is not None
+    assert np.isfinite(np.array(mi.load_dict({"type": "bdpt", "max_depth": 2}).render(scene, spp=4))).all()
+
+
+def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
+    """Rationale: such a lamp is sampled by its area from within, and that must not be asked of other lamps: a
+    table has their centres at the origin. Expected: nothing counts as not finite, and the sky is seen with its
+    radiance of 1 (within 5 %, ten standard errors of (1,1) and s = 0 together); it was black."""
+    lamp = {"type": "sphere", "center": [0, 0, -5], "flip_normals": True}
+    lamp["emitter"] = {"type": "area", "radiance": 1.0}
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    floor = {"type": "rectangle", "to_world": T().translate([0, -3, 0]).rotate([1, 0, 0], -90)}
+    eye = T().look_at([0, 0, 0], [0, 0, 1], [0, 1, 0])
+    sensor = {"type": "perspective", "fov": 30, "to_world": eye, "film": film}
+    scene = {"type": "scene", "lamp": lamp, "sky": {"type": "constant", "radiance": 1.0}, "floor": floor}
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 4, "skip": "none"})
+    image = np.array(integrator.render(mi.load_dict(scene | {"sensor": sensor}), spp=256))
+    assert integrator.statistics["non_finite"] == 0
+    assert image[..., :3].mean() == pytest.approx(1, rel=0.05)

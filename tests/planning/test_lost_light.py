@@ -6,6 +6,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+import scene_parts as parts
 from mitsuba_bdpt.planning import lost_light
 from mitsuba_bdpt.run.rendering import Render
 from stress_cases.warned import Warned
@@ -396,3 +397,14 @@ def test_edits_of_what_is_around_a_lamp_are_seen():
         integrator.render(made, spp=16)
         shares.append(sum(integrator.statistics["lost_light"].values()))
     assert shares[0] == pytest.approx(shares[1], rel=0.1) and shares[1] > 0.001
+
+
+def test_nothing_is_looked_for_where_no_light_subpath_starts():
+    """Rationale: a lamp of a user's own class without area emits no light subpath that could be followed
+    through glass. Expected: the render ends, without a word."""
+    parts.register_plugins()
+    glass = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "dielectric"}}
+    scene = scene_of(parts.EMITTERS["own lamp"](), glass=glass)
+    integrator = bdpt()
+    integrator.render(scene, spp=4)
+    assert integrator.statistics["lost_light"] == {}

@@ -16,7 +16,7 @@ from ..geometry.agreement import (
     is_textured,
 )
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
-from ..host.introspection import children, named, number
+from ..host.introspection import children, named, number, own_parameters
 from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
@@ -113,7 +113,8 @@ class AreaEmitters(Group):
         by_area = mi.Bool(False)
         if self.any_inner:
             sphere = look_up(self._spheres, index, active)
-            by_area |= active & (dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius))
+            inside = dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius)
+            by_area |= active & (sphere.inner_radius > 0) & inside
         if self._by_shape.any:
             by_area |= self._by_shape.at(index, active)
         inv_area = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
@@ -165,7 +166,8 @@ class AreaEmitters(Group):
         return dr.maximum(dr.dot(emission.si.sh_frame.n, d), 0) * dr.inv_pi
 
     def connection_density(self, chosen: Chosen, emission: Emission, si, active):
-        # In area measure: the solid-angle density at the hit times the geometric cosine at y_0.
+        # Area measure times the squared distance: the solid-angle density at the hit times the geometric
+        # cosine at y_0.
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p, ds.n, ds.uv = emission.si.p, emission.anchor.n, emission.si.uv
         ds.time, ds.d, ds.emitter = emission.si.time, -emission.d, chosen.emitter
@@ -285,7 +287,8 @@ def _reads_attributes(texture) -> bool:
 def _check_coordinates(emitter):
     """Raise ``UsageError`` for a texture on a mesh that has no texture coordinates."""
     shape = emitter.get_shape()
-    if shape.shape_type() == mi.ShapeType.Mesh.value and not shape.has_vertex_texcoords():
+    # Of the parameters: a shape that Python first met as an emitter's has no methods of meshes.
+    if shape.shape_type() == mi.ShapeType.Mesh.value and not len(own_parameters(shape)["vertex_texcoords"]):
         raise UsageError(
             f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
             f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"

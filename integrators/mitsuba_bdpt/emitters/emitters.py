@@ -244,9 +244,10 @@ class Emitters:
     def hit_densities(self, si, previous, active):
         """Densities with which light-side strategies make the hit emitter point.
 
-        ``previous`` is the camera vertex before (position). Returns ``(connect, first, second)``:
-        next-event estimation from ``previous``, and the two factors of emission towards it; area
-        measure on surfaces, solid angle (and disk area) at infinity, selection included.
+        ``previous`` is the position of the camera vertex before. Returns ``(connect, first, second)``:
+        next-event estimation from ``previous`` and ``pdf_first`` of emission (area measure on surfaces, solid
+        angle at infinity; selection included), and ``pdf_second`` towards ``previous`` (solid angle on
+        surfaces, area across the direction at infinity).
         """
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))

@@ -53,8 +53,9 @@ class Direct:
     the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
     the visibility ray (unused where ``infinite``), ``met`` the number of its shape (None if the scene has
     none so small that the ray asks for it, see `rounding.SMALL`); ``emission_ratio`` is
-    pdf_first pdf_second / (density of y_0 in the measure of pdf_first), to be multiplied by the
-    geometric cosine at the camera vertex: the ratio of p_2 and p_1 without the camera's density.
+    pdf_first pdf_second / (density of y_0 in the measure of pdf_first, times the squared distance; 1 at
+    infinity), to be multiplied by the geometric cosine at the camera vertex: the ratio of the densities of
+    s = 2 and s = 1, but for that with which the camera subpath made the vertex.
     """
 
     weight: mi.Spectrum

@@ -116,7 +116,9 @@ class _Walk:
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
-    return not plan.arrival and bool(unreachable_paths(prepared, plan, settings))
+    if plan.arrival or not prepared.emitters.traced:  # what starts no light subpath has none to look with
+        return False
+    return bool(unreachable_paths(prepared, plan, settings))
 
 
 def lost_radiance(prepared: PreparedScene, plan: Plan, max_depth: int) -> dict[int, float]:

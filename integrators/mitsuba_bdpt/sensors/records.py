@@ -37,7 +37,7 @@ class CameraJoin:
 
     ``p`` of z_0; ``anchor`` where visibility ends (for cameras on the near plane); ``d`` unit direction from
     the point to z_0; ``dist2`` squared distance to z_0 (1 to a parallel sensor); ``importance``
-    W_e cos / density of z_0;
+    W_e cos / density of z_0 (of a parallel sensor, whose z_0 follows from the point, W_e alone);
     ``pdf_w`` as in `CameraStart`, towards the point; ``arrival`` cos / (dist2 * density of z_0), which makes
     a density of directions at the point the ratio of t = 0 and t = 1 (0 without area); ``position`` on the
     film in pixels; ``reach`` length of camera rays along ``-d``; ``valid``: seen by the film, and within the

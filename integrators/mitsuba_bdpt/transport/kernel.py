@@ -12,10 +12,11 @@ path of s light and t camera vertices has k = s + t - 1 edges. Equations of Geor
 
     # The light subpath                                                     _light_subpath
     y_0, direction <- an emitter, with pdf_first * pdf_second               Emitters.sample_emission
-    d_vcm, d_vc <- 1 / densities of y_0 and direction (eqs. 31-33)          _light_walk
+    d_vcm <- 1 / densities of y_0 and direction, d_vc <- their cos / the    _light_walk
+        same; 0 if y_0 cannot be hit (eqs. 31, 32)
     (1,1):   splat y_0 seen by the sensor                                   techniques.join_endpoints
     for y in y_1, y_2, ...:                                                 walk.random_walk
-        d_vcm, d_vc <- in the area measure at y (eqs. 31-35)                walk._vertex
+        d_vcm, d_vc <- in the area measure at y (eqs. 31, 32, 34, 35)       walk._vertex
         direction of the next edge, BSDF towards the sensor <- one call     walk._interact
         t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
         t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
@@ -26,12 +27,14 @@ path of s light and t camera vertices has k = s + t - 1 edges. Equations of Geor
     # Its camera subpaths
     for S pixels:                                                           trace
         z_0, direction <- the sensor, at a point of the pixel               _camera_subpath
-        d_vcm, d_vc <- 1 / density of the direction                         _camera_walk
+        d_vcm <- 1 / density of the direction,                              _camera_walk
+            d_vc <- cos / densities of z_0 and direction; 0 without area
         total <- 0
         for z in z_1, z_2, ...:                                             walk.random_walk
             d_vcm, d_vc <- in the area measure at z                         walk._vertex
             direction of the next edge, BSDF towards an emitter <- one call walk._interact
-            s = 0:  total += emission of z towards z_0 (eqs. 42, 43)        techniques.hit_emitter
+            s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
+                        (eqs. 42, 43)
             s = 1:  total += z lit by a point of an emitter (eqs. 44, 45)   techniques.next_event
             s >= 2: total += z joined with kept vertices y (eqs. 40, 41):
                         each of them,                                       connections.connect_all

@@ -162,10 +162,11 @@ class ByClass(Heuristic):
 
 
 def to_area(heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float) -> Partial:
-    """Convert to the area measure at a new vertex (the part of eqs. 31-35 that is known at the hit).
+    """Convert to the area measure at a new vertex (the part of eqs. 31, 32, 34, 35 that is known there).
 
-    ``dist2`` squared length of the edge (1 where the edge keeps another measure: the first edge
-    from an emitter at infinity), ``cos`` absolute geometric cosine at the new vertex.
+    ``dist2`` squared length of the edge; 1 on the first edge of a light subpath, where ``d_vcm`` contains it
+    (from infinity there is none), and of a parallel sensor, whose density is one across the edge;
+    ``cos`` absolute geometric cosine at the new vertex.
     """
     return Partial(
         d_vcm=heuristic.scale(partial.d_vcm, dist2 / cos),
