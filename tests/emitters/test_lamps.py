@@ -343,8 +343,8 @@ def test_a_textured_cube_that_was_met_as_an_emitters_shape():
 
 def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
     """Rationale: such a lamp is sampled by its area from within, and that must not be asked of other lamps: a
-    table has their centres at the origin. Expected: nothing counts as not finite, and the sky is seen with its
-    radiance of 1 (within 5 %, ten standard errors of (1,1) and s = 0 together); it was black."""
+    table has their centres at the origin. Expected: nothing counts as not finite, and the sky is seen with
+    its radiance of 1 (within 5 %, ten standard errors of (1,1) and s = 0 together); it was black."""
     lamp = {"type": "sphere", "center": [0, 0, -5], "flip_normals": True}
     lamp["emitter"] = {"type": "area", "radiance": 1.0}
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
