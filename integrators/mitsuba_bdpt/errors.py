@@ -40,7 +40,22 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"did you mean {by_case[near[0]]}? " if near else ""
 
 
-def message(error: Exception) -> str:
-    """The text of `error`; of a Python traceback that Mitsuba has put into it, the last line only."""
+def behind(error: BaseException, *kinds: type[BaseException]) -> BaseException | None:
+    """The exception of these ``kinds`` that ``error`` is, or that was wrapped into it; None if none was.
+
+    Mitsuba and Dr.Jit make a ``RuntimeError`` of all that is raised while they render or record.
+    """
+    found: BaseException | None = error
+    while found is not None and not isinstance(found, kinds):
+        found = (found.__cause__ or found.__context__) if isinstance(found, RuntimeError) else None
+    return found
+
+
+def message(error: BaseException) -> str:
+    """The text of `error`, or of the user's mistake that is behind it.
+
+    Of a Python traceback that Mitsuba has put into it, the last line only.
+    """
+    error = behind(error, UsageError, UnsupportedError) or error
     before, traceback, rest = str(error).partition("Traceback (most recent call last):")
     return before + rest.strip().splitlines()[-1] if traceback else before

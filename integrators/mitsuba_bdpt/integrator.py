@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
-from .errors import UnsupportedError
+from .errors import UnsupportedError, UsageTypeError
 from .host.notices import warn_once
 from .image.features import feature_names
 from .image.layers import layer_names
@@ -141,6 +141,8 @@ class BDPTIntegrator:
         of the uninterrupted render up to rounding. Raises ``UsageError`` and ``UnsupportedError``.
         """
         check_made_for(self, scene)
+        if self.on_pass is not None and not callable(self.on_pass):
+            raise UsageTypeError(f"on_pass={self.on_pass!r} must be None or a function of a PassReport")
         sensor = resolve_sensor(scene, sensor)
         spp = samples_per_pixel(sensor, spp, self.settings)
         render = Render(scene, sensor, self.settings, seed, spp)
@@ -217,6 +219,8 @@ class BDPTIntegrator:
         parameters.
         """
         check_made_for(self, scene)
+        if not isinstance(snapshot, Snapshot):
+            raise UsageTypeError(f"snapshot={type(snapshot).__name__} must be one from a PassReport")
         sensor = resolve_sensor(scene, sensor)
         render = Render(scene, sensor, self.settings, 0, 1)
         render.resume(snapshot, apart_from=("seed", "spp", "decisions"))

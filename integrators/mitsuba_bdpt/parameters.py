@@ -161,7 +161,8 @@ def _given(props) -> dict:
         if present not in PARAMETERS:
             raise UsageError(_not_a_parameter(name, props[name]))
         if present in given:
-            raise UsageError(f"{present} is given twice, {name} is its old name; leave out one of them")
+            old = next(former for former, now in ALIASES.items() if now == present)
+            raise UsageError(f"{present} is given twice, {old} is its old name; leave out one of them")
         given[present] = props[name]
     return given
 

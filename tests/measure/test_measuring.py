@@ -277,3 +277,48 @@ def test_a_default_that_nothing_uses_is_no_parameter(here):
     declared = '<default name="resolution" value="64"/>'
     file.write_text(ROOM.format(height=32, sampler="").replace("<integrator", f"{declared}<integrator", 1))
     assert SceneFile("room", file).size(16) == (16, 8)
+
+
+def refused(*words) -> str:
+    """The one line that a command with these words answers, with the exit status of a mistake."""
+    done = subprocess.run([sys.executable, "-m", "mitsuba_bdpt", *words], capture_output=True, text=True)
+    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
+    return done.stderr.strip().splitlines()[-1]
+
+
+def test_mistakes_that_only_a_render_finds_are_one_line(here):
+    """Rationale: Mitsuba wraps what its plugins raise. Expected: one line that names the parameter, before a
+    reference is made where no render is needed to find it, and no traceback."""
+    room, preset = here / "elsewhere" / "room.xml", here / "project" / "presets" / "mine.toml"
+    options = ["--scenes", str(room), "--resolution", "16", "--spp", "4", "--pairs", "1"]
+    words = ["compare", "bdpt skp=none", "bdpt", *options, "--project", "project"]
+    assert "bdpt: skp='none' is not a parameter; did you mean skip?" in refused(*words)
+    preset.write_text(PRESET.replace('heuristic = "power"', 'heuristic = "pwer"'))
+    assert "heuristic='pwer' is not known" in refused("sweep", "mine", "--project", "project")
+    preset.write_text(PRESET.replace('sampler = "multijitter"', 'sampler = "multijiter"'))
+    assert "sampler of 'power'" in refused("sweep", "mine", "--project", "project")
+    assert not (here / "project" / "references").exists()
+    medium = '<medium type="homogeneous" name="interior"/>'
+    room.write_text(ROOM.format(height=64, sampler="").replace("<emitter", f"{medium}<emitter", 1))
+    words = ["fireflies", str(room), "--resolution", "16", "--spp", "4", "--project", "project"]
+    assert "participating medium, which is not supported" in refused(*words)
+
+
+def test_samples_of_a_render_that_stops_are_its_own(here):
+    """Expected: the row of a render that has reached its target error has the samples that it took."""
+    stopping = PRESET.split("[[integrator]]")[0].replace("[2, 4]", "[256]").replace("[8, 2]", "[1]")
+    own = '[[integrator]]\ntype = "bdpt"\nvariance = true\ntarget_error = 100.0\n'
+    (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
+    command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
+    (row,) = pyarrow.parquet.read_table(here / "out" / "rows.parquet").to_pylist()
+    assert (row["budget"], row["spp"]) == (256, 32)
+
+
+def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
+    """Rationale: cells are named after the plugin's source, which somebody may edit meanwhile. Expected: the
+    rows of what was rendered are written; a damaged cell is named."""
+    digests = iter("abcdefgh" * 99)
+    monkeypatch.setattr("mitsuba_bdpt.measure.cells.source_digest", lambda: next(digests))
+    words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
+    assert main(words) == 0
+    assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 30

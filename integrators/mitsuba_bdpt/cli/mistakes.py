@@ -2,7 +2,8 @@
 
 Taken for mistakes is what names something that the user gave:
 
-* `errors.UsageError` and `errors.UnsupportedError`: a value, a file or a name that cannot be used.
+* `errors.UsageError` and `errors.UnsupportedError`: a value, a file or a name that cannot be used; also
+  where Mitsuba or Dr.Jit have wrapped them.
 * ``argparse.ArgumentTypeError``: words of the command line that are read after the rest of it.
 * ``OSError``: a file or a folder that is missing, or cannot be written.
 * ``RuntimeError`` of Mitsuba's parser: about a scene's file, an unknown plugin, or its parameters; where it
@@ -19,7 +20,7 @@ import sys
 from collections.abc import Callable
 from typing import TypeVar
 
-from ..errors import UnsupportedError, UsageError, message
+from ..errors import UnsupportedError, UsageError, behind, message
 
 STATUS = 2
 """The exit status after a mistake."""
@@ -37,6 +38,8 @@ def answered(main: Callable[[], Status]) -> Status | int:
     try:
         return main()
     except Exception as error:
+        if behind(error, KeyboardInterrupt) is not None:
+            raise KeyboardInterrupt from error
         if not is_mistake(error):
             raise
         print(f"error: {' '.join(message(error).split())}", file=sys.stderr)
@@ -45,7 +48,7 @@ def answered(main: Callable[[], Status]) -> Status | int:
 
 def is_mistake(error: Exception) -> bool:
     """Whether the user is to mend it, see above."""
-    if isinstance(error, UsageError | UnsupportedError | OSError | argparse.ArgumentTypeError):
+    if behind(error, UsageError, UnsupportedError, OSError, argparse.ArgumentTypeError) is not None:
         return True
     if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
         return False

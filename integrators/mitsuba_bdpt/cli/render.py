@@ -84,6 +84,9 @@ def explain(options: Namespace) -> int:
         sensor = choose_sensor(scene, options.sensor)
         spp = options.spp or sensor.sampler().sample_count()
         print(integrator.explain(scene, sensor, spp))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
     except (OSError, RuntimeError, TypeError, ValueError) as error:
         print(f"error: {message(error)}", file=sys.stderr)
         return 1

@@ -119,7 +119,8 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "parameters": json.dumps(dict(cell.parameters)),
         "versions": json.dumps(dict(cell.versions)),
         "started": started,
-        "spp": spp,
+        # A render that stops at a target error or after some time has fewer than it was asked for.
+        "spp": sum(statistics.get("passes", ())) or spp,
         "seconds": seconds,
         "seconds_compile": compile_seconds,
         "seconds_pilot": bench.pilot_seconds(cell, spp),

@@ -19,7 +19,7 @@ from .making import Job, obtained
 from .metrics import TRIM, rel_mse
 from .project import Project
 from .reference import Reference
-from .scenes import integrator_of
+from .scenes import check_plugins, integrator_of
 from .tables import table
 from .timing import timed
 
@@ -98,6 +98,10 @@ def run(options: Namespace) -> int:
     rows = []
     for scene in scenes:
         job = Job(project, scene, options.resolution, None, max(options.spp), options.reference_seconds)
+        for side in options.sides:
+            own = dict(side)
+            sampler = own.pop("sampler", None)
+            check_plugins(str(own.get("type")), own, sampler, job.depth)
         target = obtained(job)
         made = [Side.of(side, job) for side in options.sides]
         rows += [line(scene.name, made, target, spp, options.pairs) for spp in options.spp]

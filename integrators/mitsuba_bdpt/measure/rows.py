@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 
+from ..errors import CommandError
 from ..files.images import read_layers, write_layers
 from ..files.texts import write_json
 from ..files.whole import replacing
@@ -83,7 +84,7 @@ def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
         file = cell_file(output, cell)
         if not file.exists():
             continue
-        row = json.loads(file.read_text())
+        row = _read(file)
         if not path.exists() or row["reference_sha256"] != digest(path):
             (image,), _ = read_layers(image_file(output, cell), "")
             row |= errors(image, *judge_of(*cells.where()), cell.seed == FIRST_SEED)
@@ -92,11 +93,20 @@ def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
     return found
 
 
-def rows(project: Project, preset: Preset, output: Path) -> list[dict]:
-    """The rows of all finished cells of the preset, in its order."""
+def _read(file: Path) -> dict:
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise CommandError(f"{str(file)!r} is damaged ({error}); delete it, to render it anew") from error
+
+
+def rows(preset: Preset, scenes: list[Cells], output: Path) -> list[dict]:
+    """The rows of all finished cells of the ``preset``, in its order; ``scenes``: its cells of each.
+
+    (Those that were rendered: the cells of a source that was edited meanwhile have other names.)
+    """
     found = []
-    for subject in preset.subjects:
-        cells = Cells(project, preset, subject)
+    for cells in scenes:
         wanted = {c.key: c for c in cells.planned()}
         if cells.more is not None:
             wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import CommandError
+from ..errors import CommandError, message
 from ..files.loading import choose_sensor, in_proportion, parameters
 from ..files.named import named_files
 
@@ -76,6 +76,20 @@ def depth_of(integrator) -> int:
 def integrator_of(parameters: dict, depth: int):
     """The plugin with these ``parameters``, ``type`` among them, at the ``max_depth`` of the scene."""
     return mi.load_dict({"max_depth": depth} | parameters)
+
+
+def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) -> None:
+    """Raise ``CommandError`` if the plugin with these ``parameters``, called ``name``, or the ``sampler``
+    cannot be made."""
+    for what, make in (
+        (f"integrator {name!r}", lambda: integrator_of(parameters, depth)),
+        (f"sampler of {name!r}", lambda: mi.load_dict({"type": sampler}) if sampler else None),
+    ):
+        try:
+            make()
+        except (RuntimeError, TypeError) as error:
+            last = message(error).strip().splitlines()[-1]
+            raise CommandError(f"{what}: {last}") from error
 
 
 def _resize(scene, width: int) -> None:

@@ -34,6 +34,7 @@ from .making import Job, obtained
 from .preset import Preset, read_preset
 from .project import Project
 from .rows import beside, cell_file, judge_of, read_rows, rows, store, write_tables
+from .scenes import check_plugins
 
 
 class Sweep:
@@ -41,22 +42,25 @@ class Sweep:
 
     def __init__(self, project: Project, preset: Preset, output: Path):
         self.project, self.preset, self.output, self.failed = project, preset, output, []
-        self._scenes = [Cells(project, preset, subject) for subject in preset.subjects]
-        self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self._scenes]
+        self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
+        self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
         self._judges, self._tried = {}, set()
         self._progress, self._task = Progress(), TaskID(0)  # those of `run`, until then shown nowhere
 
     def prepare(self, seconds: float):
-        """Make references that are missing, each for at most about so many ``seconds``, and complain of those
-        that are of other scenes before hours of rendering, not after."""
-        for cells, missing in zip(self._scenes, self._todo, strict=True):
+        """Complain of what cannot be rendered before hours of rendering, not after, and make references that
+        are missing, each for at most about so many ``seconds``."""
+        for cells, missing in zip(self.scenes, self._todo, strict=True):
+            for method in {cell.method: cell for cell in missing}.values():
+                check_plugins(method.method, dict(method.parameters), method.sampler, cells.subject.max_depth)
+        for cells, missing in zip(self.scenes, self._todo, strict=True):
             if missing:
                 obtained(Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds))
 
     def run(self, progress: Progress, elsewhere=None):
         """Render all that is not there yet, showing ``progress``; on a cluster if ``elsewhere``, a client and
         the preset's text, is given."""
-        scenes, todo = self._scenes, self._todo
+        scenes, todo = self.scenes, self._todo
         probed = 0 if elsewhere else len(self.preset.probes)
         self._progress = progress
         self._task = progress.add_task("", total=sum(map(len, todo)) + probed)
@@ -189,7 +193,7 @@ def run(options: Namespace) -> int:
                 sweep.run(progress, (client, file.read_text()))
         else:
             sweep.run(progress)
-    table = rows(project, preset, output)
+    table = rows(preset, sweep.scenes, output)
     if options.scenes:
         table = beside(table, whole, output)
     if table:

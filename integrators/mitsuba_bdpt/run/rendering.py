@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UsageError
+from ..errors import UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
 from ..image.accumulator import Accumulator
@@ -295,8 +295,6 @@ def raise_interrupt(error: BaseException):
 
     Dr.Jit makes a ``RuntimeError`` of all that comes while it records a loop or a call.
     """
-    cause = error
-    while cause is not None:
-        if isinstance(cause, KeyboardInterrupt):
-            raise cause from None
-        cause = cause.__cause__ or cause.__context__
+    cause = behind(error, KeyboardInterrupt)
+    if cause is not None:
+        raise cause from None
