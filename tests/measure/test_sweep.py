@@ -15,6 +15,7 @@ import OpenEXR
 import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
+from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.images import read_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import agreement, analysis, cells, making, metrics, probes, reference, scenes, sweep
@@ -539,13 +540,26 @@ def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, 
 
 
 def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
-    """Expected: the cells of a plugin that does not exist fail, are named, and the others are there."""
+    """Expected: cells that cannot be rendered (the variance of fewer samples than it needs) fail, are named,
+    and the others are there."""
     making.make(job(3))
-    path = preset_file(folder, PRESET.replace('type = "path"', 'type = "no_such_plugin"\nname = "bad"'))
+    bad = 'type = "bdpt"\nname = "bad"\nvariance = true'
+    path = preset_file(folder, PRESET.replace('type = "path"', bad))
     words = path, "-o", folder / "out"
     assert swept(*words) == 1
     out = capsys.readouterr().out
-    assert len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad:", out)) == 4 and ": 4 rows" in out
+    assert (
+        len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad: bdpt: variance=True", out)) == 4
+        and ": 4 rows" in out
+    )
+
+
+def test_a_plugin_that_does_not_exist_is_refused(folder, job, swept):
+    """Expected: before anything is rendered, by the name of the integrator."""
+    path = preset_file(folder, PRESET.replace('type = "path"', 'type = "no_such_plugin"\nname = "bad"'))
+    with pytest.raises(CommandError, match="integrator 'bad': .*no_such_plugin"):
+        swept(path, "-o", folder / "out")
+    assert not (folder / "out" / "cells").exists()
 
 
 def test_a_killed_sweep_loses_one_cell_at_most(folder, project, job):
