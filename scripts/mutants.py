@@ -247,13 +247,19 @@ MUTANTS = (
         ("tests/transport/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-n1c1]",),
     ),
     Mutant(
-        "connections: roulette is not divided by",
+        "roulette: splats are not divided by",
         "transport/techniques.py",
         "replace(c, value=value / survival, active=active, counted=counted)",
         "replace(c, value=value, active=active, counted=counted)",
-        (
-            "tests/images/test_known_answers.py::test_partial_sums_with_drawn_connections_and_roulette[default-3]",
-        ),
+        ("tests/images/test_plausible_bugs.py::test_what_plays_roulette_is_made_up_for",),
+    ),
+    Mutant(
+        "roulette: drawn connections are not divided by",
+        "transport/connections.py",
+        "value / survival",
+        "value",
+        ("tests/images/test_plausible_bugs.py::test_what_plays_roulette_is_made_up_for",),
+    ),
     ),
     Mutant(
         "emission: start of a light subpath lacks its density",
