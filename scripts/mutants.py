@@ -260,7 +260,6 @@ MUTANTS = (
         "value",
         ("tests/images/test_plausible_bugs.py::test_what_plays_roulette_is_made_up_for",),
     ),
-    ),
     Mutant(
         "emission: start of a light subpath lacks its density",
         "transport/kernel.py",
