@@ -211,6 +211,12 @@ class Results:
         return [name for name in RIVALS if name in others] + [name for name in others if name not in known]
 
     @cached_property
+    def standard(self) -> list[str]:
+        """What efficiencies by budget and costs are over: `path` with each sampler; other rivals if it was
+        not rendered under these names."""
+        return [rival for rival in self.rivals if rival in RIVALS] or self.rivals
+
+    @cached_property
     def _of(self) -> dict:
         """Rows by scene and integrator."""
         found = {}
@@ -273,12 +279,12 @@ class Results:
         return self.efficiency(scene, rival, error, budget)
 
     def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Summary:
-        """Over the stronger of `path` and `path` with multijitter, that with the smaller ratio, of those
-        that were rendered and pass the bias check; raises `Biased` if none does."""
+        """Over the strongest of `standard`, that with the smallest ratio, of those that were rendered and
+        pass the bias check; raises `Biased` if none does."""
         found, biased = [], {}
-        rivals = [rival for rival in RIVALS if rival != self.methods[0] and self.of(scene, rival)]
+        rivals = [rival for rival in self.standard if self.of(scene, rival)]
         if not rivals:
-            raise Refused(f"{RIVALS[0]} was not rendered")
+            raise Refused(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
         for rival in rivals:
             try:
                 found.append(self.fair_efficiency(scene, rival, error, budget))

@@ -105,9 +105,9 @@ def efficiency_table(results: Results) -> str:
 
 
 def gaps_table(results: Results) -> str:
-    """How much of the error single values carry: raw over trimmed relMSE, of the first integrator and of
-    `path`, scenes with most of it first."""
-    methods = results.methods[0], RIVALS[0]
+    """How much of the error single values carry: raw over trimmed relMSE, of the first integrator and of the
+    first of `Results.standard`, scenes with most of it first."""
+    methods = results.methods[0], *results.standard[:1]
     rows = [
         [f"`{scene}`", *(said(lambda s=scene, m=method: results.gap(s, m)) for method in methods)]
         for scene in results.by_gap(methods[0])
@@ -145,11 +145,13 @@ def estimate(x) -> str:
 def checks_table(results: Results, made: dict, notes: dict) -> str:
     """Per scene: cost per sample, slopes, bias checks; what is not as expected and has no note is marked."""
     ours = results.methods[0]
-    head = ["scene", "cost of a sample over path", f"{NONE} over path", "slope", "slope, independent points"]
+    rival = (results.standard or RIVALS)[0]
+    head = ["scene", f"cost of a sample over {rival}", f"{NONE} over {rival}", "slope"]
+    head += ["slope, independent points"]
     head += ["bias check", LIGHT_TRACER]
     lines = []
     for scene in results.scenes:
-        path = results.of(scene, RIVALS[0], results.deciding)
+        path = results.of(scene, rival, results.deciding)
         lines.append(
             [
                 f"`{scene}`",
@@ -241,8 +243,16 @@ def _verdict(check) -> str:
     return f"{verdict}, p = {check.family_p:.2g}, energy {-100 * check.missing.value:+.2g} % ± {half:.2g}"
 
 
+def stronger(results: Results) -> str:
+    """What efficiencies by budget are over, in words."""
+    names = results.standard or [RIVALS[0]]
+    if set(names) <= set(RIVALS):
+        return "the stronger `path`"
+    return f"the strongest of {', '.join(names)}" if len(names) > 1 else names[0]
+
+
 def budgets_table(results: Results) -> str:
-    """How the efficiency over the stronger `path` depends on the budget."""
+    """How the efficiency over the strongest of `Results.standard` depends on the budget."""
     budgets = sorted({row["budget"] for row in results.rows})
     head = ["scene", *(f"{b} spp, {kind}" for b in budgets for kind in ("trimmed", "raw"))]
     lines = []
@@ -496,7 +506,7 @@ def page(results: Results, made: dict, goals: list, notes: dict) -> str:
 {efficiency_table(results)}
 {"![Efficiency per scene](efficiency.png)" if results.rivals else ""}
 
-By budget, over the stronger `path` that passes the bias check:
+By budget, over {stronger(results)} that passes the bias check:
 
 {budgets_table(results)}
 How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel
