@@ -13,7 +13,8 @@ from typing import Any
 # Path length, or number of samples, that stands for no limit: the largest of Dr.Jit's 32-bit integers.
 UNLIMITED = 2**32 - 1
 
-# Most light vertices per lane (a lane's local memory lies on a thread's stack).
+# Most edges of a path that uses all strategies, and so most light vertices per lane, whose local memory lies
+# on a thread's stack.
 MAX_STORED = 1024
 
 DEFAULT_STORED = 64
