@@ -293,6 +293,8 @@ def test_mistakes_that_only_a_render_finds_are_one_line(here):
     options = ["--scenes", str(room), "--resolution", "16", "--spp", "4", "--pairs", "1"]
     words = ["compare", "bdpt skp=none", "bdpt", *options, "--project", "project"]
     assert "bdpt: skp='none' is not a parameter; did you mean skip?" in refused(*words)
+    words = ["compare", "bdpt max_depth=2", "path", *options, "--project", "project"]
+    assert "max_depth=2 of 'bdpt' would compare different images" in refused(*words)
     preset.write_text(PRESET.replace('heuristic = "power"', 'heuristic = "pwer"'))
     assert "heuristic='pwer' is not known" in refused("sweep", "mine", "--project", "project")
     preset.write_text(PRESET.replace('sampler = "multijitter"', 'sampler = "multijiter"'))

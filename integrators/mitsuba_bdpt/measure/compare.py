@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
+from ..errors import CommandError
 from .analysis import Refused
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse
@@ -95,6 +96,12 @@ def run(options: Namespace) -> int:
     mi.set_variant("llvm_ad_rgb")
     project = Project(options.project)
     scenes = [project.scene(name) for name in options.scenes]
+    for side in map(dict, options.sides):
+        if "max_depth" in side:
+            raise CommandError(
+                f"max_depth={side['max_depth']} of {side.get('type')!r} would compare different images; "
+                "leave it out: both sides have the depth of the reference"
+            )
     rows = []
     for scene in scenes:
         job = Job(project, scene, options.resolution, None, max(options.spp), options.reference_seconds)
