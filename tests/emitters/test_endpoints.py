@@ -5,11 +5,13 @@ image comparisons: Welch's t-test of tile means over seeds with Sidak's correcti
 """
 
 import itertools
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import welch
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.kinds import GROUPS, group_of
 from mitsuba_bdpt.geometry.rounding import ShapeErrors
@@ -29,10 +31,10 @@ from scene_parts import (
     texture,
     thinlens,
 )
-from scipy import stats
+from welch import tiles
 
-SIGNIFICANCE = 1e-4
-ROUNDING = 2e-4  # `path` and we offset rays differently; relative
+# `path` and we offset rays differently.
+agree = partial(welch.agree, rounding=2e-4)
 
 
 def like_of_rgb():
@@ -48,41 +50,6 @@ def render(scene, method, seeds, spp, **keywords):
     """Images, stacked: (seeds, height, width, channels)."""
     return np.stack(
         [np.array(method.render(scene, seed=seed, spp=spp, **keywords), dtype=np.float64) for seed in seeds]
-    )
-
-
-def tiles(images, size=4):
-    """Means of size x size pixels: (seeds, tiles x channels)."""
-    n, h, w = images.shape[:3]
-    cut = images.reshape(n, h // size, size, w // size, size, -1)
-    return cut.mean((2, 4)).reshape(n, -1)
-
-
-def agree(a, b, relative):
-    """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
-    their means. Faint columns that are zero in a tenth of the renders are left to the mean: a few
-    lumps are not normal. The confidence interval of the mean must be narrower than ``relative``."""
-    share = np.minimum((a != 0).mean(0), (b != 0).mean(0))
-    lumpy = np.append((share < 0.9) & (b.mean(0) < 0.05 * b.mean(0).max()), False)
-    a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
-    variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
-    error = np.sqrt(sum(variance))
-    freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
-        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120
-    )
-    level = 1 - (1 - SIGNIFICANCE) ** (1 / a.shape[1])
-    scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
-    reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + ROUNDING * scale
-    difference = a.mean(0) - b.mean(0)
-    bad = (np.abs(difference) > reach) & ~lumpy
-    assert not bad.any(), "\n".join(
-        f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
-        f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
-        for i in np.flatnonzero(bad)[-20:]
-    )
-    assert scale[-1] > 0
-    assert reach[-1] < relative * scale[-1], (
-        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}"
     )
 
 

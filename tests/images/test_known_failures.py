@@ -6,13 +6,18 @@ is Welch's t-test of tile means over seeds with Sidak's correction (`agree`); wh
 known, the t-test against it. Seeds are fixed and differ between the two sides.
 """
 
+from functools import partial
+
 import mitsuba as mi
 import numpy as np
 import pytest
+import welch
 from scipy import stats
+from welch import OF_AGREE, tiles
 
-SIGNIFICANCE = 1e-4
 ROUNDING = 1e-4  # systematic differences in float32 between two ways to one image, relative
+
+agree = partial(welch.agree, rounding=ROUNDING)
 
 T = mi.ScalarTransform4f
 
@@ -24,41 +29,6 @@ def integrator(kind="bdpt", **parameters):
 def render(scene, method, seeds, spp):
     """Images, stacked: (seeds, height, width, channels)."""
     return np.stack([np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
-
-
-def tiles(images, size=4):
-    """Means of size x size pixels: (seeds, tiles)."""
-    n, h, w = images.shape[:3]
-    cut = images.reshape(n, h // size, size, w // size, size, -1)
-    return cut.mean((2, 4)).reshape(n, -1)
-
-
-def agree(a, b, relative):
-    """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
-    their means. Faint columns that are zero in a tenth of the renders are left to the mean: a few
-    lumps are not normal. The confidence interval of the mean must be narrower than ``relative``."""
-    share = np.minimum((a != 0).mean(0), (b != 0).mean(0))
-    lumpy = np.append((share < 0.9) & (b.mean(0) < 0.05 * b.mean(0).max()), False)
-    a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
-    variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
-    error = np.sqrt(sum(variance))
-    freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
-        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120
-    )
-    level = 1 - (1 - SIGNIFICANCE) ** (1 / a.shape[1])
-    scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
-    reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + ROUNDING * scale
-    difference = a.mean(0) - b.mean(0)
-    bad = (np.abs(difference) > reach) & ~lumpy
-    assert not bad.any(), "\n".join(
-        f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
-        f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
-        for i in np.flatnonzero(bad)[-20:]
-    )
-    assert scale[-1] > 0
-    assert reach[-1] < relative * scale[-1], (
-        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}"
-    )
 
 
 def layer(images, bdpt, name):
@@ -415,7 +385,7 @@ def test_environment_does_not_depend_on_other_objects(environment):
 def known(samples, expected, relative, allowed=ROUNDING):
     """t-test of seeds against a known value, with a systematic error of up to ``allowed`` (relative);
     the interval must be narrower than ``relative``."""
-    reach = stats.t.isf(SIGNIFICANCE / 2, len(samples) - 1) * samples.std(ddof=1) / len(
+    reach = stats.t.isf(OF_AGREE / 2, len(samples) - 1) * samples.std(ddof=1) / len(
         samples
     ) ** 0.5 + allowed * abs(expected)
     assert abs(samples.mean() - expected) < reach, (samples.mean(), expected, reach)
