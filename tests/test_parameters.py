@@ -16,6 +16,7 @@ import mitsuba as mi
 import mitsuba_bdpt
 import numpy as np
 import pytest
+import scene_parts as parts
 from mitsuba_bdpt.parameters import check_variant
 from mitsuba_bdpt.run import schedule, work
 from mitsuba_bdpt.scene.prepared import PreparedScene
@@ -42,15 +43,7 @@ def sensor(size=16, spp=4, sampler="independent", keys=None, **film):
         "near_clip": 1e-3,
         "to_world": T().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0]),
         "sampler": {"type": sampler, "sample_count": spp},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": "box"},
-            **film,
-        },
+        "film": parts.film(size, "box", **film),
     } | (keys or {})
 
 

@@ -10,6 +10,7 @@ number of values tested at once. Seeds are fixed, so a test passes or fails alwa
 import mitsuba as mi
 import numpy as np
 import pytest
+import scene_parts as parts
 from scipy import stats
 
 # Chance that a correct program fails one call of `check`, had the seeds not been fixed.
@@ -52,15 +53,7 @@ def camera(origin=(0, 0, 0.5), target=(0.2, 0.1, -1), fov=60, size=16, rfilter="
         "near_clip": 1e-3,
         "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
         "sampler": {"type": "independent"},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": rfilter},
-            **film,
-        },
+        "film": parts.film(size, rfilter, **film),
     }
 
 

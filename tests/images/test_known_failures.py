@@ -11,6 +11,7 @@ from functools import partial
 import mitsuba as mi
 import numpy as np
 import pytest
+import scene_parts as parts
 import welch
 from scipy import stats
 from welch import OF_AGREE, tiles
@@ -45,15 +46,7 @@ def camera(origin, target, fov=45, size=16, up=(0, 1, 0), rfilter="box", **film)
         "near_clip": 1e-3,
         "to_world": T().look_at(list(origin), list(target), list(up)),
         "sampler": {"type": "independent"},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "pixel_format": "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": rfilter},
-            **film,
-        },
+        "film": parts.film(size, rfilter, **film),
     }
 
 
