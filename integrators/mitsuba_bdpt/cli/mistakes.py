@@ -48,7 +48,9 @@ def answered(main: Callable[[], Status]) -> Status | int:
 
 def is_mistake(error: Exception) -> bool:
     """Whether the user is to mend it, see above."""
-    if behind(error, UsageError, UnsupportedError, OSError, argparse.ArgumentTypeError) is not None:
+    if isinstance(error, OSError | argparse.ArgumentTypeError):
+        return True
+    if behind(error, UsageError, UnsupportedError) is not None:
         return True
     if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
         return False
