@@ -43,7 +43,7 @@ def sensor(size=16, spp=4, sampler="independent", keys=None, **film):
         "near_clip": 1e-3,
         "to_world": T().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0]),
         "sampler": {"type": sampler, "sample_count": spp},
-        "film": parts.film(size, "box", **film),
+        "film": parts.film(size, **film),
     } | (keys or {})
 
 
@@ -405,8 +405,8 @@ def test_interruption_keeps_what_is_done(rfilter):
             raise KeyboardInterrupt
 
     for scene, parameters, expected, tolerance in (
-        (glowing_sphere(rfilter={"type": rfilter}), {"max_depth": 1, "light_paths": 0}, 0.5, 1e-5),
-        (lamp_in_a_sphere(rfilter={"type": rfilter}, size=32), {}, 1, 0.05),
+        (glowing_sphere(rfilter=rfilter), {"max_depth": 1, "light_paths": 0}, 0.5, 1e-5),
+        (lamp_in_a_sphere(rfilter=rfilter, size=32), {}, 1, 0.05),
     ):
         bdpt = integrator(skip="none", spp_per_pass=4, **parameters)
         bdpt.on_pass = interrupt
