@@ -14,9 +14,9 @@ from .errors import UnsupportedError, UsageTypeError
 from .host.notices import warn_once
 from .image.features import feature_names
 from .image.layers import layer_names
-from .parameters import check_variant, integer, read_settings
 from .planning.budget import is_open
 from .planning.explain import explain
+from .properties import check_variant, integer, read_settings
 from .run import messages
 from .run.arguments import check_made_for, check_resumable, resolve_sensor, samples_per_pixel
 from .run.rendering import PassReport, Render

@@ -24,8 +24,8 @@ from mitsuba_bdpt.measure.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coeffici
 from mitsuba_bdpt.measure.recording import stepwise
 from mitsuba_bdpt.transport import connections
 from mitsuba_bdpt.transport.counters import Counters
-from mitsuba_bdpt.transport.light_path import StoredVertex
 from mitsuba_bdpt.transport.observer import Observer
+from mitsuba_bdpt.transport.stored_vertices import StoredVertex
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.

@@ -29,6 +29,7 @@ ON_SURFACES = [
 
 def emission(name, **others):
     """Scene, tables and `COUNT` sampled emissions of the emitter ``name``, which is alone but for a ball."""
+    parts.register_plugins()
     ball = {"type": "sphere", "center": [0.3, 0.5, 0], "radius": 0.5}
     scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": parts.EMITTERS[name]()} | others)
     emitters = Emitters(scene)

@@ -319,7 +319,7 @@ UNPOLARIZED = [v for v in mi.variants() if v.startswith("llvm") and not v.endswi
 
 def test_every_colour_mode_is_there():
     """The wheel has a variant of each colour mode for the test below (the others are refused in words, see
-    ``test_parameters``)."""
+    ``test_properties``)."""
     assert {"llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"} <= set(UNPOLARIZED)
 
 

@@ -57,7 +57,11 @@ def register_plugins():
 
         def __init__(self, props):
             super().__init__(props)
-            self.radiance = props.get("radiance", 1.0)
+            self.radiance = mi.Float(props.get("radiance", 1.0))
+
+        def traverse(self, callback):
+            callback.put("radiance", self.radiance, mi.ParamFlags.Differentiable)
+            callback.put("name", "a text", mi.ParamFlags.NonDifferentiable)
 
         def sample_wavelengths(self, si, sample, active=True):
             raise NotImplementedError

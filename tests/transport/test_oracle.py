@@ -34,7 +34,7 @@ from mitsuba_bdpt.measure import oracle
 from mitsuba_bdpt.measure.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
-from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, light_path, mis, techniques
+from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, mis, stored_vertices, techniques
 from mitsuba_bdpt.transport.counters import Counters
 from mitsuba_bdpt.transport.observer import Observer
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
@@ -573,9 +573,9 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     ):
         monkeypatch.setattr(sys.modules[function.__module__], function.__name__, record(function, edges_of))
     monkeypatch.setattr(
-        light_path,
+        stored_vertices,
         "store_light_vertex",
-        lambda kernel_, y, path: stored.append(light_path.StoredVertex.of(y)),
+        lambda kernel_, y, path: stored.append(stored_vertices.StoredVertex.of(y)),
     )
     monkeypatch.setattr(connections, "connect_all", connect_all)
     monkeypatch.setattr(techniques, "sees_emitter", lambda kernel_, z: z.active)

@@ -6,7 +6,7 @@ density of ``sample_ray``, ``pdf_position`` throws for all of them and ``eval_di
 directions. A bidirectional weight needs all of these for points that other strategies have made. So emission
 is sampled here, by formulas on top of the calls that are right: ``sample_direction``, ``pdf_direction``,
 ``eval`` and the shapes' ``sample_position``; where these are wrong too (small spheres, turned spheres, some
-textures), `geometry.agreement` says what is done in their place.
+textures), `geometry.mitsubas_choices` says what is done in their place.
 
 `emitters.Emitters` selects an emitter and asks the group that it belongs to (`group.Group`: area, directional
 area, position, infinite, hit-only, third-party), one module each, all views of its density together. A new

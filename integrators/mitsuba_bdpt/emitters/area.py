@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UnsupportedError, UsageError
-from ..geometry.agreement import (
+from ..geometry.mitsubas_choices import (
     TEXTURE_SAMPLED,
     check_densities,
     is_sampled_by_direction,

@@ -1,7 +1,7 @@
 """Spheres and cylinders: their curvature and sides, and spheres that emit or measure.
 
 Where Mitsuba's own calls are wrong about spheres, what stands here repeats the choice that its samplers make;
-`agreement` says which tests show that it does.
+`mitsubas_choices` says which tests show that it does.
 """
 
 from __future__ import annotations

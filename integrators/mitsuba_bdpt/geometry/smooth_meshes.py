@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import UsageError
 from ..host.introspection import named, own_parameters
-from .agreement import CHECKED, OFF, spread_points
+from .mitsubas_choices import CHECKED, OFF, spread_points
 
 
 class SmoothMeshes:

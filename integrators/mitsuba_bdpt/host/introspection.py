@@ -57,10 +57,17 @@ def own_parameters(owner) -> dict:
     collector = _collector(mi.variant())()
     found = collector.of(owner)
     return {
-        name: mi.get_property(value, collector.types[name], owner)
+        name: _value(value, collector.types[name], owner)
         for name, value in found.items()
         if value is not None and not isinstance(value, mi.Object)
     }
+
+
+def _value(value, cpptype, owner):
+    """The parameter itself, as ``mi.traverse`` reads it.
+
+    A plugin in Python puts the value, one of Mitsuba's a pointer to a value of this C++ type."""
+    return value if cpptype is None else mi.get_property(value, cpptype, owner)
 
 
 def all_parameters(owners):
@@ -76,7 +83,7 @@ def all_parameters(owners):
             if isinstance(value, mi.Object):
                 left.append(value)
             elif value is not None:
-                yield mi.get_property(value, collector.types[name], owner)
+                yield _value(value, collector.types[name], owner)
 
 
 def matrix_of(owner) -> np.ndarray:

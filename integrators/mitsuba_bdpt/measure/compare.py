@@ -3,7 +3,8 @@
 Medians over pairs of renders of different seeds, after one that compiles; of the efficiency the quartiles
 too. Errors are relMSE, trimmed of the worst 0.1 % and raw; the last column is what the reference's own error
 adds to the trimmed one, of that side where it is more (ratios are off by as much). Where an image has no
-error at all there are no ratios of errors, and that is said.
+error at all there are no ratios of errors, and that is said. Whether both have the same mean is not tested
+here: see `agreement`.
 """
 
 from __future__ import annotations

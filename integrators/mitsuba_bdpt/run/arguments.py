@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from ..errors import UsageError, UsageTypeError
 from ..host.introspection import named
-from ..parameters import integer, is_index
+from ..properties import integer, is_index
 from .schedule import REPLICATES
 from .snapshot import Snapshot
 

@@ -18,12 +18,12 @@ from ..host.jit import evaluated_mode, gc_paused
 from ..image.accumulator import Accumulator
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
-from ..parameters import check_film, check_not_frozen, check_scene, check_variant, integer
 from ..planning import lost_light
 from ..planning.choice import Prediction
 from ..planning.decision import MOST_ROULETTE
 from ..planning.findings import Findings
 from ..planning.planner import Planner
+from ..properties import check_film, check_not_frozen, check_scene, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis

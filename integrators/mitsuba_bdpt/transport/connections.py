@@ -10,10 +10,10 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream
 from . import bsdf, mis
-from .contribution import Contribution, finite, roulette, size_of, worth_a_ray
+from .contribution import Contribution, drop_non_finite, roulette, size_of, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
-from .light_path import LightPath, StoredVertex, read_light_vertex
+from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .walk import Vertex, newest_coefficient
 
 
@@ -68,7 +68,7 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, total, add):
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
     while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, add, candidates]):
         y = read_light_vertex(kernel, path, slot)
-        c = finite(inner(kernel, z, y))
+        c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
         lost += c.counted.non_finite
         ray, own = _sight(kernel, z, y)
@@ -138,7 +138,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         slot < candidates, label="draw an inner connection", exclude=[kernel, z, path, candidates, small]
     ):
         y = read_light_vertex(kernel, path, slot)
-        c = finite(inner(kernel, z, y))
+        c = drop_non_finite(inner(kernel, z, y))
         of_this = c.weighted()
         size = size_of(of_this)
         before, total = total, total + size

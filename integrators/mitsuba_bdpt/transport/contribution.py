@@ -40,7 +40,7 @@ class Contribution:
         return dr.select(self.active, self.value * self.weight, 0)
 
 
-def finite(c: Contribution) -> Contribution:
+def drop_non_finite(c: Contribution) -> Contribution:
     """``c``, inactive where it adds no finite value, which is counted: such a contribution counts as zero.
 
     All contributions pass here on their way to the sink; whatever finds a density from which no weight
@@ -67,8 +67,9 @@ def roulette(
 
 
 def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool:
-    """Mask: a strategy of this ``value`` and weight is worth a ray, or has to be counted by `finite` (of what
-    is not finite the weight may be 0). Technique images show unweighted ones too."""
+    """Mask: a strategy of this ``value`` and weight is worth a ray, or `drop_non_finite` has to count it.
+
+    (Of what is not finite the weight may be 0.) Technique images show unweighted ones too."""
     return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 

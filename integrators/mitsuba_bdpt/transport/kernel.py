@@ -2,33 +2,38 @@
 
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
 subpaths that it serves, in S different pixels (see `sharing`); all strategies of a pair are evaluated by that
-lane. Nothing per lane lives in global memory: apart from the film, the footprint does not grow with samples
-or image size.
+lane. No vertex lies in global memory: apart from the film, the footprint does not grow with samples or image
+size. (With ``points=sampler`` the random numbers of a pass do, and in a pilot what each sample adds.)
 
-What a lane does; below stand the functions in this order. Vertices: y_0 on the emitter, z_0 on the sensor; a
-path of s light and t camera vertices has k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`::
+What a lane does. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
+k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
     time, wavelengths <- drawn for all subpaths of the lane                 _shared
 
     # The light subpath                                                     _light_subpath
-    y_0, direction <- an emitter, with pdf_first * pdf_second               Emitters.sample_emission
-    d_vcm <- 1 / densities of y_0 and direction, d_vc <- their cos / the    _light_walk
-        same; 0 if y_0 cannot be hit (eqs. 31, 32)
-    (1,1):   splat y_0 seen by the sensor                                   techniques.join_endpoints
+    y_0, direction <- an emitter, with pdf_first * pdf_second               _emission
+    (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
+    d_vcm <- 1 / densities of y_0 and direction (eq. 31)                    _light_walk
+    d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
+    the first edge <- a ray
     for y in y_1, y_2, ...:                                                 walk.random_walk
-        d_vcm, d_vc <- in the area measure at y (eqs. 31, 32, 34, 35)       walk._vertex
+        d_vcm, d_vc <- in the area measure at y (eqs. 31, 32, 34, 35); at   walk._vertex
+            y_1 with next-event estimation's density of y_0 in d_vcm
         direction of the next edge, BSDF towards the sensor <- one call     walk._interact
         t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
         t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
-        keep y if its BSDF is not delta                                     light_path.store_light_vertex
+        keep y, if on a surface whose BSDF is not delta, for inner          stored_vertices
+            connections, unless no camera subpath could reach it in time
         throughput, d_vcm, d_vc <- the event at y (eqs. 34, 35, 53, 54)     walk._leave
-        roulette; the next edge <- a ray
+        roulette of the subpath; the next edge <- a ray
 
     # Its camera subpaths
-    for S pixels:                                                           trace
-        z_0, direction <- the sensor, at a point of the pixel               _camera_subpath
-        d_vcm <- 1 / density of the direction,                              _camera_walk
-            d_vc <- cos / densities of z_0 and direction; 0 without area
+    for S pixels (one, without light subpaths):                             _serve_all, _camera_subpath
+        z_0, direction <- the sensor, at a point of the pixel               _camera_sample
+        d_vcm <- 1 / density of the direction                               _camera_walk
+        d_vc <- kappa of t = 0 * cos / densities of z_0 and direction;
+            0 without area
+        the first edge <- a ray
         total <- 0
         for z in z_1, z_2, ...:                                             walk.random_walk
             d_vcm, d_vc <- in the area measure at z                         walk._vertex
@@ -40,19 +45,24 @@ path of s light and t camera vertices has k = s + t - 1 edges. Equations of Geor
                         each of them,                                       connections.connect_all
                         or one, drawn by what it would add unshadowed       connections.connect_one
             throughput, d_vcm, d_vc <- the event at z                       walk._leave
-            roulette; the next edge <- a ray
+            roulette of the subpath; the next edge <- a ray
         add the total to the pixel                                          sink.end
 
-Each strategy i of a path adds w_i f / (n_i p_i), with its number of samples n_i per camera sample (the light
-subpaths per camera subpath for t <= 1, else 1) and the weight (eq. 37)
+Each strategy i of a path adds w_i f / (n_i p_i). n_i is its number of samples per camera sample: the light
+subpaths per camera subpath for t <= 1, else 1. The weights w_i are those of a `mis.Heuristic`; of the balance
+heuristic (eq. 37)
 
-    w_i = kappa_i p_i / sum_j kappa_j p_j = 1 / (light side + 1 + camera side)
+    w_i = kappa_i p_i / sum_j kappa_j p_j = kappa_i / (light side + kappa_i + camera side)
 
-whose two sums are over the strategies with fewer and with more light vertices, from the partial sums of y and
-z. Classes of strategies that the plan leaves out have kappa = 0 and are not recorded.
+with kappa_j p_j / p_i added up over the strategies of fewer light vertices (light side) and of more (camera
+side), from the partial sums of y and z. kappa_i contains n_i, as 1 / S for t <= 1 (where S does not divide
+the batch, the estimate's n_i is the exact one: weights need only sum to 1). Classes of strategies that the
+plan leaves out have kappa = 0 and are not recorded.
 
-What is not finite is stopped at two gates, and counted: the walk ends a subpath (`walk.not_finite`), and on
-the way to the sink a contribution is dropped (`contribution.finite`; the sink drops such colours).
+What t = 1 or a drawn inner connection would add plays roulette before its shadow ray is traced
+(`contribution.roulette`). What is not finite is stopped, and counted: the walk ends a subpath
+(`walk.not_finite`), a contribution is dropped on its way to the sink (`contribution.drop_non_finite`), and
+the sink drops what the film would make of a colour.
 """
 
 from __future__ import annotations
@@ -65,7 +75,7 @@ import mitsuba as mi
 from ..geometry import rays
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
-from . import bsdf, contribution, light_path, mis, techniques
+from . import bsdf, contribution, mis, stored_vertices, techniques
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, one
 from .inputs import Kernel, Shared
@@ -80,7 +90,7 @@ class _Lane:
 
     place: Places
     shared: Shared
-    path: light_path.LightPath
+    path: stored_vertices.LightPath
 
 
 @dataclass
@@ -149,7 +159,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[_Lane, Counters]
     """The lanes of these numbers with their light subpaths, which are traced."""
     stream = kernel.points.stream("light", place.index(index), index)
     shared = _shared(kernel, stream)
-    path = light_path.allocate_light_path(kernel, dr.width(index))
+    path = stored_vertices.allocate_light_path(kernel, dr.width(index))
     counters = Counters()
     if kernel.plan.light:
         path, counters = _light_subpath(kernel, sink, stream, shared, path)
@@ -172,7 +182,7 @@ def _shared(kernel: Kernel, stream) -> Shared:
 # -- the light subpath ------------------------------------------------------------------------
 
 
-def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[light_path.LightPath, Counters]:
+def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_vertices.LightPath, Counters]:
     """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections."""
     plan = kernel.plan
     e = _emission(kernel, stream, shared)
@@ -188,7 +198,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[light_pa
         if plan.splat:
             counters += _splat(kernel, sink, techniques.splat(kernel, vertex, stream), shared)
         if plan.connections != "none":
-            light_path.store_light_vertex(kernel, vertex, path)
+            stored_vertices.store_light_vertex(kernel, vertex, path)
         return path, counters
 
     walk = _light_walk(kernel, e, shared)
@@ -243,7 +253,7 @@ def _light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
 
 def _splat(kernel: Kernel, sink, c, shared) -> Counters:
     """Hand a contribution with t <= 1 to the sink."""
-    c = contribution.finite(c)
+    c = contribution.drop_non_finite(c)
     return c.counted + sink.splat(kernel, c, shared)
 
 
@@ -332,7 +342,7 @@ def _camera_visit(kernel: Kernel, sink, lane: _Lane, sample: _Sample):
     plan, start, shared = kernel.plan, sample.start, lane.shared
 
     def add_hit(z, total, lost):
-        c = contribution.finite(techniques.hit_emitter(kernel, z))
+        c = contribution.drop_non_finite(techniques.hit_emitter(kernel, z))
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
     def visit(z, state, _):
@@ -348,7 +358,7 @@ def _camera_visit(kernel: Kernel, sink, lane: _Lane, sample: _Sample):
             )
             counters = replace(counters, non_finite=lost)
         if plan.direct:
-            c = contribution.finite(techniques.next_event(kernel, z))
+            c = contribution.drop_non_finite(techniques.next_event(kernel, z))
             total, counters = sink.add(kernel, c, total, start, shared), counters + c.counted
         if plan.connections != "none":
             total, counted = sink.connect(kernel, z, lane, sample.stream, total, start)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import all_shapes, named
-from .image import features, memory
+from .image import features, film_limits
 from .image.channels import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
@@ -272,8 +272,8 @@ def check_film(sensor, settings: Settings):
         )
     _check_has_pixels(sensor.film())
     channels = Channels.of(sensor.film(), len(colour.names), len(features.feature_names(settings.aovs)))
-    memory.check_film(sensor.film(), channels, settings.variance)
-    memory.check_strategies(sensor.film(), settings.strategy_depth)
+    film_limits.check_film(sensor.film(), channels, settings.variance)
+    film_limits.check_strategies(sensor.film(), settings.strategy_depth)
     return colour
 
 

@@ -17,7 +17,7 @@ import mitsuba_bdpt
 import numpy as np
 import pytest
 import scene_parts as parts
-from mitsuba_bdpt.parameters import check_variant
+from mitsuba_bdpt.properties import check_variant
 from mitsuba_bdpt.run import schedule, work
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
@@ -852,7 +852,7 @@ def test_gradients_do_not_matter_to_what_is_told():
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
     Expected: on a machine that has room for the film alone, each of them is refused in words."""
-    monkeypatch.setattr("mitsuba_bdpt.image.memory.available", lambda: 300 * 64 * 64)
+    monkeypatch.setattr("mitsuba_bdpt.image.film_limits.available", lambda: 300 * 64 * 64)
     scene = glowing_sphere(size=64)
     assert image(integrator(), scene, spp=8).shape == (64, 64, 3)
     for more in ({"variance": True}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
