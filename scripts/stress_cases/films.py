@@ -128,6 +128,6 @@ def huge() -> Outcome:
         for kind in ("bdpt",) if width == side else ("bdpt", "path"):
             done = child.python(HUGE, kind, str(width), str(height), str(HUGE_MEMORY))
             said[kind] = done.stdout.strip() or f"ends with status {done.returncode}"
-        ok &= said["bdpt"].startswith("ValueError bdpt: the film of ")
+        ok &= said["bdpt"].startswith("UsageError bdpt: the film of ")
         happened.append(f"{width} x {height}: {short(said['bdpt'], 90)} (`path`: {short(said['path'], 60)})")
     return Outcome(ok, "; ".join(happened))
