@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 
@@ -35,6 +34,8 @@ class CommandError(UsageError):
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The question for the one of the ``known`` names that ``name`` is most like, with a space after it;
     empty if none is."""
+    import difflib  # which takes 5 ms, and only mistakes need it
+
     by_case = {other.lower(): other for other in known}
     near = difflib.get_close_matches(name.lower(), by_case, 1)
     return f"did you mean {by_case[near[0]]}? " if near else ""

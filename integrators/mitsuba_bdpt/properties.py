@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from numbers import Integral, Real
 
 import drjit as dr
@@ -110,6 +109,8 @@ def _light_paths(value, name: str) -> float | str:
         raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
     if value == "auto":
         return value
+    from fractions import Fraction  # which takes 3 ms, and the default does not need it
+
     try:
         number = float(Fraction(value))
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
