@@ -100,8 +100,8 @@ MUTANTS = (
     Mutant(
         "count of light subpaths",
         "transport/kernel.py",
-        "1.0 if batch.spread else sharing.lanes / batch.size",
-        "1.0 if batch.spread else 1 / kernel.plan.camera_paths_per_light_path",
+        "kernel.bound(points, _count_light(batch, sharing), Observer())",
+        "kernel.bound(points, 1 / kernel.plan.camera_paths_per_light_path, Observer())",
         ("tests/images/test_plausible_bugs.py::test_splats_of_few_pixels_count_once[3-1]",),
     ),
     Mutant(

@@ -3,14 +3,17 @@
 The README is the first page, CONTRIBUTING.md and CHANGELOG.md are pages too, and so are the tutorial's cells.
 A comment `<!-- api: CLASS MEMBER ... -->` is replaced by the docstrings of that class of the package, read
 without importing it. Links to files that the site does not have (source, tests, scenes) become plain text.
+Equations become MathML, so that pages need no script and no other site.
 """
 
 from __future__ import annotations
 
 import ast
+import html
 import re
 from pathlib import Path
 
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,6 +26,12 @@ TOP = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG
 ELSEWHERE = r"(?:(?:\.\./)+|(?=LICENSE|CITATION))"
 FOLDERS = r"(?:integrators|tests|scripts|scenes|references|presets|LICENSE|CITATION|Makefile|pyproject)"
 OUTSIDE = re.compile(rf"(?<!!)\[([^\]]*)\]\({ELSEWHERE}{FOLDERS}\b[^)]*\)")
+
+# What pymdownx.arithmatex makes of equations in the text and of those on lines of their own.
+EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+
+# Characters in a line of code; longer calls have a line for each argument.
+CODE_WIDTH = 80
 
 API = re.compile(r"<!-- api: (\w+)((?: \w+)*) -->")
 
@@ -63,7 +72,25 @@ def signature(method: ast.FunctionDef) -> str:
     if any(isinstance(d, ast.Name) and d.id == "property" for d in method.decorator_list):
         return method.name + result
     arguments = re.sub(r"^(self|cls)(, )?", "", ast.unparse(method.args))
-    return f"{method.name}({arguments}){result}"
+    call = f"{method.name}({arguments}){result}"
+    if len(call) > CODE_WIDTH:
+        arguments = re.sub(r", (?=\*?\w+(?::|=|$))", ",\n    ", arguments)
+        call = f"{method.name}(\n    {arguments},\n){result}"
+    return call
+
+
+def documented(node: ast.ClassDef) -> str:
+    """Return the docstring of a class, with its attributes as a list that has their types."""
+    types = {
+        ast.unparse(n.target): ast.unparse(n.annotation) for n in node.body if isinstance(n, ast.AnnAssign)
+    }
+    text, _, attributes = ast.get_docstring(node).partition("\n\nAttributes:\n")
+    told = dict(re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", attributes, re.MULTILINE))
+    lines = [
+        f"* `{name}: {kind}`" + (f": {' '.join(told[name].split())}" if name in told else "")
+        for name, kind in types.items()
+    ]
+    return "\n\n".join([text, "\n".join(lines)])
 
 
 def described(match: re.Match) -> str:
@@ -74,10 +101,8 @@ def described(match: re.Match) -> str:
         raise ValueError(f"{node.name} has no method {missing[0]}, whose docstring a page of docs/ shows")
     if not members:
         members = [name for name in methods if not name.startswith("_")]
-    fields = [n for n in node.body if isinstance(n, ast.AnnAssign) and ast.get_docstring(node)]
-    parts = []
-    if fields:
-        parts += [ast.get_docstring(node), "\n".join(f"* `{ast.unparse(n)}`" for n in fields)]
+    has_fields = any(isinstance(n, ast.AnnAssign) for n in node.body)
+    parts = [documented(node)] if has_fields and ast.get_docstring(node) else []
     for name in members:
         text = ast.get_docstring(methods[name])
         if text is None:
@@ -100,6 +125,18 @@ def on_page_markdown(markdown, page, config, files):
     markdown = re.sub(r"\]\(((?:[\w./]*/)?)tutorial\.py\)", r"](\1tutorial.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md\)", _top_page(page), markdown)
     return OUTSIDE.sub(r"\1", markdown)
+
+
+def on_page_content(content, page, config, files):
+    """Set the equations."""
+    return EQUATION.sub(_set, content)
+
+
+def _set(match: re.Match) -> str:
+    """Return an equation in TeX as MathML; one on a line of its own in a frame that may be scrolled."""
+    display = "block" if match[1] == "div" else "inline"
+    set_ = convert(html.unescape(match[2]).strip(), display=display)
+    return f'<div class="equation">{set_}</div>' if display == "block" else set_
 
 
 def _top_page(page):
