@@ -215,6 +215,11 @@ def test_recipes_say_what_makes_a_reference(here):
         ("windows = [[0, 0, 2, 1]]", "must be lists of four shares"),
         ("radiance = { limit = 1.0 }", "must have the keys limit and lacks"),
         ("window = 1", "window is not a key of"),
+        ("windows = 3", "windows=3 of .* must be lists of four shares"),
+        ('windows = [3, "x"]', "must be lists of four shares"),
+        ("by = []", r"by=\[\] of .* must be one of"),
+        ("radiance = 3", "radiance=3 of .* must have the keys limit and lacks, numbers"),
+        ("radiance = { limit = true, lacks = 'x' }", "must have the keys limit and lacks, numbers"),
     ):
         recipe.write_text(f"[room]\n{wrong}\n")
         with pytest.raises(ValueError, match=message):

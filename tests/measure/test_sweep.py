@@ -536,7 +536,9 @@ def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, 
     assert depths == [subjects[name].max_depth for name in ("cornell_box", "pool")]
     assert depths[0] != project.scene("cornell_box").max_depth
     data = {"max_depth": 3, "scene": {"pool": {"max_depth": 4}}}
-    assert [depth_in(data, project.scene(name)) for name in ("pool", "cornell_box")] == [4, 3]
+    assert [
+        depth_in(preset_file(project.root), data, project.scene(name)) for name in ("pool", "cornell_box")
+    ] == [4, 3]
 
 
 def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
@@ -663,7 +665,21 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (('match = "seconds"', MORE.replace('"path"', '"none"')), r"'none' of \[more\] integrators"),
         (('match = "seconds"', MORE.replace('"ours", ', "")), r"must be the first one, 'ours', and its"),
         (('match = "seconds"', MORE.replace("[3, 9]", "[9, 3]")), r"must be \[at least, at most\]"),
-        (('match = "seconds"', MORE.replace("0.5", "0")), "width=0 of .* must be between 0 and 1"),
+        (('match = "seconds"', MORE.replace("0.5", "0")), "width=0 of .* must be a number between 0 and 1"),
+        (('["cornell_box"]', "[3]"), r"scenes=\[3\] must be a list .* all texts in quotes"),
+        (("seeds = 2", "scene = 3\nseeds = 2"), r"scene=3 must be a table: write \[scene\]"),
+        (("seeds = 2", "scene.cornell_box = 3\nseeds = 2"), r"scene.cornell_box=3 must be a table"),
+        (("seeds = 2", "more = 3\nseeds = 2"), "more=3 must be a table"),
+        (("seeds = 2", "probes = [1]\nseeds = 2"), r"probes=\[1\] must be a table"),
+        (("[2, 4]", "[2, -4]"), r"spp=\[2, -4\] must be a list of whole numbers of at least 1"),
+        (("[2, 4]", "[true]"), r"spp=\[True\] must be a list of whole numbers"),
+        (('type = "path"', "type = 3"), "type of an integrator=3 must be a text in quotes"),
+        (('type = "path"', 'type = "path"\nname = 3'), "name of an integrator=3 must be a text"),
+        (('type = "path"', 'type = "path"\nsampler = 3'), "sampler of integrator 'path'=3 must be a text"),
+        (('match = "seconds"', 'scenes = "pool"'), "scenes of integrator 'path'='pool' must be a list"),
+        (('match = "seconds"', "x = [1]"), r"x=\[1\] of integrator 'path' must be a number, a text, true"),
+        (('match = "seconds"', MORE.replace("0.5", "true")), "width=True of .* must be a number"),
+        (('match = "seconds"', MORE.replace('["ours", "path"]', "1")), r"integrators of \[more\]=1 must be"),
     ],
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import platform
 import time
 from argparse import Namespace
@@ -26,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from ..files.texts import read_toml
+from ..files.texts import read_toml, table_of
 from ..host.versions import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means
@@ -55,6 +56,17 @@ MARGIN = 0.9  # of the share that a reference may carry
 SECONDS = 600.0  # that a reference may take
 
 
+def _is_number(value) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_window(share) -> bool:
+    """Whether this is left, top, right and bottom of a part of an image."""
+    if not isinstance(share, list) or len(share) != 4 or not all(map(_is_number, share)):
+        return False
+    return 0 <= share[0] < share[2] <= 1 and 0 <= share[1] < share[3] <= 1
+
+
 @dataclass(frozen=True)
 class Recipe:
     """How the reference of a scene is made, from the table of its name in PROJECT/references/scenes.toml:
@@ -78,21 +90,24 @@ class Recipe:
     def of(project: Project, name: str) -> Recipe:
         """That of a scene; raises ``CommandError`` for one that cannot be followed."""
         file = project.references / "scenes.toml"
-        entry = (read_toml(file) if file.is_file() else {}).get(name, {})
+        entry = table_of(file, name, (read_toml(file) if file.is_file() else {}).get(name, {}))
         keys = {"by", "windows", "radiance"}
         if unknown := sorted(set(entry) - keys):
             raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
-        if entry.get("by", "bdpt") not in WAYS:
+        if entry.get("by", "bdpt") not in tuple(WAYS):  # of a list there is no hash
             raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
         windows = entry.get("windows", [])
-        if not all(len(w) == 4 and 0 <= w[0] < w[2] <= 1 and 0 <= w[1] < w[3] <= 1 for w in windows):
+        if not isinstance(windows, list) or not all(map(_is_window, windows)):
             raise CommandError(
                 f"{file}: windows={windows!r} of [{name}] must be lists of four shares, left, top, "
                 "right, bottom"
             )
         known = entry.get("radiance")
-        if known is not None and set(known) != {"limit", "lacks"}:
-            raise CommandError(f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks")
+        whole = isinstance(known, dict) and set(known) == {"limit", "lacks"}
+        if known is not None and not (whole and all(map(_is_number, known.values()))):
+            raise CommandError(
+                f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks, numbers"
+            )
         return Recipe(entry.get("by", "bdpt"), tuple(map(tuple, windows)), known)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow.parquet
 
 from ..errors import CommandError
-from ..files.texts import read_toml, write_text
+from ..files.texts import list_of, read_toml, text_of, write_text
 from . import figures
 from .analysis import (
     ALONE,
@@ -420,6 +420,30 @@ GOALS = {
     "memory": _memory,
 }
 
+OF_A_SCENE = ("efficiency", "efficiency raw", "near one", "alone", "cost", "pilot")
+"""Those that take a scene."""
+
+
+def checked_goals(file: Path, data: dict) -> list[dict]:
+    """The entries [[goal]] of goals.toml; raises ``CommandError`` for what is no goal."""
+    if not data:
+        return []
+    goals = list_of(file, "goal", data.get("goal"), dict, "tables: write [[goal]] and the keys of each below")
+    for goal in goals:
+        for key in ("what", "at_least"):
+            text_of(file, f"{key} of a [[goal]]", goal.get(key))
+        for key in {"aim", "tried"} & set(goal):
+            text_of(file, f"{key} of {goal['what']!r}", goal[key])
+        measure, scene = goal.get("measure"), goal.get("scene")
+        if measure is not None and measure not in tuple(GOALS):
+            raise CommandError(
+                f"{file}: measure={measure!r} of {goal['what']!r} must be one of {sorted(GOALS)}"
+            )
+        if measure is not None and (scene is not None) != (measure in OF_A_SCENE):
+            needs = "needs a scene" if scene is None else "is no figure of one scene: leave out scene"
+            raise CommandError(f"{file}: measure={measure!r} of {goal['what']!r} {needs}")
+    return goals
+
 
 def goals_table(results: Results, goals) -> str:
     """What is asked for beside what is measured."""
@@ -550,7 +574,9 @@ def run(options: Namespace) -> int:
     results, made = load(project, folder)
     files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
     kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
-    goals, notes = kept["goals"].get("goal", []), kept["notes"]
+    goals, notes = checked_goals(files["goals"], kept["goals"]), kept["notes"]
+    for scene, text in notes.items():
+        text_of(files["notes"], scene, text)
     write_text(folder / "README.md", page(results, made, goals, notes))
     if results.rivals:
         figures.efficiencies(results, results.rivals, folder / "efficiency.png")
