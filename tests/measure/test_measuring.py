@@ -329,3 +329,35 @@ def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
     words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
     assert main(words) == 0
     assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 30
+
+
+def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
+    """Rationale: some scenes fail only while their reference is made. Expected: those that are black or
+    cannot be rendered are left out and named, the rows of the others are written, the status is 1; so it is
+    where the rows of a scene are damaged. A film without colours and a reference of another scene are refused
+    before anything is rendered."""
+    room = ROOM.format(height=64, sampler="")
+    lamp = re.search(r"<emitter.*</emitter>", room, re.DOTALL)[0]
+    medium = '<medium type="homogeneous" name="interior"/>'
+    for name, text in (("dark", room.replace(lamp, "")), ("fog", room.replace(lamp, medium + lamp))):
+        (here / "elsewhere" / f"{name}.xml").write_text(text)
+    preset = here / "project" / "presets" / "mine.toml"
+    head = PRESET.partition("[[integrator]]")[0].replace("[2, 4]", "[2]").replace("[8, 2]", "2")
+    listed = ", ".join(f'"elsewhere/{name}.xml"' for name in ("dark", "fog", "room"))
+    preset.write_text(head.replace('"../elsewhere/room.xml"', listed) + '[[integrator]]\ntype = "bdpt"\n')
+    words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
+    assert main(words) == 1
+    out = capsys.readouterr().out
+    assert "failed: dark: left out: scene='dark' is black" in out and "max_depth=4" in out
+    assert "failed: fog: left out: bdpt: shape" in out and "out: 2 rows" in out
+    next((here / "out" / "cells").iterdir()).write_text("{")
+    assert main([*words, "--scenes", "room"]) == 1
+    assert re.search(r"failed: room: no rows: .*json' is damaged .*; delete it", capsys.readouterr().out)
+    (here / "elsewhere" / "room.xml").write_text(room.replace("<integrator", "<!-- edited --><integrator", 1))
+    assert main(words) == 2
+    assert "reference room_16_4.exr was made of another room.xml" in capsys.readouterr().err
+    grey = '<film type="hdrfilm"><string name="pixel_format" value="luminance"/>'
+    (here / "elsewhere" / "fog.xml").write_text(room.replace('<film type="hdrfilm">', grey))
+    assert main(words) == 2
+    said = capsys.readouterr()
+    assert "fog.xml': its film has no colours" in said.err and "making one" not in said.out

@@ -159,6 +159,15 @@ def obtained(job: Job) -> Reference:
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
+def check(job: Job) -> None:
+    """Raise ``CommandError`` for a reference that cannot be made or used, as far as that is known before
+    anything is rendered."""
+    Recipe.of(job.project, job.scene.name)
+    check_size(job)
+    if reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
+        load_reference(job.project, job.scene, job.resolution, job.depth)
+
+
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it; also whether it is good
     enough. One that the time has cut short does not replace a better one."""
@@ -174,7 +183,8 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def check_size(job: Job) -> None:
-    """Raise ``CommandError`` for an image that the tiles of a bias check do not divide."""
+    """Raise ``CommandError`` for an image that the tiles of a bias check do not divide, or without
+    colours."""
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
@@ -197,16 +207,23 @@ class Aim:
     """What a reference has to judge: renders of default `bdpt` with ``spp`` samples per pixel, and of `path`
     in the same time where that converges."""
 
-    def __init__(self, scene, depth: int, spp: int, by_path: bool):
+    def __init__(self, job: Job, scene, by_path: bool):
+        self.name, self.depth, spp = job.scene.name, job.depth, job.spp
         rivals = [({"type": "bdpt"}, spp)] + [(WAYS["path"], TWICE * spp)] * by_path
         self.images = []
         for parameters, samples in rivals:
-            rival = integrator_of(parameters, depth)
+            rival = integrator_of(parameters, job.depth)
             for seed in range(TRIALS):
                 self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
 
     def reached(self, reference: Reference) -> bool:
-        """Whether the reference carries little enough of their errors, and can serve in a bias check."""
+        """Whether the reference carries little enough of their errors, and can serve in a bias check; raises
+        ``CommandError`` if it is black: no error is relative to that."""
+        if not reference.image.any():
+            raise CommandError(
+                f"scene={self.name!r} is black: the samples of its reference found no light; check its "
+                f"lamps, its sensor and max_depth={self.depth}, or leave it out"
+            )
         if reference.means is None:
             return False
         return all(
@@ -251,7 +268,7 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, SAMPLER])
     scene = job.scene.load(job.resolution, SAMPLER)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(scene, job.depth, job.spp, by == "path")
+    aim = Aim(job, scene, by == "path")
     windows = [Window(job, share) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):

@@ -100,17 +100,15 @@ def _read(file: Path) -> dict:
         raise CommandError(f"{str(file)!r} is damaged ({error}); delete it, to render it anew") from error
 
 
-def rows(preset: Preset, scenes: list[Cells], output: Path) -> list[dict]:
-    """The rows of all finished cells of the ``preset``, in its order; ``scenes``: its cells of each.
+def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
+    """The rows of all finished ``cells`` of a scene of the ``preset``, in its order.
 
     (Those that were rendered: the cells of a source that was edited meanwhile have other names.)
     """
-    found = []
-    for cells in scenes:
-        wanted = {c.key: c for c in cells.planned()}
-        if cells.more is not None:
-            wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
-        found += read_rows(output, cells, wanted.values())
+    wanted = {c.key: c for c in cells.planned()}
+    if cells.more is not None:
+        wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
+    found = read_rows(output, cells, wanted.values())
     return [row | {"first": preset.methods[0].name} for row in found]
 
 

@@ -3,11 +3,12 @@
 Presets (see `preset`) say what is rendered. For each scene, budget and seed all integrators follow one
 another, so that a noisy machine is noisy for all. Every finished render is a file of its own in OUTPUT/cells,
 named after a hash of all that determines it (parameters, scene, versions, the plugin's source), and is not
-rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the next time.
-Errors are taken against the references of `making`, which are made first where there are none, and anew when
-a reference has become better; HDR-FLIP for the first seed alone, since it takes longer than most renders. On
-a cluster, renders that follow one another go to one worker together, which renders them one after the other;
-workers see the project under the same path, and have the same software. Probes are left out there.
+rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the next time,
+and so is a scene of which no reference can be made. Errors are taken against the references of `making`,
+which are made first where there are none, and anew when a reference has become better; HDR-FLIP for the first
+seed alone, since it takes longer than most renders. On a cluster, renders that follow one another go to one
+worker together, which renders them one after the other; workers see the project under the same path, and have
+the same software. Probes are left out there.
 OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what `probes` measure.
 """
 
@@ -30,7 +31,7 @@ from ..run.rendering import raise_interrupt
 from . import analysis, probes
 from .bench import Bench, measure, measured
 from .cells import Cell, Cells, machine, software
-from .making import Job, obtained
+from .making import Job, check, obtained
 from .preset import Preset, read_preset
 from .project import Project
 from .rows import beside, cell_file, judge_of, read_rows, rows, store, write_tables
@@ -49,13 +50,39 @@ class Sweep:
 
     def prepare(self, seconds: float):
         """Complain of what cannot be rendered before hours of rendering, not after, and make references that
-        are missing, each for at most about so many ``seconds``."""
-        for cells, missing in zip(self.scenes, self._todo, strict=True):
+        are missing, each for at most about so many ``seconds``. A scene without one is left out, and noted in
+        ``failed``: one scene must not cost the others."""
+        wanted = [(cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing]
+        for cells, missing in wanted:
             for method in {cell.method: cell for cell in missing}.values():
                 check_plugins(method.method, dict(method.parameters), method.sampler, cells.subject.max_depth)
-        for cells, missing in zip(self.scenes, self._todo, strict=True):
-            if missing:
-                obtained(Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds))
+        jobs = [Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds) for cells, _ in wanted]
+        for job in jobs:
+            check(job)
+        lost = []
+        for (cells, _), job in zip(wanted, jobs, strict=True):
+            try:
+                obtained(job)
+            except Exception as error:
+                self._note(f"{job.scene.name}: left out", error)
+                lost.append(cells)
+        kept = [i for i, cells in enumerate(self.scenes) if cells not in lost]
+        self.scenes, self._todo = [self.scenes[i] for i in kept], [self._todo[i] for i in kept]
+
+    def _note(self, what: str, error: Exception):
+        """Keep a failure for the end; raises ``KeyboardInterrupt`` if it is none."""
+        raise_interrupt(error)
+        self.failed.append(f"{what}: {' '.join(message(error).split())}")
+
+    def rows(self) -> list[dict]:
+        """The rows of all finished cells; scenes of which they cannot be read are noted in ``failed``."""
+        found = []
+        for cells in self.scenes:
+            try:
+                found += rows(self.preset, cells, self.output)
+            except Exception as error:
+                self._note(f"{cells.subject.name}: no rows", error)
+        return found
 
     def run(self, progress: Progress, elsewhere=None):
         """Render all that is not there yet, showing ``progress``; on a cluster if ``elsewhere``, a client and
@@ -95,8 +122,7 @@ class Sweep:
         try:
             self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
-            raise_interrupt(error)
-            self.failed.append(f"{_description(cell)}: {message(error)}")
+            self._note(_description(cell), error)
         self._progress.advance(self._task)
 
     def _store(self, cells: Cells, cell: Cell, result):
@@ -176,7 +202,7 @@ def chosen(preset: Preset, names) -> Preset:
 
 
 def run(options: Namespace) -> int:
-    """Sweep as the command line ``options`` say; the exit status is 1 if a cell failed."""
+    """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
     mi.set_variant("llvm_ad_rgb")
     project = Project(options.project)
     file = project.preset(options.preset)
@@ -193,7 +219,7 @@ def run(options: Namespace) -> int:
                 sweep.run(progress, (client, file.read_text()))
         else:
             sweep.run(progress)
-    table = rows(preset, sweep.scenes, output)
+    table = sweep.rows()
     if options.scenes:
         table = beside(table, whole, output)
     if table:
