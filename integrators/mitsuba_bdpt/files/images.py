@@ -17,6 +17,22 @@ PNG_SIDE = 1_000_000
 """Pixels in a row or column of a PNG, at most: libpng's limit."""
 
 
+MOST_CHANNELS = 1023
+"""Of an image file, the weight of a pixel among them: Mitsuba's bitmaps have 4095 bytes for a pixel."""
+
+
+def check_channels(film: mi.Film, layers: list[str]) -> None:
+    """Raise ``CommandError`` for more ``layers``, names of channels, than a file can hold, which would come
+    out after the render."""
+    if len(layers) + film.base_channels_count() > MOST_CHANNELS // 2:
+        count = film.prepare(layers)
+        if count > MOST_CHANNELS:
+            raise CommandError(
+                f"the image has {count} channels, {len(layers)} of them layers, and Mitsuba's images hold "
+                f"{MOST_CHANNELS} at most; ask for fewer layers: of strategies, by a smaller max_depth."
+            )
+
+
 def check_png(film: mi.Film) -> None:
     """Raise ``CommandError`` for an image that no PNG can hold, which would come out after the render."""
     width, height = film.crop_size()
