@@ -19,6 +19,7 @@ import pyarrow.parquet
 
 from ..errors import CommandError
 from ..files.texts import list_of, read_toml, text_of, write_text
+from ..files.whole import check_own
 from . import figures
 from .analysis import (
     ALONE,
@@ -500,11 +501,15 @@ def machine(results: Results) -> str:
     return f"{text}, source {main}{named}"
 
 
+MARK = "Made by `mitsuba-bdpt report`"
+"""What every report has in it."""
+
+
 def _introduction(results: Results) -> str:
     """What the figures are, and where they were measured."""
     return f"""# Benchmark
 
-Made by `mitsuba-bdpt report` from the data beside it. Machine and versions: {machine(results)}.
+{MARK} from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
@@ -571,6 +576,7 @@ def run(options: Namespace) -> int:
     """Write the report that the command line ``options`` ask for."""
     project = Project(options.project)
     folder = project.results(options.folder)
+    check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")
     results, made = load(project, folder)
     files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
     kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
