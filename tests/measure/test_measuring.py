@@ -12,7 +12,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.measure import making, reference
+from mitsuba_bdpt.measure import making, reference, sweep
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import SceneFile
 
@@ -312,13 +312,17 @@ def test_mistakes_that_only_a_render_finds_are_one_line(here):
 
 
 def test_samples_of_a_render_that_stops_are_its_own(here):
-    """Expected: the row of a render that has reached its target error has the samples that it took."""
+    """Expected: the row of a render that has reached its target error has the samples that it took; of one
+    that has not, it is said at the end, which is no failure."""
     stopping = PRESET.split("[[integrator]]")[0].replace("[2, 4]", "[256]").replace("[8, 2]", "[1]")
     own = '[[integrator]]\ntype = "bdpt"\nvariance = true\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
     command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
     (row,) = pyarrow.parquet.read_table(here / "out" / "rows.parquet").to_pylist()
-    assert (row["budget"], row["spp"]) == (256, 32)
+    assert (row["budget"], row["spp"]) == (256, 32) and sweep.short_of_target([row]) == []
+    (here / "project" / "presets" / "mine.toml").write_text(stopping + own.replace("100.0", "1e-9"))
+    said = command("sweep", "mine", "--project", "project", "-o", "out")
+    assert "room, 256 spp, bdpt: 1 of 1 renders did not reach target_error=1e-09\n" in said
 
 
 def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):

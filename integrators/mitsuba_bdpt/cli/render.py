@@ -278,9 +278,10 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: f
     if "error" in outcome.statistics:
         error = outcome.statistics["error"]
         missed = 0 < target_error < error
-        parts.append(
-            f"relMSE about {error:.2g}" + (f", not the {target_error:g} asked for" if missed else "")
-        )
+        text = f"relMSE about {error:.2g}" if math.isfinite(error) else "relMSE not known"
+        if missed:
+            text += f", not the {target_error:g} asked for: that takes more samples (--spp, --time)"
+        parts.append(text)
     if outcome.statistics.get("no_pilot"):
         parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
     if outcome.statistics.get("non_finite"):

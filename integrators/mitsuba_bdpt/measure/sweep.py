@@ -201,6 +201,25 @@ def chosen(preset: Preset, names) -> Preset:
     return replace(preset, subjects=subjects, probes={})
 
 
+def short_of_target(table: list[dict]) -> list[str]:
+    """A text about each integrator whose renders, of those in the ``table``, ended before they reached the
+    target error that the preset asks for."""
+    renders = {}
+    for row in table:
+        parameters = json.loads(row["parameters"])
+        target = parameters.get("target_error", parameters.get("until_error", 0))
+        if target > 0:
+            key = row["scene"], row["budget"], row["method"], target
+            error = json.loads(row["statistics"])["error"]
+            renders.setdefault(key, []).append(error is None or not error <= target)
+    return [
+        f"{scene}, {budget} spp, {method}: {sum(short)} of {len(short)} renders did not reach "
+        f"target_error={target:g}"
+        for (scene, budget, method, target), short in renders.items()
+        if any(short)
+    ]
+
+
 def run(options: Namespace) -> int:
     """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
     mi.set_variant("llvm_ad_rgb")
@@ -225,4 +244,6 @@ def run(options: Namespace) -> int:
     if table:
         write_tables(table, output)
     print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
+    for text in short_of_target(table):
+        print(text)
     return 1 if sweep.failed else 0
