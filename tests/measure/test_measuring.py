@@ -3,6 +3,7 @@
 import importlib.resources
 import importlib.util
 import re
+import shlex
 import subprocess
 import sys
 
@@ -125,6 +126,27 @@ def test_the_first_integrator_may_be_any(here):
         assert main([*words, "--project", "project"]) == 0
     text = (here / "project" / "results" / "alone" / "README.md").read_text()
     assert "| `room` |" in text and "efficiency.png" not in text
+
+
+def test_commands_in_messages_can_be_pasted(here, capsys):
+    """Rationale: a command without the project made its files elsewhere. Expected: the words that a message
+    quotes, read as a shell does, name the project and the file, and do what the message says."""
+    project = here / "my project"
+    (project / "presets").mkdir(parents=True)
+    (project / "presets" / "mine.toml").write_text(PRESET)
+    words = ["reference", "elsewhere/room.xml", "--resolution", "8", "--spp", "64", "--project", "my project"]
+    assert main([*words, "--seconds", "0"]) == 1
+    quoted = capsys.readouterr().out.partition("go on by ")[2]
+    program, *again = shlex.split(quoted)
+    assert program == "mitsuba-bdpt" and build_parser().parse_args(again).project.name == "my project"
+    assert main(again) == 0
+    assert [file.name for file in (project / "references").iterdir()] == ["room_8_4.exr"]
+    assert main(["report", "my project/results/mine", "--project", "my project"]) == 2
+    quoted = capsys.readouterr().err.partition("; run ")[2]
+    assert shlex.split(quoted)[1:] == [
+        *("sweep", "mine", "-o", "my project/results/mine"),
+        *("--project", "my project"),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -285,7 +285,7 @@ def test_wide_scenes_stay_wide():
 
 def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
     """Expected: the command that makes the reference is named."""
-    command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2"
+    command = f"mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --project {project.root}"
     with pytest.raises(ValueError, match=f"no reference.*{command}"):
         reference_of(project, 2)
     making.make(job(2, seconds=0))

@@ -35,7 +35,7 @@ from .efficiency import REFERENCE_SHARE
 from .halves import PASS_SPP, Halves
 from .metrics import TRIM, rel_mse
 from .project import Project
-from .reference import Reference, load_reference, reference_path, write
+from .reference import Reference, load_reference, make_command, reference_path, write
 from .scenes import SceneFile, integrator_of
 
 WAYS = {
@@ -329,7 +329,10 @@ class Window:
 def said(job: Job, made: Reference, reached: bool) -> str:
     """What was made, in a line."""
     text = f"{job.scene.name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e}"
-    return text + ("" if reached else f", not good enough for {job.spp} spp: go on by the command reference")
+    if reached:
+        return text
+    own = job.project, job.project.called(job.scene), job.resolution, job.depth
+    return f"{text}, not good enough for {job.spp} spp: go on by {make_command(*own, '--spp', str(job.spp))}"
 
 
 def run(options: Namespace) -> int:

@@ -11,6 +11,7 @@ None of these folders has to be there.
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +65,16 @@ class Project:
     def called(self, scene: SceneFile) -> str:
         """What `scene` finds a scene by."""
         return scene.name if scene.file == self.scenes / f"{scene.name}.xml" else str(scene.file)
+
+    def command(self, *words: str | Path) -> str:
+        """A command line of this project, as a message quotes it for a shell."""
+        there = [] if self.root == Path() else ["--project", str(self.root)]
+        return shlex.join(["mitsuba-bdpt", *map(str, words), *there])
+
+    def sweep_command(self, folder: Path) -> str:
+        """That of the sweep that fills a ``folder``: of the preset of its name, if there is one."""
+        known = (self.root / "presets" / f"{folder.name}.toml").is_file()
+        return self.command("sweep", folder.name if known else "PRESET", "-o", folder)
 
     def _names_for(self, name: str) -> str:
         """The end of a message about a ``name`` that is unknown."""

@@ -51,11 +51,17 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
     return project.references / f"{name}_{resolution}_{max_depth}.exr"
 
 
+def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
+    """The command line that makes the reference of the scene that is ``called`` so, or goes on with it."""
+    words = ["reference", called, "--resolution", str(resolution), "--max-depth", str(max_depth), *more]
+    return project.command(*words)
+
+
 def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
     """The stored reference; raises ``CommandError`` with the command that makes it, if there is none, and
     if it was made of another version of the scene's file."""
     path = reference_path(project, scene.name, resolution, max_depth)
-    make = f"mitsuba-bdpt reference {project.called(scene)} --resolution {resolution} --max-depth {max_depth}"
+    make = make_command(project, project.called(scene), resolution, max_depth)
     if not path.is_file():
         raise CommandError(
             f"no reference for scene={scene.name!r} at {resolution} and depth {max_depth}; {make}"

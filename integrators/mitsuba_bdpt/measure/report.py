@@ -41,7 +41,7 @@ from .analysis import (
 )
 from .metrics import rel_mse_epsilon
 from .project import Project
-from .reference import read_reference, reference_path
+from .reference import make_command, read_reference, reference_path
 from .scenes import digest
 from .tables import ranged, ratio, said, table
 
@@ -53,7 +53,7 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
         rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
     except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
         raise CommandError(
-            f"{folder}: rows.parquet is missing or not whole; run mitsuba-bdpt sweep PRESET -o {folder}"
+            f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
         ) from error
     made, digests = {}, {}
     for row in rows:
@@ -69,16 +69,23 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
         if row["reference_sha256"] != digests[scene]:
             raise CommandError(
                 f"{folder}: the errors in {scene} were taken against another reference; run "
-                "mitsuba-bdpt sweep again, which takes them anew"
+                f"{project.sweep_command(folder)}, which takes them anew"
             )
     if without := [scene for scene, kept in made.items() if kept.means is None]:
         raise CommandError(
-            f"{folder}: the reference of {without[0]} has too few renders for a bias check; go on with "
-            "mitsuba-bdpt reference"
+            f"{folder}: the reference of {without[0]} has too few renders for a bias check; go on by "
+            f"{_reference_command(project, rows, without[0])}"
         )
     file = folder / "probes.json"
     measured = json.loads(file.read_text()) if file.exists() else {}
     return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made
+
+
+def _reference_command(project: Project, rows: list[dict], scene: str) -> str:
+    """The command line that goes on with the reference of a scene, of which rows know the name alone."""
+    row = next(row for row in rows if row["scene"] == scene)
+    called = scene if scene in project.scene_names() else f"{scene}.xml"
+    return make_command(project, called, row["resolution"], row["max_depth"])
 
 
 def efficiency_table(results: Results) -> str:
