@@ -158,6 +158,8 @@ def test_commands_in_messages_can_be_pasted(here, capsys):
         ("sweep nowhere", "nowhere"),
         ("report nowhere", "run mitsuba-bdpt sweep PRESET -o nowhere"),
         ("reference", "name a scene, or give --all"),
+        ("reference --all", "there is no scene in 'scenes'; name the folder that has scenes/ by --project"),
+        ("reference --all elsewhere/room.xml", "'elsewhere/room.xml' together with --all"),
         ("compare bdpt path --scenes wide.xml", "64 x 33 pixels at resolution=64"),
         ("reference elsewhere/room.xml --project badly", "by='light' of [room] must be one of"),
     ],

@@ -26,7 +26,7 @@ from functools import cached_property
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError
+from ..errors import CommandError, message
 from ..files.texts import read_toml, table_of
 from ..host.versions import versions
 from ..run.rendering import raise_interrupt
@@ -340,9 +340,19 @@ def run(options: Namespace) -> int:
     good enough."""
     if not (options.all or options.scenes):
         raise CommandError("reference: name a scene, or give --all")
-    mi.set_variant("llvm_ad_rgb")
+    if options.all and options.scenes:
+        raise CommandError(
+            f"reference: {options.scenes[0]!r} together with --all: leave out one or the other"
+        )
     project, status = Project(options.project), 0
-    for name in project.scene_names() if options.all else options.scenes:
+    names = project.scene_names() if options.all else options.scenes
+    if not names:
+        raise CommandError(
+            f"reference --all: there is no scene in {str(project.scenes)!r}; name the folder that has "
+            "scenes/ by --project, or give the path of an XML file"
+        )
+    mi.set_variant("llvm_ad_rgb")
+    for name in names:
         try:
             scene = project.scene(name)
             job = Job(
@@ -357,7 +367,7 @@ def run(options: Namespace) -> int:
             made, reached = make(job)
         except (ValueError, RuntimeError, NotImplementedError) as error:  # go on with the other scenes
             raise_interrupt(error)
-            print(f"{name}: failed: {error}", flush=True)
+            print(f"{name}: failed: {' '.join(message(error).split())}", flush=True)
             status = 1
             continue
         status |= not reached
