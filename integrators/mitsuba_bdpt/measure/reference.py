@@ -74,6 +74,11 @@ def load_reference(project: Project, scene: SceneFile, resolution: int, max_dept
     return found
 
 
+def too_few(name: str, make: str) -> str:
+    """What is said of a reference without `Means`, and the command that goes on with it."""
+    return f"the reference of {name} has too few renders for a bias check; go on by {make}"
+
+
 def read_reference(path: Path) -> Reference:
     """The reference in a file, whatever scene it was made of."""
     (image, difference), header = read_layers(path, "", "difference.")

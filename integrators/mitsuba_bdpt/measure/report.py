@@ -41,7 +41,7 @@ from .analysis import (
 )
 from .metrics import rel_mse_epsilon
 from .project import Project
-from .reference import make_command, read_reference, reference_path
+from .reference import make_command, read_reference, reference_path, too_few
 from .scenes import digest
 from .tables import ranged, ratio, said, table
 
@@ -72,10 +72,7 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
                 f"{project.sweep_command(folder)}, which takes them anew"
             )
     if without := [scene for scene, kept in made.items() if kept.means is None]:
-        raise CommandError(
-            f"{folder}: the reference of {without[0]} has too few renders for a bias check; go on by "
-            f"{_reference_command(project, rows, without[0])}"
-        )
+        raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
     file = folder / "probes.json"
     measured = json.loads(file.read_text()) if file.exists() else {}
     return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made

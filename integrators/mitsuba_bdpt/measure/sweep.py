@@ -34,6 +34,7 @@ from .cells import Cell, Cells, machine, software
 from .making import Job, check, obtained
 from .preset import Preset, read_preset
 from .project import Project
+from .reference import load_reference, make_command, too_few
 from .rows import beside, cell_file, judge_of, read_rows, rows, store, write_tables
 from .scenes import check_plugins
 
@@ -201,6 +202,28 @@ def chosen(preset: Preset, names) -> Preset:
     return replace(preset, subjects=subjects, probes={})
 
 
+def poor_reference(cells: Cells, table: list[dict]) -> list[str]:
+    """What the report will refuse of the rows of a scene since its reference is too poor, as it says it, and
+    the command that goes on with the reference."""
+    rows = analysis.select(table, scene=cells.subject.name)
+    if not rows:
+        return []
+    project, scene, resolution, depth = cells.where()
+    words = "--spp", str(max(cells.subject.spp))
+    make = make_command(project, project.called(scene), resolution, depth, *words)
+    found = []
+    if load_reference(*cells.where()).means is None:
+        found.append(too_few(scene.name, make))
+    if refused := analysis.unjudged(rows):
+        (method, budget), worst = max(refused.items(), key=lambda item: item[1].share)
+        others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
+        found.append(
+            f"{scene.name}: no figure of {method} at {budget} spp{others} will be judged. {worst} To go on: "
+            f"{make}"
+        )
+    return found
+
+
 def short_of_target(table: list[dict]) -> list[str]:
     """A text about each integrator whose renders, of those in the ``table``, ended before they reached the
     target error that the preset asks for."""
@@ -244,6 +267,7 @@ def run(options: Namespace) -> int:
     if table:
         write_tables(table, output)
     print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
-    for text in short_of_target(table):
-        print(text)
+    poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
+    for text in [*short_of_target(table), *poor]:
+        print(f"warning: {text}")
     return 1 if sweep.failed else 0
