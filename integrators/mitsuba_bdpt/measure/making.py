@@ -37,6 +37,7 @@ from .metrics import TRIM, rel_mse
 from .project import Project
 from .reference import Reference, load_reference, make_command, reference_path, write
 from .scenes import SceneFile, integrator_of
+from .showing import amount
 
 WAYS = {
     "path": {"type": "path"},
@@ -275,13 +276,17 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
         halves.go_on_from(stored, [window.slices for window in windows])
     started = time.perf_counter()
     reached = halves.rounds > 0 and aim.reached(halves.reference({}))
-    while halves.rounds < job.rounds or not (reached or time.perf_counter() - started > job.seconds):
-        behind = [w for w in windows if w.is_behind(halves)]
-        for window in behind:
-            halves.add(_pair(window.scene, integrator, halves, WINDOW_PASSES), window.slices, WINDOW_PASSES)
-        if not behind:
-            halves.add(_pair(scene, integrator, halves))
-        reached = aim.reached(halves.reference({}))
+    with amount(f"{job.scene.name}: seconds of the reference", job.seconds) as show:
+        while halves.rounds < job.rounds or not (reached or time.perf_counter() - started > job.seconds):
+            behind = [w for w in windows if w.is_behind(halves)]
+            for window in behind:
+                halves.add(
+                    _pair(window.scene, integrator, halves, WINDOW_PASSES), window.slices, WINDOW_PASSES
+                )
+            if not behind:
+                halves.add(_pair(scene, integrator, halves))
+            reached = aim.reached(halves.reference({}))
+            show(time.perf_counter() - started)
     provenance = _provenance(
         job,
         integrator=parameters,

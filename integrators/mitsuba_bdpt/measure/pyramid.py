@@ -25,6 +25,7 @@ from ..files.whole import replacing
 from .metrics import tone_map
 from .project import Project
 from .scenes import SceneFile, integrator_of
+from .showing import amount
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -52,7 +53,9 @@ def render(file: SceneFile, options: Namespace):
     parameters = {"type": "bdpt", "strategy_images": True, "heuristic": options.heuristic}
     integrator = integrator_of(parameters, options.max_depth)
     check_channels(choose_sensor(scene, 0).film(), integrator.aov_names())
-    image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
+    with amount(f"{file.name}: samples per pixel", options.spp) as show:
+        integrator.on_pass = lambda report: show(report.spp_done)
+        image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
     names = integrator.aov_names()
     return scene.sensors()[0].film(), {kind: technique_images(image, names, kind) for kind in KINDS}
 

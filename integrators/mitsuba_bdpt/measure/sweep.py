@@ -21,14 +21,14 @@ from itertools import groupby
 from pathlib import Path
 
 import mitsuba as mi
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 
 from .. import workers
 from ..errors import CommandError, message
 from ..files.images import check_output
 from ..files.texts import write_json
 from ..run.rendering import raise_interrupt
-from . import analysis, probes
+from . import analysis, probes, showing
 from .bench import Bench, measure, measured
 from .cells import Cell, Cells, machine, software
 from .making import Job, check, obtained
@@ -254,8 +254,7 @@ def run(options: Namespace) -> int:
     check_output(output / "rows.csv", ".csv")  # complain before hours of rendering, not after
     sweep = Sweep(project, preset, output)
     sweep.prepare(options.reference_seconds)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
+    with showing.bar() as progress:
         if options.scheduler:
             with workers.connected(options.scheduler) as client:
                 sweep.run(progress, (client, file.read_text()))
