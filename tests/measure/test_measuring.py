@@ -382,6 +382,59 @@ def test_a_sweep_says_what_its_reference_cannot_judge(here, capsys):
     assert main(words) == 0 and "warning" not in capsys.readouterr().out
 
 
+def test_damaged_files_are_named_with_what_to_do(here, capsys):
+    """Rationale: a full disk or a copy that broke off leaves files without an end. Expected: one
+    line that names the file and what to do, which mends it."""
+    preset = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "1") + '[[integrator]]\ntype = "path"\n'
+    (here / "project" / "presets" / "mine.toml").write_text(preset)
+    sweep_words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
+    assert main(sweep_words) == 0
+    made = here / "project" / "references" / "room_16_4.exr"
+    sums = here / "project" / "renders" / "reference_room_16_4.npz"
+    reference_words = ["reference", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
+    reference_words += ["--spp", "1", "--seconds", "1"]
+    report_words = ["report", "out", "--project", "project"]
+    for file, keep, words, message in (
+        (sums, 2, reference_words, "room_16_4.npz' is damaged .*; delete it: what references/ holds"),
+        (made, 2, report_words, "room_16_4.exr' is damaged .*; delete it, to make it anew"),
+        (
+            made,
+            20,
+            ["fireflies", *reference_words[1:-2]],
+            "room_16_4.exr' is .*anew, by mitsuba-bdpt reference",
+        ),
+        (here / "out" / "probes.json", 0, report_words, "probes.json' is damaged .*; delete it"),
+        (
+            here / "out" / "rows.parquet",
+            2,
+            [*sweep_words, "--scenes", "room"],
+            "run the sweep without --scen",
+        ),
+    ):
+        whole = file.read_bytes() if file.exists() else b""
+        file.write_bytes(whole[: len(whole) // keep] if keep else b"{")
+        capsys.readouterr()
+        assert main(words) in (1, 2), file
+        said = capsys.readouterr()
+        assert re.search(message, said.out + said.err), (file, said)
+        file.write_bytes(whole) if whole else file.unlink()
+    sums.unlink()
+    assert main(reference_words) == 0
+
+
+def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
+    """Expected: the file that stands in the way, and what to do; nothing is rendered."""
+    (here / "project" / "references").write_text("")
+    (here / "file").write_text("")
+    words = ["elsewhere/room.xml", "--resolution", "16", "--project", "project"]
+    remedy = "; a file stands where a folder is needed: move it away, or give another path"
+    assert main(["fireflies", *words]) == 2
+    assert f"'project/references': File exists{remedy}" in capsys.readouterr().err
+    assert main(["sweep", "mine", "--project", "project", "-o", "file"]) == 2
+    assert f"'file': File exists{remedy}" in capsys.readouterr().err
+    assert not (here / "project" / "renders").exists()
+
+
 def test_samples_of_a_render_that_stops_are_its_own(here):
     """Expected: the row of a render that has reached its target error has the samples that it took; of one
     that has not, it is said at the end, which is no failure."""

@@ -16,7 +16,8 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
-from mitsuba_bdpt.files.images import read_layers
+from mitsuba_bdpt.files import whole
+from mitsuba_bdpt.files.images import read_layers, write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import agreement, analysis, cells, making, metrics, probes, reference, scenes, sweep
 from mitsuba_bdpt.measure import bench as bench_module
@@ -480,6 +481,19 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
     assert not list(folder.glob(".*"))
     assert json.loads(file.read_text()) == [1, 2]
     assert halves_module.Halves(folder / "sums.npz", "key").rounds == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
+def test_a_full_disk_leaves_the_old_image(folder):
+    """Rationale: OpenEXR does not say that a disk is full. Expected: an error with the file's name, and the
+    image that was there."""
+    file = folder / "image.exr"
+    write_layers(file, {"": np.ones((64, 64, 3))}, {})
+    before = file.read_bytes()
+    whole._temporary(file).symlink_to("/dev/full")
+    with pytest.raises(OSError, match="could not be written whole; is the disk full.*image.exr"):
+        write_layers(file, {"": np.zeros((64, 64, 3))}, {})
+    assert file.read_bytes() == before and not list(folder.glob(".*"))
 
 
 def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):

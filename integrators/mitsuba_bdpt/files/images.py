@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -126,7 +127,13 @@ def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+        temporary.touch()  # OpenEXR does not say what hinders it
         file.write(str(temporary))
+        try:
+            read_layers(temporary, *layers)
+        except CommandError as error:  # nor that a disk is full
+            why = "could not be written whole; is the disk full?"
+            raise OSError(errno.ENOSPC, why, str(path)) from error
 
 
 def read_layers(path: Path, *layers: str):
@@ -136,8 +143,15 @@ def read_layers(path: Path, *layers: str):
         start = file.read(4)
     if start != MAGIC[".exr"]:
         raise CommandError(f"{str(path)!r} is not an EXR")
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels, header = file.channels(), dict(file.header())
+    try:
+        opened = OpenEXR.File(str(path), separate_channels=True)
+    except (RuntimeError, ValueError) as error:
+        raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
+    with opened as file:
+        try:
+            channels, header = file.channels(), dict(file.header())
+        except ValueError as error:  # of a file that ends in the middle
+            raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
         missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
         if missing:
             raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")

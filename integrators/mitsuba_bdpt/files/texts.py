@@ -19,6 +19,14 @@ def read_toml(path: Path) -> dict:
         raise CommandError(f"{path} is not TOML: {error}") from error
 
 
+def read_json(path: Path, remedy: str):
+    """What a JSON file holds; raises ``CommandError`` with the ``remedy`` if it is damaged."""
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise CommandError(f"{str(path)!r} is damaged ({error}); {remedy}") from error
+
+
 def table_of(path: Path, key: str, value) -> dict:
     """The ``value`` of a ``key`` in a TOML file, which has to be a table; raises ``CommandError``."""
     if not isinstance(value, dict):

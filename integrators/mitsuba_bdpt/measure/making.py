@@ -28,6 +28,7 @@ import numpy as np
 
 from ..errors import CommandError, message
 from ..files.texts import read_toml, table_of
+from ..files.whole import check_writable
 from ..host.versions import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means
@@ -174,12 +175,15 @@ def make(job: Job) -> tuple[Reference, bool]:
     enough. One that the time has cut short does not replace a better one."""
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
+    path = reference_path(job.project, job.scene.name, job.resolution, job.depth)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
     reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
     stored = None if reached else job.stored
     if stored is not None and stored.error < reference.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
-    write(reference_path(job.project, job.scene.name, job.resolution, job.depth), reference)
+    write(path, reference)
     return reference, reached
 
 

@@ -66,7 +66,10 @@ def load_reference(project: Project, scene: SceneFile, resolution: int, max_dept
         raise CommandError(
             f"no reference for scene={scene.name!r} at {resolution} and depth {max_depth}; {make}"
         )
-    found = read_reference(path)
+    try:
+        found = read_reference(path)
+    except CommandError as error:
+        raise CommandError(f"{error}, by {make}") from error
     if found.provenance["scene_sha256"] != scene.sha256:
         raise CommandError(
             f"the reference {path.name} was made of another {scene.name}.xml, mesh or texture; {make}"
@@ -80,10 +83,16 @@ def too_few(name: str, make: str) -> str:
 
 
 def read_reference(path: Path) -> Reference:
-    """The reference in a file, whatever scene it was made of."""
+    """The reference in a file, whatever scene it was made of; raises ``CommandError`` if it is none."""
     (image, difference), header = read_layers(path, "", "difference.")
-    provenance = json.loads(header["provenance"])
-    return Reference(image, difference, means_of(provenance["means"]), provenance)
+    try:
+        provenance = json.loads(header["provenance"])
+        means = means_of(provenance["means"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CommandError(
+            f"{str(path)!r} is no reference: it does not say what made it; delete it, to make it anew"
+        ) from error
+    return Reference(image, difference, means, provenance)
 
 
 def write(path: Path, reference: Reference):

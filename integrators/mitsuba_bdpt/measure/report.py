@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow.parquet
 
 from ..errors import CommandError
-from ..files.texts import list_of, read_toml, text_of, write_text
+from ..files.texts import list_of, read_json, read_toml, text_of, write_text
 from ..files.whole import check_own
 from . import figures
 from .analysis import (
@@ -74,7 +74,7 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
     if without := [scene for scene, kept in made.items() if kept.means is None]:
         raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
     file = folder / "probes.json"
-    measured = json.loads(file.read_text()) if file.exists() else {}
+    measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
     return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made
 
 

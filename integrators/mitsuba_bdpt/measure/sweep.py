@@ -26,7 +26,7 @@ from rich.progress import Progress, TaskID
 from .. import workers
 from ..errors import CommandError, message
 from ..files.images import check_output
-from ..files.texts import write_json
+from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
 from . import analysis, probes, showing
 from .bench import Bench, measure, measured
@@ -105,7 +105,7 @@ class Sweep:
 
     def _probes(self):
         file = self.output / "probes.json"
-        kept = json.loads(file.read_text()) if file.exists() else {}
+        kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
         for name, rounds in self.preset.probes.items():
             self._progress.update(self._task, description=name)
             key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
