@@ -39,7 +39,7 @@ pictures: $(INSTALLED)
 	$(VENV)/bin/python scripts/equal_time.py veach_mis --spp 16 -o docs/images/veach_mis_heuristics.png \
 		-i "bdpt skip=none heuristic=uniform" "bdpt skip=none heuristic=maximum" \
 		"bdpt skip=none heuristic=power" "bdpt skip=none heuristic=balance"
-	$(VENV)/bin/python scripts/strategies.py veach_bidir -o renders/pyramid
+	$(VENV)/bin/python scripts/strategies.py veach_bidir -o renders/pyramid.exr
 	cp renders/pyramid_weighted.png renders/pyramid_unweighted.png docs/images
 
 # The documentation as a site, in build/site.

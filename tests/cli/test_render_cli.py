@@ -371,6 +371,7 @@ def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
         (["-P", "nonsense=1"], "nonsense"),
         (["-Dnonsense=1"], "nonsense"),
         (["--integrator", "no_such_plugin"], "no_such_plugin"),
+        (["-Pstrategy_images=true", "-Pmax_depth=17", "--integrator=bdpt"], "smaller max_depth"),
         (["--integrator", "bdpt", "-P", "max_depth=0.5"], "TypeError: bdpt: max_depth=0.5 must be"),
     ],
 )

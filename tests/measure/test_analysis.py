@@ -12,7 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
-from mitsuba_bdpt.measure import analysis, reference, report
+from mitsuba_bdpt.errors import CommandError
+from mitsuba_bdpt.measure import analysis, efficiency, reference, report, tables
 from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Biased, Refused, Results
 from mitsuba_bdpt.measure.preset import read_preset
@@ -327,6 +328,28 @@ def test_choices_and_the_cost_of_the_pilot():
         report.GOALS["pilot"](Results([row(seed=1)], {"box": KNOWN}, {}), "box")
 
 
+def test_a_bar_in_a_name_ends_no_cell():
+    """Expected: escaped, as GitHub's Markdown has it, in code too; a line stays a line."""
+    assert (
+        tables.table(["a|b", "c"], [["`d|e`", "f\ng"]]) == "| a\\|b | c |\n| --- | --- |\n| `d\\|e` | f g |\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("share", "words"), [(0.023, "2.3 %"), (0.0104, "just above 1 %"), (0.01000001, "just above 1 %")]
+)
+def test_a_share_that_is_refused_is_not_rounded_to_one_that_is_allowed(share, words):
+    """Rationale: a report said "not judged: reference 1 %" where 1 % may be. Expected: that it is more."""
+
+    def figure():
+        raise analysis.NotJudged("", share)
+
+    assert tables.said(figure) == f"not judged: reference {words}"
+    assert f"carries {'just above 1' if share < 0.0101 else f'{100 * share:.3g}'} %" in (
+        efficiency.reference_refusal(share, 1.0)
+    )
+
+
 def test_what_a_biased_integrator_lacks_is_said():
     """Too dark, too bright, and right as a whole but wrong in a tile."""
     for factor, text in ((0.95, "4.9 % of the energy is missing"), (1.1, "10 % too much energy")):
@@ -354,9 +377,32 @@ def test_names_are_those_of_the_preset():
     }
 
 
+@pytest.mark.parametrize(
+    ("goals", "message"),
+    [
+        ("goal = 3", "goal=3 must be a list .* tables"),
+        ("x = 3", "goal=None must be a list"),
+        ("[[goal]]\nwhat = 3", r"what of a \[\[goal\]\]=3 must be a text in quotes"),
+        ('[[goal]]\nwhat = "x"', r"at_least of a \[\[goal\]\]=None must be a text"),
+        ('[[goal]]\nwhat = "x"\nat_least = "1"\naim = 2', "aim of 'x'=2 must be a text"),
+        ('[[goal]]\nwhat = "x"\nat_least = "1"\nmeasure = "speed"', "measure='speed' of 'x' must be one of"),
+        ('[[goal]]\nwhat = "x"\nat_least = "1"\nmeasure = "cost"', "measure='cost' of 'x' needs a scene"),
+        (
+            '[[goal]]\nwhat = "x"\nat_least = "1"\nmeasure = "worst"\nscene = "a"',
+            "measure='worst' of 'x' is no figure of one scene: leave out scene",
+        ),
+    ],
+)
+def test_mistakes_in_goals_are_named(goals, message):
+    """Expected: the file, the key, its value and what to write instead."""
+    with pytest.raises(CommandError, match=f"goals.toml: {message}"):
+        report.checked_goals(Path("goals.toml"), tomllib.loads(goals))
+
+
 def test_the_goals_of_the_project_can_be_measured(results):
     """Expected: every row of goals.toml names a figure that exists, and gives a text for any data."""
-    goals = tomllib.loads((ROOT / "docs" / "reports" / "benchmark" / "goals.toml").read_text())["goal"]
+    file = ROOT / "docs" / "reports" / "benchmark" / "goals.toml"
+    goals = report.checked_goals(file, tomllib.loads(file.read_text()))
     assert report.goals_table(results, goals).count("\n") == len(goals) + 2
 
 
@@ -370,7 +416,8 @@ def test_parts_of_the_readme_are_replaced():
 
 
 def test_a_report_is_written(results, tmp_path):
-    """Expected: from the data of a folder the page, the plots, and the project's README's parts."""
+    """Expected: from the data of a folder the page, the plots, and the project's README's parts; a page of
+    the user's own is not overwritten, one that a report has written is."""
     only = [r for r in results.rows if r["scene"] == "box"]
     provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096, "scene_sha256": "the scene"}
     kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), KNOWN, provenance)
@@ -387,7 +434,11 @@ def test_a_report_is_written(results, tmp_path):
     )
     words = ["report", str(tmp_path), "--readme", str(readme), "--project", str(tmp_path)]
     options = build_parser().parse_args(words)
-    assert report.run(options) == 0
+    (tmp_path / "README.md").write_text("# Mine\n")
+    with pytest.raises(CommandError, match="README.md' exists and was made by something else; move it away"):
+        report.run(options)
+    (tmp_path / "README.md").unlink()
+    assert [report.run(options), report.run(options)] == [0, 0]
     page = (tmp_path / "README.md").read_text()
     assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet"]
     assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page

@@ -2,7 +2,9 @@
 
 import importlib.resources
 import importlib.util
+import io
 import re
+import shlex
 import subprocess
 import sys
 
@@ -12,7 +14,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.measure import making, reference
+from mitsuba_bdpt.measure import making, reference, showing, sweep
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import SceneFile
 
@@ -115,6 +117,28 @@ def test_other_commands_take_the_users_scene(here, capsys):
     assert {"equal_time_room.png", "pyramid_room.exr", "pyramid_room_weighted.png"} <= made
 
 
+def test_a_terminal_sees_how_far_a_command_is(here, monkeypatch, capsys):
+    """Expected: a bar for the reference and for the renders of each command, with what is rendered last;
+    nothing on standard error where that is no terminal."""
+    shown, plain = io.StringIO(), showing.Console
+    terminal = {"file": shown, "force_terminal": True, "width": 200}
+    common = ["elsewhere/room.xml", "--resolution", "16", "--project", "project", "--spp", "2"]
+    compare = ["compare", "bdpt", "path", "--pairs", "1", "--scenes", *common]
+    for words, text in (
+        (["reference", *common, "--seconds", "1"], "room: seconds of the reference"),
+        (compare, "room, 2 spp, seed 1"),
+        (["equal-time", *common], "bdpt"),
+        (["pyramid", *common], "room: samples per pixel"),
+        (["fireflies", *common, "--seeds", "2"], "room, seed 2"),
+    ):
+        monkeypatch.setattr(showing, "Console", lambda **_: plain(**terminal))
+        assert main(words) == 0 and text in shown.getvalue()
+        shown.truncate(0)
+    monkeypatch.setattr(showing, "Console", plain)
+    capsys.readouterr()
+    assert main(compare) == 0 and not capsys.readouterr().err
+
+
 def test_the_first_integrator_may_be_any(here):
     """Rationale: tables looked for rays and pilots, which Mitsuba does not tell. Expected: a sweep
     of `path` alone is reported and shown."""
@@ -127,6 +151,27 @@ def test_the_first_integrator_may_be_any(here):
     assert "| `room` |" in text and "efficiency.png" not in text
 
 
+def test_commands_in_messages_can_be_pasted(here, capsys):
+    """Rationale: a command without the project made its files elsewhere. Expected: the words that a message
+    quotes, read as a shell does, name the project and the file, and do what the message says."""
+    project = here / "my project"
+    (project / "presets").mkdir(parents=True)
+    (project / "presets" / "mine.toml").write_text(PRESET)
+    words = ["reference", "elsewhere/room.xml", "--resolution", "8", "--spp", "64", "--project", "my project"]
+    assert main([*words, "--seconds", "0"]) == 1
+    quoted = capsys.readouterr().out.partition("go on by ")[2]
+    program, *again = shlex.split(quoted)
+    assert program == "mitsuba-bdpt" and build_parser().parse_args(again).project.name == "my project"
+    assert main(again) == 0
+    assert [file.name for file in (project / "references").iterdir()] == ["room_8_4.exr"]
+    assert main(["report", "my project/results/mine", "--project", "my project"]) == 2
+    quoted = capsys.readouterr().err.partition("; run ")[2]
+    assert shlex.split(quoted)[1:] == [
+        *("sweep", "mine", "-o", "my project/results/mine"),
+        *("--project", "my project"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -136,6 +181,8 @@ def test_the_first_integrator_may_be_any(here):
         ("sweep nowhere", "nowhere"),
         ("report nowhere", "run mitsuba-bdpt sweep PRESET -o nowhere"),
         ("reference", "name a scene, or give --all"),
+        ("reference --all", "there is no scene in 'scenes'; name the folder that has scenes/ by --project"),
+        ("reference --all elsewhere/room.xml", "'elsewhere/room.xml' together with --all"),
         ("compare bdpt path --scenes wide.xml", "64 x 33 pixels at resolution=64"),
         ("reference elsewhere/room.xml --project badly", "by='light' of [room] must be one of"),
     ],
@@ -215,6 +262,11 @@ def test_recipes_say_what_makes_a_reference(here):
         ("windows = [[0, 0, 2, 1]]", "must be lists of four shares"),
         ("radiance = { limit = 1.0 }", "must have the keys limit and lacks"),
         ("window = 1", "window is not a key of"),
+        ("windows = 3", "windows=3 of .* must be lists of four shares"),
+        ('windows = [3, "x"]', "must be lists of four shares"),
+        ("by = []", r"by=\[\] of .* must be one of"),
+        ("radiance = 3", "radiance=3 of .* must have the keys limit and lacks, numbers"),
+        ("radiance = { limit = true, lacks = 'x' }", "must have the keys limit and lacks, numbers"),
     ):
         recipe.write_text(f"[room]\n{wrong}\n")
         with pytest.raises(ValueError, match=message):
@@ -306,14 +358,95 @@ def test_mistakes_that_only_a_render_finds_are_one_line(here):
     assert "participating medium, which is not supported" in refused(*words)
 
 
+def test_a_sweep_says_what_its_reference_cannot_judge(here, capsys):
+    """Rationale: only the report said so, hours later. Expected: of a reference cut short, a warning with
+    the share that the report's rule refuses, and the command that goes on with it; none when it is good
+    enough."""
+    preset = here / "project" / "presets" / "mine.toml"
+    preset.write_text(
+        PRESET.split("[[integrator]]")[0].replace("[8, 2]", "[2, 2]").replace("[2, 4]", "[2, 64]")
+    )
+    with preset.open("a") as file:
+        file.write('[[integrator]]\ntype = "bdpt"\n')
+    room = ["reference", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
+    assert main([*room, "--seconds", "0", "--spp", "1"]) == 1
+    capsys.readouterr()
+    words = ["sweep", "mine", "--project", "project", "-o", "out"]
+    assert main(words) == 0
+    few, noisy = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
+    assert few.startswith("warning: the reference of room has too few renders for a bias check; go on by mit")
+    assert noisy.startswith("warning: room: no figure of bdpt at 64 spp")
+    assert "The reference carries" in noisy and noisy.endswith("--spp 64 --project project")
+    assert main(shlex.split(noisy.partition("To go on: ")[2])[1:]) == 0
+    capsys.readouterr()
+    assert main(words) == 0 and "warning" not in capsys.readouterr().out
+
+
+def test_damaged_files_are_named_with_what_to_do(here, capsys):
+    """Rationale: a full disk or a copy that broke off leaves files without an end. Expected: one
+    line that names the file and what to do, which mends it."""
+    preset = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "1") + '[[integrator]]\ntype = "path"\n'
+    (here / "project" / "presets" / "mine.toml").write_text(preset)
+    sweep_words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
+    assert main(sweep_words) == 0
+    made = here / "project" / "references" / "room_16_4.exr"
+    sums = here / "project" / "renders" / "reference_room_16_4.npz"
+    reference_words = ["reference", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
+    reference_words += ["--spp", "1", "--seconds", "1"]
+    report_words = ["report", "out", "--project", "project"]
+    for file, keep, words, message in (
+        (sums, 2, reference_words, "room_16_4.npz' is damaged .*; delete it: what references/ holds"),
+        (made, 2, report_words, "room_16_4.exr' is damaged .*; delete it, to make it anew"),
+        (
+            made,
+            20,
+            ["fireflies", *reference_words[1:-2]],
+            "room_16_4.exr' is .*anew, by mitsuba-bdpt reference",
+        ),
+        (here / "out" / "probes.json", 0, report_words, "probes.json' is damaged .*; delete it"),
+        (
+            here / "out" / "rows.parquet",
+            2,
+            [*sweep_words, "--scenes", "room"],
+            "run the sweep without --scen",
+        ),
+    ):
+        whole = file.read_bytes() if file.exists() else b""
+        file.write_bytes(whole[: len(whole) // keep] if keep else b"{")
+        capsys.readouterr()
+        assert main(words) in (1, 2), file
+        said = capsys.readouterr()
+        assert re.search(message, said.out + said.err), (file, said)
+        file.write_bytes(whole) if whole else file.unlink()
+    sums.unlink()
+    assert main(reference_words) == 0
+
+
+def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
+    """Expected: the file that stands in the way, and what to do; nothing is rendered."""
+    (here / "project" / "references").write_text("")
+    (here / "file").write_text("")
+    words = ["elsewhere/room.xml", "--resolution", "16", "--project", "project"]
+    remedy = "; a file stands where a folder is needed: move it away, or give another path"
+    assert main(["fireflies", *words]) == 2
+    assert f"'project/references': File exists{remedy}" in capsys.readouterr().err
+    assert main(["sweep", "mine", "--project", "project", "-o", "file"]) == 2
+    assert f"'file': File exists{remedy}" in capsys.readouterr().err
+    assert not (here / "project" / "renders").exists()
+
+
 def test_samples_of_a_render_that_stops_are_its_own(here):
-    """Expected: the row of a render that has reached its target error has the samples that it took."""
+    """Expected: the row of a render that has reached its target error has the samples that it took; of one
+    that has not, it is said at the end, which is no failure."""
     stopping = PRESET.split("[[integrator]]")[0].replace("[2, 4]", "[256]").replace("[8, 2]", "[1]")
     own = '[[integrator]]\ntype = "bdpt"\nvariance = true\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
     command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
     (row,) = pyarrow.parquet.read_table(here / "out" / "rows.parquet").to_pylist()
-    assert (row["budget"], row["spp"]) == (256, 32)
+    assert (row["budget"], row["spp"]) == (256, 32) and sweep.short_of_target([row]) == []
+    (here / "project" / "presets" / "mine.toml").write_text(stopping + own.replace("100.0", "1e-9"))
+    said = command("sweep", "mine", "--project", "project", "-o", "out")
+    assert "room, 256 spp, bdpt: 1 of 1 renders did not reach target_error=1e-09\n" in said
 
 
 def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
@@ -324,3 +457,35 @@ def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
     words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
     assert main(words) == 0
     assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 30
+
+
+def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
+    """Rationale: some scenes fail only while their reference is made. Expected: those that are black or
+    cannot be rendered are left out and named, the rows of the others are written, the status is 1; so it is
+    where the rows of a scene are damaged. A film without colours and a reference of another scene are refused
+    before anything is rendered."""
+    room = ROOM.format(height=64, sampler="")
+    lamp = re.search(r"<emitter.*</emitter>", room, re.DOTALL)[0]
+    medium = '<medium type="homogeneous" name="interior"/>'
+    for name, text in (("dark", room.replace(lamp, "")), ("fog", room.replace(lamp, medium + lamp))):
+        (here / "elsewhere" / f"{name}.xml").write_text(text)
+    preset = here / "project" / "presets" / "mine.toml"
+    head = PRESET.partition("[[integrator]]")[0].replace("[2, 4]", "[2]").replace("[8, 2]", "2")
+    listed = ", ".join(f'"elsewhere/{name}.xml"' for name in ("dark", "fog", "room"))
+    preset.write_text(head.replace('"../elsewhere/room.xml"', listed) + '[[integrator]]\ntype = "bdpt"\n')
+    words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
+    assert main(words) == 1
+    out = capsys.readouterr().out
+    assert "failed: dark: left out: scene='dark' is black" in out and "max_depth=4" in out
+    assert "failed: fog: left out: bdpt: shape" in out and "out: 2 rows" in out
+    next((here / "out" / "cells").iterdir()).write_text("{")
+    assert main([*words, "--scenes", "room"]) == 1
+    assert re.search(r"failed: room: no rows: .*json' is damaged .*; delete it", capsys.readouterr().out)
+    (here / "elsewhere" / "room.xml").write_text(room.replace("<integrator", "<!-- edited --><integrator", 1))
+    assert main(words) == 2
+    assert "reference room_16_4.exr was made of another room.xml" in capsys.readouterr().err
+    grey = '<film type="hdrfilm"><string name="pixel_format" value="luminance"/>'
+    (here / "elsewhere" / "fog.xml").write_text(room.replace('<film type="hdrfilm">', grey))
+    assert main(words) == 2
+    said = capsys.readouterr()
+    assert "fog.xml': its film has no colours" in said.err and "making one" not in said.out

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.measure import page
 from mitsuba_bdpt.measure.analysis import Biased, NotJudged, Summary
 
@@ -134,6 +135,14 @@ def test_the_page_in_a_browser(tmp_path):
     assert seen["noError"] == [68, 1, 84, 255] and "reference right of it" in seen["label"]
     assert seen["rows"] == 3 and seen["sorted"] and seen["sort"] == "ascending"
     assert seen["filtered"] == ["cornell_box"]
+
+
+def test_a_page_of_the_users_is_not_overwritten(tmp_path, capsys):
+    """Expected: refused before the sweep is read; the title of each page says what has made it."""
+    (tmp_path / "page.html").write_text("<title>mine</title>")
+    assert main(["page", str(tmp_path)]) == 2
+    assert "page.html' exists and was made by something else; move it away, or" in capsys.readouterr().err
+    assert "<title>@TITLE@</title>" in page.FRAME.read_text()
 
 
 def test_images_are_half_precision():

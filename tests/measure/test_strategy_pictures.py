@@ -1,5 +1,7 @@
 """Pictures of single strategies: the command `pyramid`."""
 
+import re
+
 import matplotlib.image
 import numpy as np
 import OpenEXR
@@ -30,12 +32,12 @@ def test_pyramid(tmp_path, capsys):
     the image (float32: 1e-4), and two pictures of the pyramid with a row for k = 2 and one for k = 3."""
     file = tmp_path / "room.xml"
     file.write_text(SCENE)
-    output = tmp_path / "made" / "room"
+    output = tmp_path / "made" / "room.v2.exr"
     options = ["--max-depth", "3", "--spp", "8", "--resolution", "16"]
     assert main(["pyramid", str(file), "-o", str(output), *options]) == 0
     said = capsys.readouterr().out.split()
-    assert said == [f"{output}_weighted.png", f"{output}_unweighted.png"]
-    with OpenEXR.File(str(output.with_suffix(".exr")), separate_channels=True) as opened:
+    assert said == [str(output.with_name(f"room.v2_{kind}.png")) for kind in ("weighted", "unweighted")]
+    with OpenEXR.File(str(output), separate_channels=True) as opened:
         channels = {name: np.array(c.pixels, dtype=float) for name, c in opened.channels().items()}
     for channel in "RGB":
         layers = [v for k, v in channels.items() if k.startswith("weighted.") and k.endswith("." + channel)]
@@ -46,6 +48,29 @@ def test_pyramid(tmp_path, capsys):
         picture = matplotlib.image.imread(name)[..., :3]
         height, width = picture.shape[:2]
         assert width > 400 and height > 400 and 0.02 < picture.mean() < 0.98
+
+
+@pytest.mark.parametrize(
+    ("dark", "options", "message"),
+    [
+        (False, ["-o", "room"], "output='room' must end in .exr"),
+        (
+            False,
+            ["--max-depth", "17"],
+            "the image has 1126 channels, 1122 of them layers, and .* 1023 at most",
+        ),
+        (True, [], "nothing to draw: no path of 2 edges or more brings light"),
+    ],
+)
+def test_what_cannot_be_drawn_leaves_no_file(tmp_path, monkeypatch, capsys, dark, options, message):
+    """Rationale: Mitsuba refuses an image of so many channels after the render. Expected: one line with a
+    remedy, and no file, neither of an output without suffix nor of a black image."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "room.xml"
+    file.write_text(SCENE.replace('value="3, 2, 1"', 'value="0"') if dark else SCENE)
+    assert main(["pyramid", str(file), "--spp", "1", "--resolution", "4", *options]) == 2
+    assert re.search(message, capsys.readouterr().err)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != file]
 
 
 def test_panels_are_those_that_contribute():

@@ -16,7 +16,8 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
-from mitsuba_bdpt.files.images import read_layers
+from mitsuba_bdpt.files import whole
+from mitsuba_bdpt.files.images import read_layers, write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import agreement, analysis, cells, making, metrics, probes, reference, scenes, sweep
 from mitsuba_bdpt.measure import bench as bench_module
@@ -285,7 +286,7 @@ def test_wide_scenes_stay_wide():
 
 def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
     """Expected: the command that makes the reference is named."""
-    command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2"
+    command = f"mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --project {project.root}"
     with pytest.raises(ValueError, match=f"no reference.*{command}"):
         reference_of(project, 2)
     making.make(job(2, seconds=0))
@@ -482,6 +483,19 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
     assert halves_module.Halves(folder / "sums.npz", "key").rounds == 1
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
+def test_a_full_disk_leaves_the_old_image(folder):
+    """Rationale: OpenEXR does not say that a disk is full. Expected: an error with the file's name, and the
+    image that was there."""
+    file = folder / "image.exr"
+    write_layers(file, {"": np.ones((64, 64, 3))}, {})
+    before = file.read_bytes()
+    whole._temporary(file).symlink_to("/dev/full")
+    with pytest.raises(OSError, match="could not be written whole; is the disk full.*image.exr"):
+        write_layers(file, {"": np.zeros((64, 64, 3))}, {})
+    assert file.read_bytes() == before and not list(folder.glob(".*"))
+
+
 def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
     """Expected: measured once, again when the number of rounds changes; a failure is reported with what the
     process wrote, and the sweep goes on.
@@ -536,7 +550,9 @@ def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, 
     assert depths == [subjects[name].max_depth for name in ("cornell_box", "pool")]
     assert depths[0] != project.scene("cornell_box").max_depth
     data = {"max_depth": 3, "scene": {"pool": {"max_depth": 4}}}
-    assert [depth_in(data, project.scene(name)) for name in ("pool", "cornell_box")] == [4, 3]
+    assert [
+        depth_in(preset_file(project.root), data, project.scene(name)) for name in ("pool", "cornell_box")
+    ] == [4, 3]
 
 
 def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
@@ -663,7 +679,21 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (('match = "seconds"', MORE.replace('"path"', '"none"')), r"'none' of \[more\] integrators"),
         (('match = "seconds"', MORE.replace('"ours", ', "")), r"must be the first one, 'ours', and its"),
         (('match = "seconds"', MORE.replace("[3, 9]", "[9, 3]")), r"must be \[at least, at most\]"),
-        (('match = "seconds"', MORE.replace("0.5", "0")), "width=0 of .* must be between 0 and 1"),
+        (('match = "seconds"', MORE.replace("0.5", "0")), "width=0 of .* must be a number between 0 and 1"),
+        (('["cornell_box"]', "[3]"), r"scenes=\[3\] must be a list .* all texts in quotes"),
+        (("seeds = 2", "scene = 3\nseeds = 2"), r"scene=3 must be a table: write \[scene\]"),
+        (("seeds = 2", "scene.cornell_box = 3\nseeds = 2"), r"scene.cornell_box=3 must be a table"),
+        (("seeds = 2", "more = 3\nseeds = 2"), "more=3 must be a table"),
+        (("seeds = 2", "probes = [1]\nseeds = 2"), r"probes=\[1\] must be a table"),
+        (("[2, 4]", "[2, -4]"), r"spp=\[2, -4\] must be a list of whole numbers of at least 1"),
+        (("[2, 4]", "[true]"), r"spp=\[True\] must be a list of whole numbers"),
+        (('type = "path"', "type = 3"), "type of an integrator=3 must be a text in quotes"),
+        (('type = "path"', 'type = "path"\nname = 3'), "name of an integrator=3 must be a text"),
+        (('type = "path"', 'type = "path"\nsampler = 3'), "sampler of integrator 'path'=3 must be a text"),
+        (('match = "seconds"', 'scenes = "pool"'), "scenes of integrator 'path'='pool' must be a list"),
+        (('match = "seconds"', "x = [1]"), r"x=\[1\] of integrator 'path' must be a number, a text, true"),
+        (('match = "seconds"', MORE.replace("0.5", "true")), "width=True of .* must be a number"),
+        (('match = "seconds"', MORE.replace('["ours", "path"]', "1")), r"integrators of \[more\]=1 must be"),
     ],
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):

@@ -162,9 +162,9 @@ def test_options_of_rooms_want_rooms(here, monkeypatch, capsys, option):
     ("command", "taken"),
     [
         ("equal_time.py room.xml --reference flat.exr -o a.png", "a.png"),
-        ("strategies.py room.xml -o a", "a.png"),
-        ("strategies.py room.xml -o a", "a.exr"),
-        ("strategies.py room.xml -o a", "a_weighted.png"),
+        ("strategies.py room.xml -o a.exr", "a.png"),
+        ("strategies.py room.xml -o a.exr", "a.exr"),
+        ("strategies.py room.xml -o a.exr", "a_weighted.png"),
     ],
 )
 def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, command, taken):

@@ -165,7 +165,8 @@ def _declare_equal_time(parser) -> None:
 def _declare_pyramid(parser) -> None:
     add = parser.add_argument
     add("scene", help="a scene file, or a name in PROJECT/scenes")
-    add("-o", "--output", type=Path, help="default: PROJECT/renders/pyramid_SCENE")
+    text = "EXR file to write, PNGs come beside it; default: PROJECT/renders/pyramid_SCENE.exr"
+    add("-o", "--output", type=Path, help=text)
     add("--max-depth", type=WHOLE, default=5, help="longest path in edges; default: %(default)s")
     add("--spp", type=WHOLE, default=64, help="default: %(default)s")
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")

@@ -15,6 +15,7 @@ All else is a bug, whose traceback must be seen.
 from __future__ import annotations
 
 import argparse
+import errno
 import re
 import sys
 from collections.abc import Callable
@@ -42,8 +43,31 @@ def answered(main: Callable[[], Status]) -> Status | int:
             raise KeyboardInterrupt from error
         if not is_mistake(error):
             raise
-        print(f"error: {' '.join(message(error).split())}", file=sys.stderr)
+        text = _of_system(error) if isinstance(error, OSError) else message(error)
+        print(f"error: {' '.join(text.split())}", file=sys.stderr)
         return STATUS
+
+
+REMEDIES = {
+    errno.ENOENT: "give the path of one that is there",
+    errno.EACCES: "give a path that may be read and written, or change its rights",
+    errno.EPERM: "give a path that may be read and written, or change its rights",
+    errno.EROFS: "give a path on a disk that can be written",
+    errno.EEXIST: "a file stands where a folder is needed: move it away, or give another path",
+    errno.ENOTDIR: "a file stands where a folder is needed: move it away, or give another path",
+    errno.EISDIR: "a folder stands where a file is needed: give another path",
+    errno.ENOSPC: "free some space and run the command again; what was finished is kept",
+    errno.EDQUOT: "free some space and run the command again; what was finished is kept",
+}
+"""What to do about errors of the system."""
+
+
+def _of_system(error: OSError) -> str:
+    """What the system could not do, with which file, and what to do about it."""
+    if error.strerror is None or error.filename is None:
+        return str(error)
+    remedy = REMEDIES.get(error.errno or 0)
+    return f"{str(error.filename)!r}: {error.strerror}" + (f"; {remedy}" if remedy else "")
 
 
 def is_mistake(error: Exception) -> bool:

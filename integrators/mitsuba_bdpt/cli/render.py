@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from ..errors import CommandError, message
-from ..files.images import check_png, prepare_output, write_images
+from ..files.images import check_channels, check_png, prepare_output, write_images
 from ..files.loading import check_file, choose_sensor, load
 from ..host.versions import versions
 from . import checkpoints, cluster
@@ -55,6 +55,7 @@ def run(options: Namespace) -> int:
         check_integrator(options, integrator)
         sensor = choose_sensor(scene, options.sensor)
         check_png(sensor.film())
+        check_channels(sensor.film(), integrator.aov_names())
         open_ended = options.time is not None or options.target_error is not None
         spp = options.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
         if not spp:
@@ -277,9 +278,10 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: f
     if "error" in outcome.statistics:
         error = outcome.statistics["error"]
         missed = 0 < target_error < error
-        parts.append(
-            f"relMSE about {error:.2g}" + (f", not the {target_error:g} asked for" if missed else "")
-        )
+        text = f"relMSE about {error:.2g}" if math.isfinite(error) else "relMSE not known"
+        if missed:
+            text += f", not the {target_error:g} asked for: that takes more samples (--spp, --time)"
+        parts.append(text)
     if outcome.statistics.get("no_pilot"):
         parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
     if outcome.statistics.get("non_finite"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,22 @@ from .whole import MAGIC, check_format, check_writable, replacing
 
 PNG_SIDE = 1_000_000
 """Pixels in a row or column of a PNG, at most: libpng's limit."""
+
+
+MOST_CHANNELS = 1023
+"""Of an image file, the weight of a pixel among them: Mitsuba's bitmaps have 4095 bytes for a pixel."""
+
+
+def check_channels(film: mi.Film, layers: list[str]) -> None:
+    """Raise ``CommandError`` for more ``layers``, names of channels, than a file can hold, which would come
+    out after the render."""
+    if len(layers) + film.base_channels_count() > MOST_CHANNELS // 2:
+        count = film.prepare(layers)
+        if count > MOST_CHANNELS:
+            raise CommandError(
+                f"the image has {count} channels, {len(layers)} of them layers, and Mitsuba's images hold "
+                f"{MOST_CHANNELS} at most; ask for fewer layers: of strategies, by a smaller max_depth."
+            )
 
 
 def check_png(film: mi.Film) -> None:
@@ -110,7 +127,13 @@ def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
+        temporary.touch()  # OpenEXR does not say what hinders it
         file.write(str(temporary))
+        try:
+            read_layers(temporary, *layers)
+        except CommandError as error:  # nor that a disk is full
+            why = "could not be written whole; is the disk full?"
+            raise OSError(errno.ENOSPC, why, str(path)) from error
 
 
 def read_layers(path: Path, *layers: str):
@@ -120,8 +143,15 @@ def read_layers(path: Path, *layers: str):
         start = file.read(4)
     if start != MAGIC[".exr"]:
         raise CommandError(f"{str(path)!r} is not an EXR")
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels, header = file.channels(), dict(file.header())
+    try:
+        opened = OpenEXR.File(str(path), separate_channels=True)
+    except (RuntimeError, ValueError) as error:
+        raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
+    with opened as file:
+        try:
+            channels, header = file.channels(), dict(file.header())
+        except ValueError as error:  # of a file that ends in the middle
+            raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
         missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
         if missing:
             raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")

@@ -31,6 +31,13 @@ def check_format(path: Path, output: Path) -> None:
         )
 
 
+def check_own(path: Path, mark: str, remedy: str) -> None:
+    """Raise ``CommandError`` with the ``remedy`` if ``path`` is a text without the ``mark`` of those that the
+    command writes there."""
+    if path.is_file() and mark not in (text := path.read_text(errors="replace")) and text.strip():
+        raise CommandError(f"{str(path)!r} exists and was made by something else; {remedy}")
+
+
 def check_writable(path: Path) -> None:
     """Raise ``OSError`` now if `replacing` could not write `path` later, ``CommandError`` if it is something
     else than a file."""

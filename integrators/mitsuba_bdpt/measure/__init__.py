@@ -9,5 +9,6 @@ Needs the extra ``[measure]``. Nothing but the commands import it (see `cli.meas
 * What they show: `analysis` (figures with their reasons), `tables`, `figures`, `report`, `page`.
 * Two or a few ways to render: `compare`, `equal_time`.
 * Single strategies and paths: `pyramid`; `fireflies` with `recording`, `reconstruct`, `oracle`, `endpoints`.
+* What a terminal shows meanwhile: `showing`.
 * Kernels: `floor`.
 """

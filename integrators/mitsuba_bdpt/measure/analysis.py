@@ -98,6 +98,22 @@ def check_judged(rows, error: str) -> None:
     raise NotJudged(reference_refusal(own, measured), own / measured)
 
 
+def unjudged(rows) -> dict[tuple[str, int], NotJudged]:
+    """Integrators and budgets of the ``rows`` of a scene whose errors, raw or trimmed, the reference is too
+    noisy for, with the refusal, of both errors the worse."""
+    found = {}
+    for method, budget in dict.fromkeys((row["method"], row["budget"]) for row in rows):
+        for error in OWN:
+            try:
+                check_judged(select(rows, method=method, budget=budget), error)
+            except NotJudged as why:
+                if (method, budget) not in found or found[method, budget].share < why.share:
+                    found[method, budget] = why
+            except Refused:  # an error of 0, which no reference judges
+                continue
+    return found
+
+
 def paired(ours, theirs) -> list[tuple[dict, dict]]:
     """The renders of each seed that both have; raises `Refused` for fewer than two."""
     by_seed = {row["seed"]: row for row in theirs}

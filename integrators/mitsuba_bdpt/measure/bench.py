@@ -16,7 +16,7 @@ import numpy as np
 
 from .. import workers
 from ..errors import CommandError, message
-from ..files.texts import write_json
+from ..files.texts import read_json, write_json
 from .cells import Cell, Cells, machine, software
 from .preset import read_preset
 from .project import Project
@@ -91,7 +91,7 @@ class Bench:
                     [self.timed(c, largest, seed)[1] for c in (first, cell)] for seed in range(CALIBRATIONS)
                 ]
                 write_json(kept, float(np.median([ours / theirs for ours, theirs in pairs])))
-            self._spp[cell.method] = json.loads(kept.read_text())
+            self._spp[cell.method] = read_json(kept, "delete it, to measure it anew")
         wanted = cell.budget * self._spp[cell.method]
         if cell.sampler == "independent":
             return max(round(wanted), 1)

@@ -22,6 +22,7 @@ from .metrics import TRIM, rel_mse
 from .project import Project
 from .reference import Reference
 from .scenes import check_plugins, integrator_of
+from .showing import steps
 from .tables import table
 from .timing import timed
 
@@ -65,17 +66,21 @@ class Side:
 def line(name: str, sides: list[Side], target: Reference, spp: int, pairs: int) -> list[str]:
     """A scene's line of the table."""
     try:
-        return [f"`{name}`", str(spp), *ratios(sides, target, spp, pairs)]
+        with steps(2 * (pairs + 1)) as step:
+            found = ratios(sides, target, spp, pairs, lambda seed: step(f"{name}, {spp} spp, seed {seed}"))
+        return [f"`{name}`", str(spp), *found]
     except Refused as why:
         return [f"`{name}`", str(spp), str(why), *["–"] * (len(HEADS) - 3)]
 
 
-def ratios(sides: list[Side], target: Reference, spp: int, pairs: int) -> list[str]:
-    """The figures of a scene's line; raises `Refused` for an image without an error."""
+def ratios(sides: list[Side], target: Reference, spp: int, pairs: int, on_render) -> list[str]:
+    """The figures of a scene's line; ``on_render`` is called with the seed before each render. Raises
+    `Refused` for an image without an error."""
     found = []
     for seed in range(pairs + 1):
         pair = [None, None]
         for i in (0, 1) if seed % 2 else (1, 0):
+            on_render(seed)
             pair[i] = sides[i].measured(target, spp, seed)
         found.append(pair)
     first, second = np.array(found[1:]).transpose(1, 2, 0)

@@ -123,6 +123,12 @@ def reference_good_enough(own_error, measured_error) -> bool:
     return _reference_share(own_error, measured_error) <= REFERENCE_SHARE
 
 
+def refused_share(share: float, digits: int) -> str:
+    """A ``share`` above `REFERENCE_SHARE` in percent; rounding does not make it one that is allowed."""
+    text, limit = f"{100 * share:.{digits}g}", 100 * REFERENCE_SHARE
+    return f"{text} %" if float(text) > limit else f"just above {limit:g} %"
+
+
 def reference_refusal(own_error, measured_error) -> str:
     """The sentence that says why a figure is refused and how many more samples the reference needs."""
     share = _reference_share(own_error, measured_error)
@@ -132,7 +138,7 @@ def reference_refusal(own_error, measured_error) -> str:
         )
     times = math.ceil(round(10 * share / REFERENCE_SHARE, 6)) / 10
     return (
-        f"The reference carries {100 * share:.3g} % of the error measured with it ({own_error:.2e} of "
+        f"The reference carries {refused_share(share, 3)} of the error measured with it ({own_error:.2e} of "
         f"{measured_error:.2e}) and may carry {100 * REFERENCE_SHARE:g} %: render it with at least "
         f"{times:g} times the samples."
     )

@@ -25,6 +25,7 @@ from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from .project import RESOLUTION, Project
 from .scenes import SceneFile, depth_of, integrator_of
+from .showing import steps
 from .timing import timed
 
 matplotlib.use("Agg")
@@ -81,13 +82,16 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
     """All integrators, parameters of plugins by what is written beneath; the last has ``spp`` samples per
     pixel, others as many as its seconds allow."""
     made = [integrator_of(parameters, depth) for parameters in ways.values()]
-    limit, found = seconds(scene, made[-1], spp), []
-    for name, one in zip(ways, made, strict=True):
-        count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))
-        seconds(scene, one, count)  # Mitsuba compiles anew for each number of samples
-        image, taken = timed(scene, one, count, seed=7)
-        error = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
-        found.append(Shot(name, count, taken, image, error, rel_mse(image, target, TRIM)))
+    with steps(1 + len(made)) as step:
+        step(list(ways)[-1])
+        limit, found = seconds(scene, made[-1], spp), []
+        for name, one in zip(ways, made, strict=True):
+            step(name)
+            count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))
+            seconds(scene, one, count)  # Mitsuba compiles anew for each number of samples
+            image, taken = timed(scene, one, count, seed=7)
+            error = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
+            found.append(Shot(name, count, taken, image, error, rel_mse(image, target, TRIM)))
     return found
 
 

@@ -30,6 +30,7 @@ from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon
 from .project import Project
 from .scenes import SceneFile, integrator_of
+from .showing import steps
 from .tables import table
 
 # Estimates and weights are the same up to this.
@@ -203,12 +204,14 @@ def lines(project: Project, file: SceneFile, options: Namespace) -> tuple[list, 
     target, scene = obtained(job).image, file.load(options.resolution)
     integrator = integrator_of({"type": "bdpt"}, job.depth)
     kinds, errors, examined = {}, [], 0
-    for seed in range(1, options.seeds + 1):
-        image, found = fireflies(scene, integrator, target, options.spp, seed, options.level, options.top)
-        errors.append((rel_mse(image, target), rel_mse(image, target, TRIM)))
-        examined += len(found)
-        for firefly in found:
-            kinds.setdefault(firefly.kind, []).append(firefly)
+    with steps(options.seeds) as step:
+        for seed in range(1, options.seeds + 1):
+            step(f"{name}, seed {seed}")
+            image, found = fireflies(scene, integrator, target, options.spp, seed, options.level, options.top)
+            errors.append((rel_mse(image, target), rel_mse(image, target, TRIM)))
+            examined += len(found)
+            for firefly in found:
+                kinds.setdefault(firefly.kind, []).append(firefly)
     total = sum(raw for raw, _ in errors) * target.size
     rows = sorted(kinds.values(), key=lambda found: -sum(f.error for f in found))
     pairs = ", ".join(f"{raw:.3g} ({trimmed:.2g})" for raw, trimmed in errors)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -28,17 +30,26 @@ class Halves:
         self.sources: set[str] = set()
         self.earlier: Means | None = None
         if path.is_file():
-            kept = np.load(path)
-            if str(kept["key"]) != key:
-                print(f"{path}: of another scene, integrator or number of samples; begun anew")
-            else:
-                self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
-                self.columns = list(kept["columns"])
-                whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
-                self.counts = kept.get("counts", whole)
-                self.sources = set(kept["sources"].tolist())
-                self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
+            try:
+                with path.open("rb") as file:
+                    self._take(np.load(file))
+            except (EOFError, LookupError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+                raise CommandError(
+                    f"{str(path)!r} is damaged ({error}); delete it: what references/ holds is gone on from"
+                ) from error
         self.sources.add(source_digest())
+
+    def _take(self, kept):
+        """Go on from what a file has ``kept``, if it is of the same."""
+        if str(kept["key"]) != self.key:
+            print(f"{self.path}: of another scene, integrator or number of samples; begun anew")
+            return
+        self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
+        self.columns = list(kept["columns"])
+        whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
+        self.counts = kept.get("counts", whole)
+        self.sources = set(kept["sources"].tolist())
+        self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
 
     def go_on_from(self, stored: Reference, windows: list):
         """Take a stored reference for the renders before the first; ``windows`` are slices of rows and

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import math
 import platform
 import time
 from argparse import Namespace
@@ -25,8 +26,9 @@ from functools import cached_property
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError
-from ..files.texts import read_toml
+from ..errors import CommandError, message
+from ..files.texts import read_toml, table_of
+from ..files.whole import check_writable
 from ..host.versions import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means
@@ -34,8 +36,9 @@ from .efficiency import REFERENCE_SHARE
 from .halves import PASS_SPP, Halves
 from .metrics import TRIM, rel_mse
 from .project import Project
-from .reference import Reference, load_reference, reference_path, write
+from .reference import Reference, load_reference, make_command, reference_path, write
 from .scenes import SceneFile, integrator_of
+from .showing import amount
 
 WAYS = {
     "path": {"type": "path"},
@@ -53,6 +56,17 @@ TRIALS = 3  # renders of bdpt that say what it has to judge
 TWICE = 2  # samples of `path` in the time of one of `bdpt`, roughly
 MARGIN = 0.9  # of the share that a reference may carry
 SECONDS = 600.0  # that a reference may take
+
+
+def _is_number(value) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_window(share) -> bool:
+    """Whether this is left, top, right and bottom of a part of an image."""
+    if not isinstance(share, list) or len(share) != 4 or not all(map(_is_number, share)):
+        return False
+    return 0 <= share[0] < share[2] <= 1 and 0 <= share[1] < share[3] <= 1
 
 
 @dataclass(frozen=True)
@@ -78,21 +92,24 @@ class Recipe:
     def of(project: Project, name: str) -> Recipe:
         """That of a scene; raises ``CommandError`` for one that cannot be followed."""
         file = project.references / "scenes.toml"
-        entry = (read_toml(file) if file.is_file() else {}).get(name, {})
+        entry = table_of(file, name, (read_toml(file) if file.is_file() else {}).get(name, {}))
         keys = {"by", "windows", "radiance"}
         if unknown := sorted(set(entry) - keys):
             raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
-        if entry.get("by", "bdpt") not in WAYS:
+        if entry.get("by", "bdpt") not in tuple(WAYS):  # of a list there is no hash
             raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
         windows = entry.get("windows", [])
-        if not all(len(w) == 4 and 0 <= w[0] < w[2] <= 1 and 0 <= w[1] < w[3] <= 1 for w in windows):
+        if not isinstance(windows, list) or not all(map(_is_window, windows)):
             raise CommandError(
                 f"{file}: windows={windows!r} of [{name}] must be lists of four shares, left, top, "
                 "right, bottom"
             )
         known = entry.get("radiance")
-        if known is not None and set(known) != {"limit", "lacks"}:
-            raise CommandError(f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks")
+        whole = isinstance(known, dict) and set(known) == {"limit", "lacks"}
+        if known is not None and not (whole and all(map(_is_number, known.values()))):
+            raise CommandError(
+                f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks, numbers"
+            )
         return Recipe(entry.get("by", "bdpt"), tuple(map(tuple, windows)), known)
 
 
@@ -144,22 +161,35 @@ def obtained(job: Job) -> Reference:
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
+def check(job: Job) -> None:
+    """Raise ``CommandError`` for a reference that cannot be made or used, as far as that is known before
+    anything is rendered."""
+    Recipe.of(job.project, job.scene.name)
+    check_size(job)
+    if reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
+        load_reference(job.project, job.scene, job.resolution, job.depth)
+
+
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it; also whether it is good
     enough. One that the time has cut short does not replace a better one."""
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
+    path = reference_path(job.project, job.scene.name, job.resolution, job.depth)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
     reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
     stored = None if reached else job.stored
     if stored is not None and stored.error < reference.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
-    write(reference_path(job.project, job.scene.name, job.resolution, job.depth), reference)
+    write(path, reference)
     return reference, reached
 
 
 def check_size(job: Job) -> None:
-    """Raise ``CommandError`` for an image that the tiles of a bias check do not divide."""
+    """Raise ``CommandError`` for an image that the tiles of a bias check do not divide, or without
+    colours."""
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
@@ -182,16 +212,23 @@ class Aim:
     """What a reference has to judge: renders of default `bdpt` with ``spp`` samples per pixel, and of `path`
     in the same time where that converges."""
 
-    def __init__(self, scene, depth: int, spp: int, by_path: bool):
+    def __init__(self, job: Job, scene, by_path: bool):
+        self.name, self.depth, spp = job.scene.name, job.depth, job.spp
         rivals = [({"type": "bdpt"}, spp)] + [(WAYS["path"], TWICE * spp)] * by_path
         self.images = []
         for parameters, samples in rivals:
-            rival = integrator_of(parameters, depth)
+            rival = integrator_of(parameters, job.depth)
             for seed in range(TRIALS):
                 self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
 
     def reached(self, reference: Reference) -> bool:
-        """Whether the reference carries little enough of their errors, and can serve in a bias check."""
+        """Whether the reference carries little enough of their errors, and can serve in a bias check; raises
+        ``CommandError`` if it is black: no error is relative to that."""
+        if not reference.image.any():
+            raise CommandError(
+                f"scene={self.name!r} is black: the samples of its reference found no light; check its "
+                f"lamps, its sensor and max_depth={self.depth}, or leave it out"
+            )
         if reference.means is None:
             return False
         return all(
@@ -236,20 +273,24 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, SAMPLER])
     scene = job.scene.load(job.resolution, SAMPLER)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(scene, job.depth, job.spp, by == "path")
+    aim = Aim(job, scene, by == "path")
     windows = [Window(job, share) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):
         halves.go_on_from(stored, [window.slices for window in windows])
     started = time.perf_counter()
     reached = halves.rounds > 0 and aim.reached(halves.reference({}))
-    while halves.rounds < job.rounds or not (reached or time.perf_counter() - started > job.seconds):
-        behind = [w for w in windows if w.is_behind(halves)]
-        for window in behind:
-            halves.add(_pair(window.scene, integrator, halves, WINDOW_PASSES), window.slices, WINDOW_PASSES)
-        if not behind:
-            halves.add(_pair(scene, integrator, halves))
-        reached = aim.reached(halves.reference({}))
+    with amount(f"{job.scene.name}: seconds of the reference", job.seconds) as show:
+        while halves.rounds < job.rounds or not (reached or time.perf_counter() - started > job.seconds):
+            behind = [w for w in windows if w.is_behind(halves)]
+            for window in behind:
+                halves.add(
+                    _pair(window.scene, integrator, halves, WINDOW_PASSES), window.slices, WINDOW_PASSES
+                )
+            if not behind:
+                halves.add(_pair(scene, integrator, halves))
+            reached = aim.reached(halves.reference({}))
+            show(time.perf_counter() - started)
     provenance = _provenance(
         job,
         integrator=parameters,
@@ -297,7 +338,10 @@ class Window:
 def said(job: Job, made: Reference, reached: bool) -> str:
     """What was made, in a line."""
     text = f"{job.scene.name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e}"
-    return text + ("" if reached else f", not good enough for {job.spp} spp: go on by the command reference")
+    if reached:
+        return text
+    own = job.project, job.project.called(job.scene), job.resolution, job.depth
+    return f"{text}, not good enough for {job.spp} spp: go on by {make_command(*own, '--spp', str(job.spp))}"
 
 
 def run(options: Namespace) -> int:
@@ -305,9 +349,19 @@ def run(options: Namespace) -> int:
     good enough."""
     if not (options.all or options.scenes):
         raise CommandError("reference: name a scene, or give --all")
-    mi.set_variant("llvm_ad_rgb")
+    if options.all and options.scenes:
+        raise CommandError(
+            f"reference: {options.scenes[0]!r} together with --all: leave out one or the other"
+        )
     project, status = Project(options.project), 0
-    for name in project.scene_names() if options.all else options.scenes:
+    names = project.scene_names() if options.all else options.scenes
+    if not names:
+        raise CommandError(
+            f"reference --all: there is no scene in {str(project.scenes)!r}; name the folder that has "
+            "scenes/ by --project, or give the path of an XML file"
+        )
+    mi.set_variant("llvm_ad_rgb")
+    for name in names:
         try:
             scene = project.scene(name)
             job = Job(
@@ -322,7 +376,7 @@ def run(options: Namespace) -> int:
             made, reached = make(job)
         except (ValueError, RuntimeError, NotImplementedError) as error:  # go on with the other scenes
             raise_interrupt(error)
-            print(f"{name}: failed: {error}", flush=True)
+            print(f"{name}: failed: {' '.join(message(error).split())}", flush=True)
             status = 1
             continue
         status |= not reached

@@ -19,12 +19,16 @@ import numpy as np
 
 from ..files.images import check_output, read_layers
 from ..files.texts import write_text
+from ..files.whole import check_own
 from ..planning.explain import subpaths
 from . import figures, report
 from .analysis import NOTHING, Biased, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
 from .tables import ratio
+
+TITLE = "mitsuba-bdpt: sweep"
+"""How the title of every page begins."""
 
 FRAME = Path(__file__).with_suffix(".html")
 
@@ -192,7 +196,7 @@ def page(folder: Path, results: Results, made: dict) -> str:
         f"{first}, trimmed of the worst 0.1 % of values, over the stronger of path's samplers.</p>"
     )
     parts = {
-        "TITLE": f"mitsuba-bdpt: sweep {html.escape(folder.resolve().name)}",
+        "TITLE": f"{TITLE} {html.escape(folder.resolve().name)}",
         "INTRODUCTION": introduction,
         "ANSWERS": answers(results),
         "PLOTS": plots(results),
@@ -212,6 +216,7 @@ def run(options: Namespace) -> int:
     folder = project.results(options.folder)
     output = options.output or folder / "page.html"
     check_output(output, ".html")
+    check_own(output, f"<title>{TITLE}", "move it away, or name another output by -o")
     text = page(folder, *report.load(project, folder))
     write_text(output, text)
     print(f"{output}: {len(text) / 2**20:.1f} MiB")

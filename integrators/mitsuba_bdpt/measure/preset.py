@@ -39,7 +39,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import CommandError
-from ..files.texts import read_toml
+from ..files.texts import list_of, read_toml, table_of, text_of, whole_of
 from . import probes
 from .agreement import TILES
 from .project import Project, depth_in
@@ -107,20 +107,34 @@ def read_preset(path: Path, project: Project) -> Preset:
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
     for key in {"resolution", "max_depth"} & set(data):
-        _whole(path, key, data[key])
+        whole_of(path, key, data[key])
     if data["resolution"] % TILES:
         raise CommandError(f"{path}: resolution={data['resolution']} must be divisible by {TILES}")
-    for key in ("scenes", "integrator"):
-        if not isinstance(data[key], list) or not data[key]:
-            raise CommandError(f"{path}: {key}={data[key]!r} must be a list with at least one entry")
-    scenes = [project.scene(name) for name in data["scenes"]]
+    scenes = [project.scene(name) for name in _names(path, "scenes", data["scenes"])]
     names = [scene.name for scene in scenes]
     if len(set(names)) < len(names):
         raise CommandError(f"{path}: scenes={data['scenes']!r} names one twice")
-    for name in data.get("scene", {}):
+    for name in table_of(path, "scene", data.get("scene", {})):
         if name not in names:
             raise CommandError(f"{path}: [scene.{name}] is not among the scenes {names}")
-    methods = tuple(_method(path, dict(entry), names) for entry in data["integrator"])
+    methods = _methods(path, data["integrator"], names)
+    return Preset(
+        subjects=tuple(_subject(path, data, scene) for scene in scenes),
+        methods=methods,
+        resolution=data["resolution"],
+        more=_more(path, data["more"], names, methods) if "more" in data else None,
+        probes=_probes(path, data.get("probes", {})),
+    )
+
+
+def _names(path, key, value) -> list[str]:
+    return list_of(path, key, value, str, "texts in quotes")
+
+
+def _methods(path, entries, scenes) -> tuple:
+    """The integrators of a preset."""
+    list_of(path, "integrator", entries, dict, "tables: write [[integrator]] and the keys of each below")
+    methods = tuple(_method(path, dict(entry), scenes) for entry in entries)
     if len({m.name for m in methods}) < len(methods):
         raise CommandError(f"{path}: two integrators have the same name")
     if methods[0].scenes is not None or methods[0].seeds is not None or methods[0].match == "seconds":
@@ -128,18 +142,16 @@ def read_preset(path: Path, project: Project) -> Preset:
             f"{path}: the first integrator, {methods[0].name!r}, sets the time of the others; it takes "
             "neither scenes nor seeds nor match = 'seconds'"
         )
-    counts = data.get("probes", {})
-    for name, count in counts.items():
+    return methods
+
+
+def _probes(path, counts) -> dict:
+    """How often each probe is repeated."""
+    for name, count in table_of(path, "probes", counts).items():
         if name not in probes.PROBES:
             raise CommandError(f"{path}: probe {name!r} is unknown; there are {sorted(probes.PROBES)}")
-        _whole(path, name, count)
-    return Preset(
-        subjects=tuple(_subject(path, data, scene) for scene in scenes),
-        methods=methods,
-        resolution=data["resolution"],
-        more=_more(path, data["more"], names, methods) if "more" in data else None,
-        probes=counts,
-    )
+        whole_of(path, name, count)
+    return counts
 
 
 def _check_keys(path, entry, needed, allowed, what):
@@ -147,12 +159,6 @@ def _check_keys(path, entry, needed, allowed, what):
         raise CommandError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
     if missing := sorted(needed - set(entry)):
         raise CommandError(f"{path}: {missing[0]} is missing")
-
-
-def _whole(path, key, value) -> int:
-    if type(value) is not int or value < 1:
-        raise CommandError(f"{path}: {key}={value!r} must be a whole number of at least 1")
-    return value
 
 
 def _row(path, key, value) -> tuple:
@@ -163,7 +169,7 @@ def _row(path, key, value) -> tuple:
 
 def _subject(path, data, scene) -> Subject:
     name = scene.name
-    own = data.get("scene", {}).get(name, {})
+    own = table_of(path, f"scene.{name}", data.get("scene", {}).get(name, {}))
     _check_keys(path, own, set(), {"max_depth", "spp", "seeds"}, f"[scene.{name}]")
     merged = data | own
     spp, seeds = _row(path, "spp", merged["spp"]), merged["seeds"]
@@ -174,16 +180,16 @@ def _subject(path, data, scene) -> Subject:
         if len(seeds) != len(spp):
             raise CommandError(f"{path}: seeds={list(seeds)} of {name} must be as many as spp={list(spp)}")
     else:
-        seeds = (_whole(path, "seeds", seeds),) * len(spp)
-    if "max_depth" in merged:
-        _whole(path, "max_depth", merged["max_depth"])
-    return Subject(scene, depth_in(data, scene), spp, seeds)
+        seeds = (whole_of(path, "seeds", seeds),) * len(spp)
+    return Subject(scene, depth_in(path, data, scene), spp, seeds)
 
 
 def _method(path, entry, scenes) -> Method:
     if "type" not in entry:
         raise CommandError(f"{path}: an integrator without type: {entry!r}")
-    name, sampler = entry.pop("name", entry["type"]), entry.pop("sampler", "independent")
+    kind = text_of(path, "type of an integrator", entry["type"])
+    name = text_of(path, "name of an integrator", entry.pop("name", kind))
+    sampler = text_of(path, f"sampler of integrator {name!r}", entry.pop("sampler", "independent"))
     match, only, seeds = entry.pop("match", "spp"), entry.pop("scenes", None), entry.pop("seeds", None)
     if "max_depth" in entry:
         raise CommandError(
@@ -191,18 +197,26 @@ def _method(path, entry, scenes) -> Method:
         )
     if match not in MATCHES:
         raise CommandError(f"{path}: match={match!r} of integrator {name!r} must be one of {MATCHES}")
+    if only is not None:
+        _names(path, f"scenes of integrator {name!r}", only)
     if unknown := [scene for scene in only or () if scene not in scenes]:
         raise CommandError(f"{path}: scene {unknown[0]!r} of integrator {name!r} is not in the preset")
+    for key, value in entry.items():
+        if not isinstance(value, bool | int | float | str):
+            raise CommandError(
+                f"{path}: {key}={value!r} of integrator {name!r} must be a number, a text, true or false"
+            )
     if seeds is not None:
-        _whole(path, f"seeds of integrator {name!r}", seeds)
+        whole_of(path, f"seeds of integrator {name!r}", seeds)
     return Method(name, tuple(sorted(entry.items())), sampler, match, tuple(only) if only else None, seeds)
 
 
 def _more(path, entry, scenes, methods) -> More:
     keys = {"scenes", "integrators", "spp", "seeds", "width"}
+    table_of(path, "more", entry)
     _check_keys(path, entry, keys, keys, "[more]")
     for key, known in (("scenes", scenes), ("integrators", [m.name for m in methods])):
-        if unknown := [name for name in entry[key] if name not in known]:
+        if unknown := [n for n in _names(path, f"{key} of [more]", entry[key]) if n not in known]:
             raise CommandError(f"{path}: {unknown[0]!r} of [more] {key} is not in the preset")
     if entry["integrators"][:1] != [methods[0].name] or len(entry["integrators"]) < 2:
         raise CommandError(
@@ -214,9 +228,8 @@ def _more(path, entry, scenes, methods) -> More:
     limited = [m.name for m in methods if m.name in entry["integrators"] and (m.scenes or m.seeds)]
     if limited:
         raise CommandError(f"{path}: {limited[0]!r} of [more] is limited by scenes or seeds of its own")
-    if not 0 < entry["width"] < 1:
-        raise CommandError(f"{path}: width={entry['width']!r} of [more] must be between 0 and 1")
-    spp = _whole(path, "spp of [more]", entry["spp"])
-    return More(
-        tuple(entry["scenes"]), tuple(entry["integrators"]), spp, seeds[0], seeds[1], float(entry["width"])
-    )
+    width = entry["width"]
+    if isinstance(width, bool) or not isinstance(width, int | float) or not 0 < width < 1:
+        raise CommandError(f"{path}: width={width!r} of [more] must be a number between 0 and 1")
+    spp = whole_of(path, "spp of [more]", entry["spp"])
+    return More(tuple(entry["scenes"]), tuple(entry["integrators"]), spp, seeds[0], seeds[1], float(width))

@@ -11,11 +11,12 @@ None of these folders has to be there.
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import CommandError, did_you_mean
-from ..files.texts import read_toml
+from ..files.texts import read_toml, table_of, whole_of
 from .scenes import SceneFile
 
 RESOLUTION = 128
@@ -65,6 +66,16 @@ class Project:
         """What `scene` finds a scene by."""
         return scene.name if scene.file == self.scenes / f"{scene.name}.xml" else str(scene.file)
 
+    def command(self, *words: str | Path) -> str:
+        """A command line of this project, as a message quotes it for a shell."""
+        there = [] if self.root == Path() else ["--project", str(self.root)]
+        return shlex.join(["mitsuba-bdpt", *map(str, words), *there])
+
+    def sweep_command(self, folder: Path) -> str:
+        """That of the sweep that fills a ``folder``: of the preset of its name, if there is one."""
+        known = (self.root / "presets" / f"{folder.name}.toml").is_file()
+        return self.command("sweep", folder.name if known else "PRESET", "-o", folder)
+
     def _names_for(self, name: str) -> str:
         """The end of a message about a ``name`` that is unknown."""
         known = self.scene_names()
@@ -78,7 +89,7 @@ class Project:
         """The ``max_depth`` at which a scene is rendered unless said: that of presets/benchmark.toml if there
         is one, else that of the scene's file."""
         benchmark = self.root / "presets" / "benchmark.toml"
-        return depth_in(read_toml(benchmark) if benchmark.is_file() else {}, scene)
+        return depth_in(benchmark, read_toml(benchmark) if benchmark.is_file() else {}, scene)
 
     def preset(self, name: str) -> Path:
         """A preset by its file or by its name in presets/; the file may not be there."""
@@ -93,8 +104,9 @@ class Project:
         return named if named.exists() and not given.exists() else given
 
 
-def depth_in(preset: dict, scene: SceneFile) -> int:
-    """The ``max_depth`` at which a preset, as read from TOML, renders a scene: its own, else that of all
-    scenes, else that of the scene's file."""
-    own = preset.get("scene", {}).get(scene.name, {})
-    return (preset | own).get("max_depth") or scene.max_depth
+def depth_in(file: Path, preset: dict, scene: SceneFile) -> int:
+    """The ``max_depth`` at which a preset, as read from a TOML ``file``, renders a scene: its own, else that
+    of all scenes, else that of the scene's file; raises ``CommandError`` for what is no such number."""
+    own = table_of(file, "scene", preset.get("scene", {})).get(scene.name, {})
+    merged = preset | table_of(file, f"scene.{scene.name}", own)
+    return whole_of(file, "max_depth", merged["max_depth"]) if "max_depth" in merged else scene.max_depth

@@ -3,9 +3,9 @@
 A row for each path length of k = 2, 3, ... edges with the k + 2 ways (s, t) to make such paths, s light
 vertices and t camera vertices, brightened by 2^(k-1); strategies that contribute nothing are left out.
 
-Written are OUTPUT.exr, with the image and the layers ``weighted.s{S}t{T}.R`` ... and
-``unweighted.s{S}t{T}.R`` ..., OUTPUT.png, the image, and the pyramids OUTPUT_weighted.png, which adds up to
-the image, and OUTPUT_unweighted.png, in which each panel is an estimate by itself.
+Written are, by ``-o NAME.exr``, that file with the image and the layers ``weighted.s{S}t{T}.R`` ... and
+``unweighted.s{S}t{T}.R`` ..., NAME.png, the image, and the pyramids NAME_weighted.png, which adds up to
+the image, and NAME_unweighted.png, in which each panel is an estimate by itself.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from ..files.images import check_output, write_images
+from ..files.images import check_channels, check_output, write_images
+from ..files.loading import choose_sensor
+from ..files.whole import replacing
 from .metrics import tone_map
 from .project import Project
 from .scenes import SceneFile, integrator_of
+from .showing import amount
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -49,23 +52,28 @@ def render(file: SceneFile, options: Namespace):
     scene = file.load(options.resolution)
     parameters = {"type": "bdpt", "strategy_images": True, "heuristic": options.heuristic}
     integrator = integrator_of(parameters, options.max_depth)
-    image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
+    check_channels(choose_sensor(scene, 0).film(), integrator.aov_names())
+    with amount(f"{file.name}: samples per pixel", options.spp) as show:
+        integrator.on_pass = lambda report: show(report.spp_done)
+        image = np.array(integrator.render(scene, spp=options.spp, seed=options.seed))
     names = integrator.aov_names()
     return scene.sensors()[0].film(), {kind: technique_images(image, names, kind) for kind in KINDS}
 
 
 def panels(images: dict) -> dict:
-    """Those `technique_images` to which anything contributes, but for single edges."""
-    return {key: image for key, image in images.items() if key[0] >= SHORTEST and image.any()}
+    """Those `technique_images` to which anything contributes, but for single edges; raises ``CommandError``
+    if there are none."""
+    found = {key: image for key, image in images.items() if key[0] >= SHORTEST and image.any()}
+    if not found:
+        raise CommandError(
+            f"nothing to draw: no path of {SHORTEST} edges or more brings light; check the scene's lamps and "
+            "sensor, or take more samples by --spp"
+        )
+    return found
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """The pyramid as a picture: rows of path lengths, s rising to the right; raises ``CommandError`` if no
-    strategy contributes."""
-    if not found:
-        raise CommandError(
-            f"nothing to draw in {path.name}: no path of {SHORTEST} edges or more brings light"
-        )
+    """The pyramid as a picture: rows of path lengths, s rising to the right."""
     lengths = sorted({k for k, _, _ in found})
     rows = [[key for key in found if key[0] == k] for k in lengths]
     columns = max(len(row) for row in rows)
@@ -86,7 +94,8 @@ def draw(found: dict, path: Path, exposure: float):
             axis.set_axis_off()
         text = f"k = {lengths[i]}\n{2 ** (lengths[i] - 1)}x"
         figure.text(0.05 / wide, bottom + 0.5 / len(rows), text, fontsize=8)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110, format="png")
     plt.close(figure)
 
 
@@ -97,14 +106,15 @@ def run(options: Namespace) -> int:
     mi.set_variant("llvm_ad_rgb")
     project = Project(options.project)
     file = project.scene(options.scene)
-    output = options.output.with_suffix("") if options.output else project.renders / f"pyramid_{file.name}"
-    image = output.with_name(f"{output.name}.exr")
-    pictures = {kind: output.with_name(f"{output.name}_{kind}.png") for kind in KINDS}
-    for path in (image, *pictures.values()):
-        check_output(path, path.suffix)
+    image = options.output or project.renders / f"pyramid_{file.name}.exr"
+    pictures = {kind: image.with_name(f"{image.stem}_{kind}.png") for kind in KINDS}
+    check_output(image, ".exr")
+    for path in pictures.values():
+        check_output(path, ".png")
     film, images = render(file, options)
+    shown = {kind: panels(images[kind]) for kind in KINDS}
     write_images(film, image, {"heuristic": options.heuristic}, options.exposure)
     for kind, path in pictures.items():
-        draw(panels(images[kind]), path, options.exposure)
+        draw(shown[kind], path, options.exposure)
         print(path)
     return 0

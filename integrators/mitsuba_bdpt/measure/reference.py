@@ -51,16 +51,25 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
     return project.references / f"{name}_{resolution}_{max_depth}.exr"
 
 
+def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
+    """The command line that makes the reference of the scene that is ``called`` so, or goes on with it."""
+    words = ["reference", called, "--resolution", str(resolution), "--max-depth", str(max_depth), *more]
+    return project.command(*words)
+
+
 def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
     """The stored reference; raises ``CommandError`` with the command that makes it, if there is none, and
     if it was made of another version of the scene's file."""
     path = reference_path(project, scene.name, resolution, max_depth)
-    make = f"mitsuba-bdpt reference {project.called(scene)} --resolution {resolution} --max-depth {max_depth}"
+    make = make_command(project, project.called(scene), resolution, max_depth)
     if not path.is_file():
         raise CommandError(
             f"no reference for scene={scene.name!r} at {resolution} and depth {max_depth}; {make}"
         )
-    found = read_reference(path)
+    try:
+        found = read_reference(path)
+    except CommandError as error:
+        raise CommandError(f"{error}, by {make}") from error
     if found.provenance["scene_sha256"] != scene.sha256:
         raise CommandError(
             f"the reference {path.name} was made of another {scene.name}.xml, mesh or texture; {make}"
@@ -68,11 +77,22 @@ def load_reference(project: Project, scene: SceneFile, resolution: int, max_dept
     return found
 
 
+def too_few(name: str, make: str) -> str:
+    """What is said of a reference without `Means`, and the command that goes on with it."""
+    return f"the reference of {name} has too few renders for a bias check; go on by {make}"
+
+
 def read_reference(path: Path) -> Reference:
-    """The reference in a file, whatever scene it was made of."""
+    """The reference in a file, whatever scene it was made of; raises ``CommandError`` if it is none."""
     (image, difference), header = read_layers(path, "", "difference.")
-    provenance = json.loads(header["provenance"])
-    return Reference(image, difference, means_of(provenance["means"]), provenance)
+    try:
+        provenance = json.loads(header["provenance"])
+        means = means_of(provenance["means"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CommandError(
+            f"{str(path)!r} is no reference: it does not say what made it; delete it, to make it anew"
+        ) from error
+    return Reference(image, difference, means, provenance)
 
 
 def write(path: Path, reference: Reference):

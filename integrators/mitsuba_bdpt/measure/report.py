@@ -18,7 +18,8 @@ import numpy as np
 import pyarrow.parquet
 
 from ..errors import CommandError
-from ..files.texts import read_toml, write_text
+from ..files.texts import list_of, read_json, read_toml, text_of, write_text
+from ..files.whole import check_own
 from . import figures
 from .analysis import (
     ALONE,
@@ -40,7 +41,7 @@ from .analysis import (
 )
 from .metrics import rel_mse_epsilon
 from .project import Project
-from .reference import read_reference, reference_path
+from .reference import make_command, read_reference, reference_path, too_few
 from .scenes import digest
 from .tables import ranged, ratio, said, table
 
@@ -52,7 +53,7 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
         rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
     except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
         raise CommandError(
-            f"{folder}: rows.parquet is missing or not whole; run mitsuba-bdpt sweep PRESET -o {folder}"
+            f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
         ) from error
     made, digests = {}, {}
     for row in rows:
@@ -68,16 +69,20 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
         if row["reference_sha256"] != digests[scene]:
             raise CommandError(
                 f"{folder}: the errors in {scene} were taken against another reference; run "
-                "mitsuba-bdpt sweep again, which takes them anew"
+                f"{project.sweep_command(folder)}, which takes them anew"
             )
     if without := [scene for scene, kept in made.items() if kept.means is None]:
-        raise CommandError(
-            f"{folder}: the reference of {without[0]} has too few renders for a bias check; go on with "
-            "mitsuba-bdpt reference"
-        )
+        raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
     file = folder / "probes.json"
-    measured = json.loads(file.read_text()) if file.exists() else {}
+    measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
     return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made
+
+
+def _reference_command(project: Project, rows: list[dict], scene: str) -> str:
+    """The command line that goes on with the reference of a scene, of which rows know the name alone."""
+    row = next(row for row in rows if row["scene"] == scene)
+    called = scene if scene in project.scene_names() else f"{scene}.xml"
+    return make_command(project, called, row["resolution"], row["max_depth"])
 
 
 def efficiency_table(results: Results) -> str:
@@ -420,6 +425,30 @@ GOALS = {
     "memory": _memory,
 }
 
+OF_A_SCENE = ("efficiency", "efficiency raw", "near one", "alone", "cost", "pilot")
+"""Those that take a scene."""
+
+
+def checked_goals(file: Path, data: dict) -> list[dict]:
+    """The entries [[goal]] of goals.toml; raises ``CommandError`` for what is no goal."""
+    if not data:
+        return []
+    goals = list_of(file, "goal", data.get("goal"), dict, "tables: write [[goal]] and the keys of each below")
+    for goal in goals:
+        for key in ("what", "at_least"):
+            text_of(file, f"{key} of a [[goal]]", goal.get(key))
+        for key in {"aim", "tried"} & set(goal):
+            text_of(file, f"{key} of {goal['what']!r}", goal[key])
+        measure, scene = goal.get("measure"), goal.get("scene")
+        if measure is not None and measure not in tuple(GOALS):
+            raise CommandError(
+                f"{file}: measure={measure!r} of {goal['what']!r} must be one of {sorted(GOALS)}"
+            )
+        if measure is not None and (scene is not None) != (measure in OF_A_SCENE):
+            needs = "needs a scene" if scene is None else "is no figure of one scene: leave out scene"
+            raise CommandError(f"{file}: measure={measure!r} of {goal['what']!r} {needs}")
+    return goals
+
 
 def goals_table(results: Results, goals) -> str:
     """What is asked for beside what is measured."""
@@ -476,11 +505,15 @@ def machine(results: Results) -> str:
     return f"{text}, source {main}{named}"
 
 
+MARK = "Made by `mitsuba-bdpt report`"
+"""What every report has in it."""
+
+
 def _introduction(results: Results) -> str:
     """What the figures are, and where they were measured."""
     return f"""# Benchmark
 
-Made by `mitsuba-bdpt report` from the data beside it. Machine and versions: {machine(results)}.
+{MARK} from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
@@ -547,10 +580,13 @@ def run(options: Namespace) -> int:
     """Write the report that the command line ``options`` ask for."""
     project = Project(options.project)
     folder = project.results(options.folder)
+    check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")
     results, made = load(project, folder)
     files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
     kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
-    goals, notes = kept["goals"].get("goal", []), kept["notes"]
+    goals, notes = checked_goals(files["goals"], kept["goals"]), kept["notes"]
+    for scene, text in notes.items():
+        text_of(files["notes"], scene, text)
     write_text(folder / "README.md", page(results, made, goals, notes))
     if results.rivals:
         figures.efficiencies(results, results.rivals, folder / "efficiency.png")

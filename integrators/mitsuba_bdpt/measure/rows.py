@@ -13,7 +13,7 @@ import pyarrow.parquet
 
 from ..errors import CommandError
 from ..files.images import read_layers, write_layers
-from ..files.texts import write_json
+from ..files.texts import read_json, write_json
 from ..files.whole import replacing
 from . import agreement, analysis, metrics
 from .cells import FIRST_SEED, Cell, Cells
@@ -84,40 +84,46 @@ def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
         file = cell_file(output, cell)
         if not file.exists():
             continue
-        row = _read(file)
+        row = read_json(file, "delete it, to render it anew")
         if not path.exists() or row["reference_sha256"] != digest(path):
-            (image,), _ = read_layers(image_file(output, cell), "")
+            image = _image(output, cell)
             row |= errors(image, *judge_of(*cells.where()), cell.seed == FIRST_SEED)
             write_json(file, row)
         found.append(row)
     return found
 
 
-def _read(file: Path) -> dict:
+def _image(output: Path, cell: Cell) -> np.ndarray:
+    """That of a finished cell; raises ``CommandError`` if it is gone."""
     try:
-        return json.loads(file.read_text())
-    except ValueError as error:
-        raise CommandError(f"{str(file)!r} is damaged ({error}); delete it, to render it anew") from error
+        (image,), _ = read_layers(image_file(output, cell), "")
+    except (OSError, CommandError) as error:
+        file = str(cell_file(output, cell))
+        raise CommandError(f"{error}: delete {file!r} too, to render the image anew") from error
+    return image
 
 
-def rows(preset: Preset, scenes: list[Cells], output: Path) -> list[dict]:
-    """The rows of all finished cells of the ``preset``, in its order; ``scenes``: its cells of each.
+def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
+    """The rows of all finished ``cells`` of a scene of the ``preset``, in its order.
 
     (Those that were rendered: the cells of a source that was edited meanwhile have other names.)
     """
-    found = []
-    for cells in scenes:
-        wanted = {c.key: c for c in cells.planned()}
-        if cells.more is not None:
-            wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
-        found += read_rows(output, cells, wanted.values())
+    wanted = {c.key: c for c in cells.planned()}
+    if cells.more is not None:
+        wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
+    found = read_rows(output, cells, wanted.values())
     return [row | {"first": preset.methods[0].name} for row in found]
 
 
 def beside(table: list[dict], preset: Preset, output: Path) -> list[dict]:
     """``table`` and the rows of other scenes of the ``preset`` that OUTPUT/rows.parquet has, as they are."""
     file, done = output / "rows.parquet", {row["scene"] for row in table}
-    others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
+    try:
+        others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
+    except pyarrow.ArrowInvalid as error:
+        raise CommandError(
+            f"{str(file)!r} is damaged ({error}); run the sweep without --scenes, which writes it anew"
+        ) from error
     order = [subject.name for subject in preset.subjects]
     found = table + [row for row in others if row["scene"] in order and row["scene"] not in done]
     return sorted(found, key=lambda row: order.index(row["scene"]))

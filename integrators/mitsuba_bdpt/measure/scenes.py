@@ -43,9 +43,20 @@ class SceneFile:
             _resize(scene, resolution)
         return scene
 
+    def film(self, resolution: int | None = None):
+        """The film of the first sensor; raises ``CommandError`` for one without colours, which no measure of
+        errors takes."""
+        film = choose_sensor(self.load(resolution), 0).film()
+        if film.base_channels_count() < 3:
+            raise CommandError(
+                f"scene={str(self.file)!r}: its film has no colours, of which errors are taken; write "
+                'pixel_format "rgb" into the scene file'
+            )
+        return film
+
     def size(self, resolution: int | None = None) -> tuple[int, int]:
         """Width and height of the image."""
-        width, height = choose_sensor(self.load(resolution), 0).film().size()
+        width, height = self.film(resolution).size()
         return int(width), int(height)
 
     @cached_property

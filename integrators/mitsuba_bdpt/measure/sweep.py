@@ -3,11 +3,12 @@
 Presets (see `preset`) say what is rendered. For each scene, budget and seed all integrators follow one
 another, so that a noisy machine is noisy for all. Every finished render is a file of its own in OUTPUT/cells,
 named after a hash of all that determines it (parameters, scene, versions, the plugin's source), and is not
-rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the next time.
-Errors are taken against the references of `making`, which are made first where there are none, and anew when
-a reference has become better; HDR-FLIP for the first seed alone, since it takes longer than most renders. On
-a cluster, renders that follow one another go to one worker together, which renders them one after the other;
-workers see the project under the same path, and have the same software. Probes are left out there.
+rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the next time,
+and so is a scene of which no reference can be made. Errors are taken against the references of `making`,
+which are made first where there are none, and anew when a reference has become better; HDR-FLIP for the first
+seed alone, since it takes longer than most renders. On a cluster, renders that follow one another go to one
+worker together, which renders them one after the other; workers see the project under the same path, and have
+the same software. Probes are left out there.
 OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what `probes` measure.
 """
 
@@ -20,19 +21,20 @@ from itertools import groupby
 from pathlib import Path
 
 import mitsuba as mi
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress, TaskID
 
 from .. import workers
 from ..errors import CommandError, message
 from ..files.images import check_output
-from ..files.texts import write_json
+from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
-from . import analysis, probes
+from . import analysis, probes, showing
 from .bench import Bench, measure, measured
 from .cells import Cell, Cells, machine, software
-from .making import Job, obtained
+from .making import Job, check, obtained
 from .preset import Preset, read_preset
 from .project import Project
+from .reference import load_reference, make_command, too_few
 from .rows import beside, cell_file, judge_of, read_rows, rows, store, write_tables
 from .scenes import check_plugins
 
@@ -49,13 +51,39 @@ class Sweep:
 
     def prepare(self, seconds: float):
         """Complain of what cannot be rendered before hours of rendering, not after, and make references that
-        are missing, each for at most about so many ``seconds``."""
-        for cells, missing in zip(self.scenes, self._todo, strict=True):
+        are missing, each for at most about so many ``seconds``. A scene without one is left out, and noted in
+        ``failed``: one scene must not cost the others."""
+        wanted = [(cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing]
+        for cells, missing in wanted:
             for method in {cell.method: cell for cell in missing}.values():
                 check_plugins(method.method, dict(method.parameters), method.sampler, cells.subject.max_depth)
-        for cells, missing in zip(self.scenes, self._todo, strict=True):
-            if missing:
-                obtained(Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds))
+        jobs = [Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds) for cells, _ in wanted]
+        for job in jobs:
+            check(job)
+        lost = []
+        for (cells, _), job in zip(wanted, jobs, strict=True):
+            try:
+                obtained(job)
+            except Exception as error:
+                self._note(f"{job.scene.name}: left out", error)
+                lost.append(cells)
+        kept = [i for i, cells in enumerate(self.scenes) if cells not in lost]
+        self.scenes, self._todo = [self.scenes[i] for i in kept], [self._todo[i] for i in kept]
+
+    def _note(self, what: str, error: Exception):
+        """Keep a failure for the end; raises ``KeyboardInterrupt`` if it is none."""
+        raise_interrupt(error)
+        self.failed.append(f"{what}: {' '.join(message(error).split())}")
+
+    def rows(self) -> list[dict]:
+        """The rows of all finished cells; scenes of which they cannot be read are noted in ``failed``."""
+        found = []
+        for cells in self.scenes:
+            try:
+                found += rows(self.preset, cells, self.output)
+            except Exception as error:
+                self._note(f"{cells.subject.name}: no rows", error)
+        return found
 
     def run(self, progress: Progress, elsewhere=None):
         """Render all that is not there yet, showing ``progress``; on a cluster if ``elsewhere``, a client and
@@ -77,7 +105,7 @@ class Sweep:
 
     def _probes(self):
         file = self.output / "probes.json"
-        kept = json.loads(file.read_text()) if file.exists() else {}
+        kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
         for name, rounds in self.preset.probes.items():
             self._progress.update(self._task, description=name)
             key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
@@ -95,8 +123,7 @@ class Sweep:
         try:
             self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not cost the others
-            raise_interrupt(error)
-            self.failed.append(f"{_description(cell)}: {message(error)}")
+            self._note(_description(cell), error)
         self._progress.advance(self._task)
 
     def _store(self, cells: Cells, cell: Cell, result):
@@ -175,8 +202,49 @@ def chosen(preset: Preset, names) -> Preset:
     return replace(preset, subjects=subjects, probes={})
 
 
+def poor_reference(cells: Cells, table: list[dict]) -> list[str]:
+    """What the report will refuse of the rows of a scene since its reference is too poor, as it says it, and
+    the command that goes on with the reference."""
+    rows = analysis.select(table, scene=cells.subject.name)
+    if not rows:
+        return []
+    project, scene, resolution, depth = cells.where()
+    words = "--spp", str(max(cells.subject.spp))
+    make = make_command(project, project.called(scene), resolution, depth, *words)
+    found = []
+    if load_reference(*cells.where()).means is None:
+        found.append(too_few(scene.name, make))
+    if refused := analysis.unjudged(rows):
+        (method, budget), worst = max(refused.items(), key=lambda item: item[1].share)
+        others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
+        found.append(
+            f"{scene.name}: no figure of {method} at {budget} spp{others} will be judged. {worst} To go on: "
+            f"{make}"
+        )
+    return found
+
+
+def short_of_target(table: list[dict]) -> list[str]:
+    """A text about each integrator whose renders, of those in the ``table``, ended before they reached the
+    target error that the preset asks for."""
+    renders = {}
+    for row in table:
+        parameters = json.loads(row["parameters"])
+        target = parameters.get("target_error", parameters.get("until_error", 0))
+        if target > 0:
+            key = row["scene"], row["budget"], row["method"], target
+            error = json.loads(row["statistics"])["error"]
+            renders.setdefault(key, []).append(error is None or not error <= target)
+    return [
+        f"{scene}, {budget} spp, {method}: {sum(short)} of {len(short)} renders did not reach "
+        f"target_error={target:g}"
+        for (scene, budget, method, target), short in renders.items()
+        if any(short)
+    ]
+
+
 def run(options: Namespace) -> int:
-    """Sweep as the command line ``options`` say; the exit status is 1 if a cell failed."""
+    """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
     mi.set_variant("llvm_ad_rgb")
     project = Project(options.project)
     file = project.preset(options.preset)
@@ -186,17 +254,19 @@ def run(options: Namespace) -> int:
     check_output(output / "rows.csv", ".csv")  # complain before hours of rendering, not after
     sweep = Sweep(project, preset, output)
     sweep.prepare(options.reference_seconds)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as progress:
+    with showing.bar() as progress:
         if options.scheduler:
             with workers.connected(options.scheduler) as client:
                 sweep.run(progress, (client, file.read_text()))
         else:
             sweep.run(progress)
-    table = rows(preset, sweep.scenes, output)
+    table = sweep.rows()
     if options.scenes:
         table = beside(table, whole, output)
     if table:
         write_tables(table, output)
     print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
+    poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
+    for text in [*short_of_target(table), *poor]:
+        print(f"warning: {text}")
     return 1 if sweep.failed else 0

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from .analysis import NotJudged, Refused, Summary
+from .efficiency import refused_share
 
 
 def table(head, rows) -> str:
-    """A Markdown table."""
+    """A Markdown table; bars and ends of lines in a name or a text do not end a cell."""
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return "".join("| " + " | ".join(map(_cell, line)) + " |\n" for line in lines)
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split("\n")).replace("|", "\\|")
 
 
 def ratio(x: float) -> str:
@@ -26,6 +31,6 @@ def said(figure, form=ranged) -> str:
     try:
         return form(figure())
     except NotJudged as why:
-        return f"not judged: reference {100 * why.share:.2g} %"
+        return f"not judged: reference {refused_share(why.share, 2)}"
     except Refused as why:
         return str(why)
