@@ -33,8 +33,7 @@ class CommandError(UsageError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The question for the one of the ``known`` names that ``name`` is most like, with a space after it;
-    empty if none is."""
+    """The question for the most similar of the ``known`` names, and a space; empty if none is similar."""
     by_case = {other.lower(): other for other in known}
     near = difflib.get_close_matches(name.lower(), by_case, 1)
     return f"did you mean {by_case[near[0]]}? " if near else ""
