@@ -51,8 +51,10 @@ class Project:
         return sorted(path.stem for path in self.scenes.glob("*.xml"))
 
     def scene(self, name: str) -> SceneFile:
-        """A scene by its name, or by its file, seen from here or from the project's folder; raises
-        ``CommandError`` that says what there is if there is none."""
+        """A scene by its name, or by its file, seen from here or from the project's folder.
+
+        Raises ``CommandError`` that says what there is if there is none.
+        """
         for file in (Path(name), self.scenes / f"{name}.xml", self.root / name):
             if file.is_file():
                 return SceneFile(file.stem, file)
@@ -75,8 +77,10 @@ class Project:
         return text.rstrip("; ")
 
     def depth(self, scene: SceneFile) -> int:
-        """The ``max_depth`` at which a scene is rendered unless said: that of presets/benchmark.toml if there
-        is one, else that of the scene's file."""
+        """The ``max_depth`` at which a scene is rendered unless said.
+
+        That of presets/benchmark.toml if there is one, else that of the scene's file.
+        """
         benchmark = self.root / "presets" / "benchmark.toml"
         return depth_in(read_toml(benchmark) if benchmark.is_file() else {}, scene)
 
@@ -94,7 +98,9 @@ class Project:
 
 
 def depth_in(preset: dict, scene: SceneFile) -> int:
-    """The ``max_depth`` at which a preset, as read from TOML, renders a scene: its own, else that of all
-    scenes, else that of the scene's file."""
+    """The ``max_depth`` at which a preset, as read from TOML, renders a scene.
+
+    Its own, else that of all scenes, else that of the scene's file.
+    """
     own = preset.get("scene", {}).get(scene.name, {})
     return (preset | own).get("max_depth") or scene.max_depth

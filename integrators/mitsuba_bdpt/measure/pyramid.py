@@ -33,8 +33,11 @@ SHORTEST = 2  # edges: of single ones the emitters themselves are seen
 
 
 def technique_images(image, names: list, kind: str) -> dict:
-    """``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``, shape of ``image`` (..., 3),
-    out of a render whose last channels have these ``names``."""
+    """``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``.
+
+    They have the shape of ``image`` (..., 3), and come out of a render whose last channels have these
+    ``names``.
+    """
     first = image.shape[-1] - len(names)
     found = {}
     for i, name in enumerate(names):
@@ -60,8 +63,10 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """The pyramid as a picture: rows of path lengths, s rising to the right; raises ``CommandError`` if no
-    strategy contributes."""
+    """Draw the pyramid as a picture: rows of path lengths, s rising to the right.
+
+    Raises ``CommandError`` if no strategy contributes.
+    """
     if not found:
         raise CommandError(
             f"nothing to draw in {path.name}: no path of {SHORTEST} edges or more brings light"

@@ -48,8 +48,10 @@ class Sweep:
         self._progress, self._task = Progress(), TaskID(0)  # those of `run`, until then shown nowhere
 
     def prepare(self, seconds: float):
-        """Complain of what cannot be rendered before hours of rendering, not after, and make references that
-        are missing, each for at most about so many ``seconds``."""
+        """Complain of what cannot be rendered, and make references that are missing.
+
+        Before hours of rendering, not after; each reference for at most about so many ``seconds``.
+        """
         for cells, missing in zip(self.scenes, self._todo, strict=True):
             for method in {cell.method: cell for cell in missing}.values():
                 check_plugins(method.method, dict(method.parameters), method.sampler, cells.subject.max_depth)
@@ -58,8 +60,10 @@ class Sweep:
                 obtained(Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds))
 
     def run(self, progress: Progress, elsewhere=None):
-        """Render all that is not there yet, showing ``progress``; on a cluster if ``elsewhere``, a client and
-        the preset's text, is given."""
+        """Render all that is not there yet, showing ``progress``.
+
+        On a cluster if ``elsewhere``, a client and the preset's text, is given.
+        """
         scenes, todo = self.scenes, self._todo
         probed = 0 if elsewhere else len(self.preset.probes)
         self._progress = progress
