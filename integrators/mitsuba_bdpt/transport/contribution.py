@@ -67,8 +67,10 @@ def roulette(
 
 
 def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool:
-    """Mask: a strategy of this ``value`` and weight is worth a ray, or has to be counted by `finite` (of what
-    is not finite the weight may be 0). Technique images show unweighted ones too."""
+    """Mask: a strategy of this ``value`` and weight is worth a ray, or has to be counted by `finite`.
+
+    Of what is not finite the weight may be 0. Technique images show unweighted ones too.
+    """
     return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 
