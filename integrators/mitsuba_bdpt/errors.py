@@ -32,8 +32,7 @@ class CommandError(UsageError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The question for the one of the ``known`` names that ``name`` is most like, with a space after it;
-    empty if none is."""
+    """The question for the most similar of the ``known`` names, and a space; empty if none is similar."""
     import difflib  # which takes 5 ms, and only mistakes need it
 
     by_case = {other.lower(): other for other in known}

@@ -63,8 +63,10 @@ says so.
 
 
 def _without_gradients(method):
-    """``method``, undisturbed by parameters with gradients, be they of other scenes: virtual calls visit
-    these too, and Dr.Jit cannot differentiate local memory."""
+    """``method``, undisturbed by parameters with gradients, be they of other scenes.
+
+    Virtual calls visit these too, and Dr.Jit cannot differentiate local memory.
+    """
 
     @wraps(method)
     def undisturbed(*args, **kwargs):
@@ -290,8 +292,10 @@ _classes = {}
 
 
 def _class_of_variant():
-    """The plugin's class for the current variant, of which Mitsuba's base class is another in each; it allows
-    no second base."""
+    """The plugin's class for the current variant.
+
+    Mitsuba's base class is another one in each variant, and allows no second base.
+    """
     own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in ("__dict__", "__weakref__")}
     return type(mi.SamplingIntegrator)(
         "BDPTIntegrator", (mi.SamplingIntegrator,), own | {"__doc__": DOCUMENTATION}

@@ -154,8 +154,10 @@ def _check_layers(settings: Settings):
 
 
 def _given(props) -> dict:
-    """The parameters that are given, by their present names; raises ``UsageError`` for those that do not
-    exist or are given twice."""
+    """The parameters that are given, by their present names.
+
+    Raises ``UsageError`` for those that do not exist or are given twice.
+    """
     given = {}
     for name in props.keys():
         present = ALIASES.get(name, name)
@@ -263,8 +265,11 @@ def check_scene(scene, sensor):
 
 
 def check_film(sensor, settings: Settings):
-    """Raise ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without
-    pixels or too large; returns its colours."""
+    """Check that the film can have the layers asked for; returns its colours.
+
+    Raises ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without pixels
+    or too large.
+    """
     colour = film_colours(sensor)
     if settings.strategy_images and isinstance(colour, Bands):
         raise UnsupportedError(

@@ -13,10 +13,12 @@ one_at_a_time = threading.Lock()
 
 
 def results(client, function, arguments):
-    """Index and result of ``function(*arguments[index])`` as they come from the workers of a
-    ``distributed.Client``, each index once. A worker has one call at a time; where none are left to begin,
-    idle ones take over calls that others still have, so that one slow machine does not hold up the rest: a
-    call has to give the same wherever it runs. That of a lost worker is made by another one."""
+    """Index and result of ``function(*arguments[index])``, each index once, as they come from the workers.
+
+    The workers are those of a ``distributed.Client``. A worker has one call at a time; where none are left to
+    begin, idle ones take over calls that others still have, so that one slow machine does not hold up the
+    rest: a call has to give the same wherever it runs. That of a lost worker is made by another one.
+    """
     from distributed import as_completed
 
     to_do, running, done = deque(range(len(arguments))), {}, set()
@@ -63,8 +65,11 @@ def worker_count(client) -> int:
 
 @contextmanager
 def connected(address: str):
-    """A ``distributed.Client`` of the scheduler at ``address``. Raises ``CommandError`` if distributed is not
-    installed or the scheduler has no worker, ``OSError`` if there is no such scheduler."""
+    """A ``distributed.Client`` of the scheduler at ``address``.
+
+    Raises ``CommandError`` if distributed is not installed or the scheduler has no worker, ``OSError`` if
+    there is no such scheduler.
+    """
     try:
         from distributed import Client
     except ImportError as error:

@@ -91,8 +91,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what ``render`` and ``explain`` need of a scene; letters and ``-D``, ``-s``, ``-m`` as in
-    Mitsuba."""
+    """Declare what ``render`` and ``explain`` need of a scene; ``-D``, ``-m`` and ``-s`` as in Mitsuba."""
     add = parser.add_argument
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")

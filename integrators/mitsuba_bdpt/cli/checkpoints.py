@@ -31,8 +31,10 @@ def digest(options: Namespace) -> str:
 
 
 def check(options: Namespace, output: Path) -> None:
-    """Raise ``CommandError`` if a checkpoint would be overwritten unasked, ``OSError`` if none can be
-    written."""
+    """Raise an error if the checkpoint would overwrite another one unasked, or cannot be written.
+
+    ``CommandError`` if it would overwrite one, ``OSError`` if none can be written.
+    """
     path = path_of(output)
     if options.checkpoint is not None:
         check_writable(path)
@@ -71,8 +73,10 @@ class Checkpoints:
             self.write()
 
     def write(self) -> None:
-        """Write what the last report knows, if there was one. A full disk must not cost the render: it is
-        said on standard error, and the former checkpoint stays."""
+        """Write what the last report knows, if there was one.
+
+        A full disk must not cost the render: it is said on standard error, and the former checkpoint stays.
+        """
         if self._report is None:
             return
         snapshot = self._report.snapshot()

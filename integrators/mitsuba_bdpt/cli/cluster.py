@@ -77,10 +77,12 @@ class Merged:
 
 
 def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]):
-    """Render as the command line ``options`` say on the cluster ``options.scheduler``, into the sensor's
-    film; returns the statistics, whose seconds are those of the pilot and all parts together, and whether
-    Ctrl-C came: then they are of the parts before the first one that had not come. ``on_part`` is called
-    after each part. Raises what `connected` does."""
+    """Render as the command line ``options`` say on a cluster, into the sensor's film.
+
+    The cluster is that of ``options.scheduler``; ``on_part`` is called after each part. Returns the
+    statistics, whose seconds are those of the pilot and all parts together, and whether Ctrl-C came: then
+    they are of the parts before the first one that had not come. Raises what `connected` does.
+    """
     started, merged, interrupted = time.perf_counter(), Merged(), False
     with connected(options.scheduler) as client:
         job = _job(scene, integrator, options, spp)
@@ -104,8 +106,10 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
 
 
 def _with_pilot(parts: dict, asked: dict) -> dict:
-    """Statistics of the ``parts``, which know the pilot's decisions alone, with what it left when it was
-    ``asked``; nothing where decisions were given by hand."""
+    """Statistics of the ``parts``, with what the pilot left when it was ``asked``.
+
+    The parts know the pilot's decisions alone. Nothing is added where decisions were given by hand.
+    """
     if not asked:
         return parts
     sums = {
@@ -116,8 +120,10 @@ def _with_pilot(parts: dict, asked: dict) -> dict:
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:
-    """What a worker needs to know of each part, as JSON: the scene file by its absolute path, the options
-    that `loading.load` reads, the pilot's decisions."""
+    """What a worker needs to know of each part, as JSON.
+
+    The scene file by its absolute path, the options that `loading.load` reads, the pilot's decisions.
+    """
     properties, settings = dict(options.properties), integrator.settings
     if settings.decisions is None:  # an empty list where there is nothing to choose
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
@@ -129,8 +135,10 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
 
 
 def render_part(job: str, seed: int, spp: int) -> bytes:
-    """On a worker: one part of a `_job`, as `Snapshot.to_bytes`. A process renders one part at a time, for
-    each takes all cores."""
+    """Render one part of a `_job` on a worker; returns it as `Snapshot.to_bytes`.
+
+    A process renders one part at a time, for each takes all cores.
+    """
     with one_at_a_time:
         options, scene, integrator = _loaded(job)
         mi.set_variant(options.variant)  # of this thread

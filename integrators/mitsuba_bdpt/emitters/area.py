@@ -28,10 +28,12 @@ _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.val
 
 @dataclass
 class _Sphere:
-    """How next-event estimation samples a sphere at ``center``: by area from within ``inner_radius``
-    (`quadrics.Sphere.inner_radius`); with the density of `quadrics.cone_pdf_w` if it has a ``cone_radius``,
-    the radius of one that may be so small that Mitsuba's own is wrong. 0 where that does not concern an
-    emitter."""
+    """How next-event estimation samples a sphere at ``center``.
+
+    By area from within ``inner_radius`` (`quadrics.Sphere.inner_radius`); with the density of
+    `quadrics.cone_pdf_w` if it has a ``cone_radius``, the radius of one that may be so small that Mitsuba's
+    own is wrong. 0 where that does not concern an emitter.
+    """
 
     center: mi.Vector3f | tuple = (0, 0, 0)
     inner_radius: mi.Float | float = 0.0
@@ -86,8 +88,10 @@ class AreaEmitters(Group):
     # -- densities of points ----------------------------------------------------------------
 
     def pdf_a(self, emitter, index, at, n, active):
-        """Density of emission's y_0 (area), without the selection. ``at`` has ``p``, ``uv``; ``n`` its
-        normal."""
+        """Density of y_0 in emission (area), without the selection.
+
+        ``at`` has ``p`` and ``uv``; ``n`` is its normal.
+        """
         density = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
         if not self.by_texture.any:
             return density
@@ -101,11 +105,12 @@ class AreaEmitters(Group):
         return dr.select(textured, emitter.pdf_direction(it, ds, textured), density)
 
     def direct_pdf_w(self, emitter, index, it, ds, active):
-        """Density with which next-event estimation at ``it`` samples ``ds`` (solid angle), without the
-        selection. Turns ``ds.n``, which callers build for this call alone.
+        """Density (solid angle) with which next-event estimation at ``it`` samples ``ds``.
 
-        A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon,
-        but its pdf_direction only up to the radius: wrong for points of the sphere itself.
+        Without the selection. Turns ``ds.n``, which callers build for this call alone.
+
+        A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon, but its
+        pdf_direction only up to the radius: wrong for points of the sphere itself.
         """
         # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
         ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
@@ -204,8 +209,10 @@ class AreaEmitters(Group):
         )
 
     def _corrected(self, chosen, ds, weight, si, u, active):
-        """Mitsuba's sample, its density (solid angle, over the cosine with the shading normal) and weight,
-        where they are right; others elsewhere."""
+        """A sample of next-event estimation and its weight: Mitsuba's where these are right, else others.
+
+        The density is over solid angle, with the cosine of the shading normal in its denominator.
+        """
         emitter, index = chosen.emitter, chosen.index
         if self._by_shape.any:
             mask = self._by_shape.at(index, active)
@@ -233,8 +240,11 @@ class AreaEmitters(Group):
 
 
 def _sample_shape(emitter, ps, si, active):
-    """Next-event estimation by the uniform point ``ps`` of the emitter's shape, in Mitsuba's conventions: the
-    density is over the cosine with the shading normal, the weight is radiance over density."""
+    """Sample of next-event estimation by the uniform point ``ps`` of the emitter's shape, and its weight.
+
+    In Mitsuba's conventions: the density is over the cosine with the shading normal, the weight is radiance
+    over density.
+    """
     ds = dr.zeros(mi.DirectionSample3f)
     ds.p, ds.n, ds.uv, ds.time, ds.emitter = ps.p, ps.n, ps.uv, si.time, emitter
     between = ps.p - si.p

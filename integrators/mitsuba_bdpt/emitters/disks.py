@@ -35,8 +35,10 @@ AIMED = 0.5
 
 @dataclass
 class BoundingSphere:
-    """A sphere whose outline is a disk: ``center`` and ``radius``, which Dr.Jit may exchange without
-    compiling anew."""
+    """A sphere whose outline is a disk: ``center`` and ``radius``.
+
+    Dr.Jit may exchange both without compiling anew.
+    """
 
     center: mi.Point3f
     radius: mi.Float
@@ -60,8 +62,11 @@ class BoundingSphere:
 
 
 class Disks:
-    """Disks of a scene: ``scene`` the `BoundingSphere` about all shapes (a unit sphere if no shape has a
-    finite box), ``details`` that about its details, or None if it has none."""
+    """Disks of a scene: outlines of ``scene`` and ``details``, as `BoundingSphere` objects.
+
+    ``scene`` is the sphere about all shapes (a unit sphere if no shape has a finite box), ``details`` that
+    about the scene's details, or None if it has none.
+    """
 
     def __init__(self, scene):
         each, box = boxes(scene), mi.ScalarBoundingBox3f()
@@ -87,8 +92,10 @@ class Disks:
         return p, self._pdf_a(p, d, aimed)
 
     def pdf_a(self, p, d):
-        """Density with which a subpath along ``d`` passes ``p`` (area across ``d``). Without details ``p`` is
-        taken to be a point of the scene, else it may be anywhere."""
+        """Density with which a subpath along ``d`` passes ``p`` (area across ``d``).
+
+        Without details ``p`` is taken to be a point of the scene, else it may be anywhere.
+        """
         return self._pdf_a(p, d, None)
 
     def _pdf_a(self, p, d, aimed):
@@ -102,8 +109,10 @@ class Disks:
         )
 
     def covers(self, p, d):
-        """Mask: light that travels along ``d`` from infinity passes ``p`` on its way from a point where its
-        subpaths start. Points of a shape are all covered."""
+        """Mask: light from infinity along ``d`` passes ``p`` after a point where its subpaths start.
+
+        Points of a shape are all covered.
+        """
         passed = self.scene.is_passed(p, d)
         if self.details is not None:
             passed |= self.details.is_passed(p, d)
@@ -111,8 +120,11 @@ class Disks:
 
 
 def boxes(scene) -> list:
-    """Valid bounding boxes of the shapes. Of meshes that Mitsuba merges when it loads a scene, ``bbox`` is
-    that of one part; with a vertex that is not finite it is invalid, though rays meet other triangles."""
+    """Valid bounding boxes of the shapes; of meshes those of their finite vertices.
+
+    Of meshes that Mitsuba merges when it loads a scene, ``bbox`` is that of one part; with a vertex that is
+    not finite it is invalid, though rays meet other triangles.
+    """
     found = []
     for shape in scene.shapes():
         box = mi.ScalarBoundingBox3f(shape.bbox())
@@ -129,8 +141,11 @@ def boxes(scene) -> list:
 
 
 def details(found: list, whole):
-    """Bounding sphere of those `boxes` that are small beside the box of the ``whole`` scene; None if there
-    are none, or if they are spread over it."""
+    """Bounding sphere of those `boxes` that are small beside the box of the ``whole`` scene.
+
+    None if there are none, if they are spread over it (`LOCAL`), or if they are too small for rounding
+    (`TINY`).
+    """
     size = max(whole.extents())
     small = mi.ScalarBoundingBox3f()
     for box in found:

@@ -90,8 +90,10 @@ class Emitters:
         ]
 
     def _cannot_be_asked(self) -> bool:
-        """Whether `sample_position` cannot be called on emitters: a call visits every living one, those of
-        other scenes too, and classes of the user's need not have it."""
+        """Whether `sample_position` cannot be called on emitters.
+
+        A call visits every living one, those of other scenes too, and classes of the user's need not have it.
+        """
         if not any(is_third_party(name) for name in registered_emitters()):
             return False
         try:
@@ -205,8 +207,10 @@ class Emitters:
         )
 
     def radiance_towards(self, emission: Emission, d, active):
-        """What y_0 sends into direction ``d``: radiance, intensity (point) or irradiance (delta
-        direction), for y_0 joined with the sensor."""
+        """What y_0 sends into direction ``d``, for joining it with the sensor.
+
+        Radiance, intensity (point) or irradiance (delta direction).
+        """
         chosen = self._chosen(emission.index, active)
         return self._ask(
             lambda group, mask: group.radiance_towards(chosen, emission, d, mask),

@@ -14,8 +14,11 @@ from .records import Chosen, Direct, Emission, Hit
 
 @dataclass(frozen=True)
 class Context:
-    """What groups are made in: the ``scene``, the `rounding.ShapeErrors` of its shapes, and whether points on
-    shapes are asked of the shapes (``ask_shapes``) since emitters cannot be asked."""
+    """What groups of emitters are made in.
+
+    The ``scene``, the `rounding.ShapeErrors` of its shapes (``shape_errors``), and whether points on shapes
+    are asked of the shapes (``ask_shapes``) since emitters cannot be asked.
+    """
 
     scene: mi.Scene
     shape_errors: rounding.ShapeErrors
@@ -72,8 +75,11 @@ class Group:
         raise NotImplementedError(f"{type(self).__name__} has no direction_density")
 
     def connection_density(self, chosen: Chosen, emission: Emission, si, active):
-        """Density, selection included, of next-event estimation making y_0 of ``emission`` from its first hit
-        ``si``: in the measure of ``pdf_first``, times the squared length of the edge (1 at infinity)."""
+        """Density of next-event estimation making y_0 of ``emission`` from its first hit ``si``.
+
+        Selection included; in the measure of ``pdf_first``, times the squared length of the edge (1 at
+        infinity).
+        """
         raise NotImplementedError(f"{type(self).__name__} has no connection_density")
 
     def radiance_towards(self, chosen: Chosen, emission: Emission, d, active):
@@ -91,8 +97,10 @@ class Group:
         raise NotImplementedError(f"{type(self).__name__} has no complete_direct")
 
     def hit_densities(self, chosen: Chosen, hit: Hit, active):
-        """Densities, selection included, with which light-side strategies make the point that was hit, as
-        `Emitters.hit_densities` returns them."""
+        """Densities with which light-side strategies make the point that was hit.
+
+        Selection included; as `Emitters.hit_densities` returns them.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no hit_densities")
 
 
@@ -121,7 +129,9 @@ def free_emission(index, weight, d, pdf_first, pdf_second, delta, si) -> Emissio
 
 
 def weight_over(pmf, weight, pdf):
-    """The ``weight`` of a sample of next-event estimation over the probability ``pmf``; NaN, to be counted,
-    where its density ``pdf`` is not finite: no weight of strategies follows from it."""
+    """The ``weight`` of a sample of next-event estimation over the selection's probability ``pmf``.
+
+    NaN, to be counted, where its density ``pdf`` is not finite: no weight of strategies follows from it.
+    """
     weight = dr.select(pdf == 0, 0, weight / pmf)
     return dr.select(dr.isfinite(pdf), weight, dr.nan)

@@ -9,11 +9,11 @@ from .records import Chosen, Hit
 
 
 class HitOnlyEmitters(Group):
-    """Area lights that camera subpaths can hit, and no more: on shapes of which Mitsuba samples no points, or
-    with a radiance that only a hit has (attributes of a mesh).
+    """Area lights that camera subpaths can hit, and no more.
 
-    They may be chosen by emission and by next-event estimation, with the probability of their sampling
-    weight: the sample is black.
+    They are on shapes of which Mitsuba samples no points, or have a radiance that only a hit has (attributes
+    of a mesh). They may be chosen by emission and by next-event estimation, with the probability of their
+    sampling weight: the sample is black.
     """
 
     hittable = True

@@ -105,8 +105,11 @@ def _is_directional(emitter) -> bool:
 
 
 def contrast(emitter) -> float:
-    """The largest radiance of an environment over its mean; infinite for other emitters, and where that would
-    take long to find out, where the numbers of an ``envmap`` are not radiances, or none that has a ratio."""
+    """The largest radiance of an environment over its mean; infinite where that is not known.
+
+    Infinite, that is, for other emitters, and where it would take long to find out, where the numbers of an
+    ``envmap`` are not radiances, or none that has a ratio.
+    """
     kind = emitter.class_name()
     if kind == "ConstantBackgroundEmitter":
         return 1.0

@@ -43,8 +43,10 @@ def is_third_party(class_name: str) -> bool:
 
 
 def third_party_elsewhere(scene) -> int:
-    """How many emitters live outside of ``scene`` whose class is not Mitsuba's: virtual calls visit them
-    too."""
+    """How many emitters outside of ``scene`` are of a class that is not Mitsuba's.
+
+    Virtual calls visit them too.
+    """
     own = sum(is_third_party(emitter.class_name()) for emitter in scene.emitters())
     return sum(map(is_third_party, registered_emitters())) - own
 

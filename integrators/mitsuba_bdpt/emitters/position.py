@@ -19,9 +19,12 @@ from .tables import Mask, look_up, rows, table
 
 @dataclass
 class _Cone:
-    """Where an emitter is (``position``, world), the axes ``x``, ``y``, ``z`` of its cone (unit length), the
-    cosine of that's half angle, and the density ``pdf_w`` of a direction within (solid angle). All directions
-    for a point light. Of a projector ``position`` alone counts."""
+    """Position of an emitter and the cone into which it shines, all directions for a point light.
+
+    ``position`` (world); the axes ``x``, ``y``, ``z`` of the cone (unit length), the cosine ``cos_cutoff`` of
+    its half angle, and the density ``pdf_w`` of a direction within (solid angle). Of a projector ``position``
+    alone counts.
+    """
 
     position: mi.Vector3f | tuple = (0, 0, 0)
     x: mi.Vector3f | tuple = (1, 0, 0)

@@ -44,9 +44,11 @@ class Projectors:
 
 
 class _Projector:
-    """One projector: axes ``x``, ``y``, ``z`` (unit length), the affine map to ``uv`` and back, and the
-    texture that it chooses directions by, None where that would miss some: with ``to_uv`` Mitsuba's textures
-    sample another image than they show."""
+    """One projector: its axes, the affine map to ``uv`` and back, and the texture it chooses directions by.
+
+    The axes ``x``, ``y``, ``z`` have unit length. The texture is None where it would miss some directions:
+    with ``to_uv`` Mitsuba's textures sample another image than they show.
+    """
 
     def __init__(self, emitter):
         check_angles(emitter)

@@ -12,8 +12,10 @@ from ..geometry import rays
 
 @dataclass
 class Chosen:
-    """The emitters of the lanes: ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` the
-    probability of the selection."""
+    """The emitters that the lanes have chosen.
+
+    ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` the probability of the selection.
+    """
 
     emitter: mi.EmitterPtr
     index: mi.UInt32
@@ -70,8 +72,10 @@ class Direct:
 
 @dataclass
 class Hit:
-    """An emitter point ``si`` that a camera subpath has hit, or missed into, from its vertex ``previous``
-    (both as Mitsuba's calls take them), in the ``scene``."""
+    """An emitter point ``si`` that a camera subpath has hit, or missed into, in the ``scene``.
+
+    ``previous`` is the vertex that it comes from; both are as Mitsuba's calls take them.
+    """
 
     scene: mi.Scene
     si: mi.SurfaceInteraction3f

@@ -21,8 +21,10 @@ CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 
 @dataclass
 class _Turned:
-    """A sphere whose sampled normals are turned with its points: ``outward`` see `Sphere`, 0 where normals
-    are right as they are."""
+    """A sphere whose sampled normals are turned with its points.
+
+    ``outward``: see `Sphere`; 0 where normals are right as they are.
+    """
 
     center: mi.Vector3f | tuple = (0, 0, 0)
     outward: mi.Float | float = 0.0
@@ -61,8 +63,10 @@ class Surfaces:
             self._turned = table([_Turned(s.center, s.outward) if t else _Turned() for s, t in pairs])
 
     def sample(self, chosen, u, shared, active):
-        """A point on the shape of each emitter (``PositionSample3f``, density over area), and its geometric
-        normal up to the sign."""
+        """A point on the shape of each emitter, and its geometric normal up to the sign.
+
+        The point is a ``PositionSample3f``, its density over area.
+        """
         emitter, index = chosen.emitter, chosen.index
         if self._context.ask_shapes:
             ps = emitter.get_shape().sample_position(shared.time, u, active)
@@ -115,8 +119,10 @@ def _check(emitter, context: Context):
 
 
 def refuse_curves(scene, emitter, why: str):
-    """Raise ``UnsupportedError`` if a call on shapes, which ``emitter`` needs, would meet curves: they have
-    no ``sample_position``."""
+    """Raise ``UnsupportedError`` if a call on shapes, which ``emitter`` needs, would meet curves.
+
+    Curves have no ``sample_position``.
+    """
     for shape in all_shapes(scene):
         if shape.shape_type() in CURVES:
             raise UnsupportedError(

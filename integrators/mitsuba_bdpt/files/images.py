@@ -79,8 +79,10 @@ def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exp
 
 
 def grey(bands: np.ndarray) -> mi.Bitmap:
-    """What a film without colours shows on a screen: the mean of its `bands`, whose units are the user's
-    own, so bright that one pixel in a hundred is white."""
+    """Grey image of a film without colours, for a screen: the mean of its `bands`.
+
+    Their units are the user's own; it is so bright that one pixel in a hundred is white.
+    """
     mean = np.mean(bands, axis=-1, dtype=np.float32, keepdims=True)
     return mi.Bitmap(mean / max(np.quantile(mean, 0.99), 1e-30), mi.Bitmap.PixelFormat.Y)
 
@@ -95,8 +97,11 @@ def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
 
 
 def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
-    """Write an image by `replacing`. (Mitsuba's own files are closed without a look at what could not be
-    written: on a full disk the end of a PNG is missing, and nobody hears of it.)"""
+    """Write an image by `replacing`.
+
+    Mitsuba's own files are closed without a look at what could not be written: on a full disk the end of a
+    PNG is missing, and nobody hears of it.
+    """
     stream = mi.MemoryStream()
     bitmap.write(stream, file_format)
     with replacing(path) as temporary:
@@ -104,9 +109,12 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
 
 
 def check_output(path: Path, suffix: str) -> None:
-    """Refuse, before anything is rendered, an output of another ``suffix``, one that cannot be written, and
-    one that would overwrite an image of another format; its folder is made. With an EXR goes a PNG of its
-    name, as from the command ``render``."""
+    """Refuse an output that cannot or must not be written, before anything is rendered.
+
+    That is one of another ``suffix``, one that cannot be written, and one that would overwrite an image of
+    another format. The output's folder is made. With an EXR goes a PNG of its name, as from the command
+    ``render``.
+    """
     if suffix == ".exr":
         prepare_output(path)
         return
@@ -137,8 +145,10 @@ def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
 
 
 def read_layers(path: Path, *layers: str):
-    """Images (height, width, 3) of an EXR's layers, by the prefixes of `write_layers`, and its header; raises
-    ``CommandError`` for another file."""
+    """Images (height, width, 3) of an EXR's layers, and its header.
+
+    ``layers`` are the prefixes of `write_layers`. Raises ``CommandError`` for another file.
+    """
     with path.open("rb") as file:  # OpenEXR does not say what hinders it
         start = file.read(4)
     if start != MAGIC[".exr"]:

@@ -69,8 +69,11 @@ def _decoded(data: bytes) -> str:
 
 
 def in_proportion(scene: Path, definitions: dict) -> dict:
-    """``definitions`` with the height ``resolution_y`` that belongs to the ``resolution`` among them, if the
-    scene file has such defaults and it is not given: the image keeps its proportions."""
+    """``definitions`` with the ``resolution_y`` that keeps the image's proportions.
+
+    It is the height that belongs to the ``resolution`` among them, added if the scene file has such defaults
+    and it is not given.
+    """
     if "resolution" not in definitions or "resolution_y" in definitions:
         return definitions
     try:
@@ -157,8 +160,10 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
 
 
 def _check_kind(name: str) -> None:
-    """Raise ``CommandError`` if the plugin ``name`` is known to be no integrator. (What those in Python are
-    is known when they are made, and what is no plugin is answered then.)"""
+    """Raise ``CommandError`` if the plugin ``name`` is known to be no integrator.
+
+    What those in Python are is known when they are made, and what is no plugin is answered then.
+    """
     kind = mi.PluginManager.instance().plugin_type(name)
     if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
         raise CommandError(_no_integrator(name, f"of type {kind.name.lower()}"))
@@ -207,8 +212,10 @@ def _scenes_near(scene: Path) -> str:
 
 
 def _files_near(scene: Path, name: str) -> str:
-    """Where Mitsuba looked for a file of the ``scene`` that does not exist, and what it may be; empty if the
-    scene file itself does not have this ``name``, of which Mitsuba may tell the last part only."""
+    """Where Mitsuba looked for a file of the ``scene`` that does not exist, and what it may be.
+
+    Empty if the scene file itself does not have this ``name``, of which Mitsuba may tell the last part only.
+    """
     try:
         texts = [element.get("value", "") for element in elements(scene)]
     except ValueError:  # Mitsuba takes more for XML
@@ -224,8 +231,10 @@ def _files_near(scene: Path, name: str) -> str:
 
 
 def _in_words(error: str, options: Namespace) -> str | None:
-    """What to say instead of Mitsuba's ``error`` about a name that it does not know, which is alike; None
-    for other errors."""
+    """What to say instead of Mitsuba's ``error`` about a name that it does not know: one that is alike.
+
+    None for other errors.
+    """
     unused = [
         name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.MULTILINE)
     ]
@@ -315,12 +324,12 @@ def plugins() -> list[str]:
 def replace_integrator(
     nodes: Sequence, node, kind: str | None, overrides: Mapping[str, bool | int | float | str]
 ) -> None:
-    """Make the integrator ``node``, one of ``nodes``, one of another ``kind`` if that is set, with
-    ``overrides``.
+    """Give the integrator ``node``, one of ``nodes``, another ``kind`` if that is set, and ``overrides``.
 
     Of integrators around another one (`AROUND`), with their layers, `bdpt` takes the place of all of them,
     for it has layers of its own; others take the place of the innermost. Raises ``CommandError`` for layers
-    that cannot be kept."""
+    that cannot be kept.
+    """
     given = node.props
     if kind == "bdpt" and given.plugin_name() in AROUND:
         given, layers = _layers(nodes, node)
@@ -332,8 +341,10 @@ def replace_integrator(
 
 
 def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
-    """The properties of the innermost integrator of ``node``, which is around others, and what `bdpt` takes
-    over from those: layers, named as in Mitsuba's film, and the outermost ``timeout``, which counts there."""
+    """Properties of the innermost integrator of ``node``, and what `bdpt` takes over from those around it.
+
+    The latter are layers, named as in Mitsuba's film, and the outermost ``timeout``, which counts there.
+    """
     aovs, carried, prefix = [], {}, ""
     while (kind := node.props.plugin_name()) in AROUND:
         if kind in NOT_CARRIED:

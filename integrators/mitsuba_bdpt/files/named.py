@@ -9,17 +9,22 @@ from .loading import elements
 
 
 def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
-    """Meshes, textures, spectra and scene files that a scene file names, and those that the latter name, as
-    far as they exist, each once; raises ``CommandError`` if one of the scene files is not XML.
-    ``definitions`` of parameters, for names that hold some."""
+    """Files that a scene file names, and those that named scene files name, each once.
+
+    Meshes, textures, spectra and scene files, as far as they exist; raises ``CommandError`` if one of the
+    scene files is not XML. ``definitions`` of parameters, for names that hold some.
+    """
     found = {}
     _note_files(scene, dict(definitions), [Path()], found)
     return list(found)
 
 
 def _note_files(scene: Path, values: dict, folders: list[Path], found: dict[Path, None]) -> None:
-    """Add to ``found``, a set in the order of the files, what a scene file names, looked for as Mitsuba does:
-    beside it, then in ``folders``. ``values`` of parameters, to which its own defaults are added."""
+    """Add to ``found``, a set in the order of the files, what a scene file names.
+
+    Looked for as Mitsuba does: beside it, then in ``folders``. ``values`` of parameters, to which its own
+    defaults are added.
+    """
     folders = [scene.parent, *folders]
 
     def resolved(name, exists):

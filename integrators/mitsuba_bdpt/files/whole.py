@@ -17,8 +17,10 @@ def _temporary(path: Path) -> Path:
 
 
 def check_format(path: Path, output: Path) -> None:
-    """Raise ``CommandError`` if ``path``, which goes with ``output``, is a file of another format than the
-    one that its suffix names; an image of that format may be replaced."""
+    """Raise ``CommandError`` if ``path`` is a file of another format than its suffix names.
+
+    ``path`` goes with ``output``; an image of the format that the suffix names may be replaced.
+    """
     kind = path.suffix.lower()
     if kind not in MAGIC or not path.is_file():  # of a pipe nothing must be read
         return
@@ -39,8 +41,10 @@ def check_own(path: Path, mark: str, remedy: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ``OSError`` now if `replacing` could not write `path` later, ``CommandError`` if it is something
-    else than a file."""
+    """Raise ``OSError`` now if `replacing` could not write `path` later.
+
+    Raises ``CommandError`` if `path` is something else than a file.
+    """
     if path.exists() and not path.is_file():
         raise CommandError(f"{str(path)!r} is no file; name another output.")
     try:
@@ -52,8 +56,10 @@ def check_writable(path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path):
-    """Name of a file beside `path` that takes its place at the end: whoever looks at `path` never sees half a
-    file, and an error leaves what was there."""
+    """Name of a file beside `path` that takes its place at the end.
+
+    Whoever looks at `path` never sees half a file, and an error leaves what was there.
+    """
     temporary = _temporary(path)
     try:
         yield temporary

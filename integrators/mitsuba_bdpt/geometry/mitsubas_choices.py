@@ -85,8 +85,10 @@ def is_sampled_by_texture(emitter, sphere: Sphere | None) -> bool:
 
 
 def is_sampled_by_direction(emitter) -> bool:
-    """Whether next-event estimation towards an area light on a sphere chooses a direction: it has no texture,
-    which would be sampled wherever the lit point is."""
+    """Whether next-event estimation towards an area light on a sphere chooses a direction.
+
+    It does if the light has no texture, which would be sampled wherever the lit point is.
+    """
     return not is_textured(emitter)
 
 
@@ -95,8 +97,10 @@ def _is_turned(sphere: Sphere | None) -> bool:
 
 
 def _is_sampled_from_behind(emitter, sphere: Sphere | None) -> bool:
-    """Whether the points that Mitsuba samples by the texture of an emitter have normals opposite to those of
-    its shape: ``eval_parameterization`` of a rectangle knows nothing of ``flip_normals``."""
+    """Whether the points that Mitsuba samples by an emitter's texture have normals opposite to its shape's.
+
+    ``eval_parameterization`` of a rectangle knows nothing of ``flip_normals``.
+    """
     if not emitter.get_shape().has_flipped_normals():  # of nearly all lamps: no kernel runs for them
         return False
     u = mi.Point2f(0.4, 0.6)
@@ -152,8 +156,11 @@ def _is_rounded(emitter) -> bool:
 
 
 def _seen(shape, ps):
-    """What a ray finds from before the points ``ps`` of a shape: from so far that their rounding does not
-    decide on which side it starts, and so near that hardly any other part of the shape lies between."""
+    """What rays find from before the points ``ps`` of a shape.
+
+    They start so far away that the points' rounding does not decide on which side, and so near that hardly
+    any other part of the shape lies between.
+    """
     height = dr.opaque(mi.Float, 1e-3 * max(shape.bbox().extents()))
     return shape.ray_intersect(mi.Ray3f(ps.p + height * ps.n, -mi.Vector3f(ps.n)), mi.RayFlags.All)
 
@@ -165,8 +172,10 @@ def _differ(sampled, stated):
 
 
 def _places(box, points):
-    """Places about a shape: each second one of its ``points``, others on a line from the middle of its
-    ``box`` to twice the distance of the corners."""
+    """Places on and about a shape: each second one of its ``points``, others on a line.
+
+    The line leads from the middle of its ``box`` to about three times the distance of the corners.
+    """
     middle = dr.opaque(mi.Point3f, list(box.center()))
     along = dr.opaque(mi.Vector3f, list(box.extents() * mi.ScalarVector3f(0.61, -0.77, 0.83)))
     index = dr.arange(mi.UInt32, CHECKED)

@@ -29,8 +29,10 @@ ROUND = {mi.ShapeType.Sphere.value: 0.0, mi.ShapeType.Cylinder.value: 0.5}
 @dataclass
 class Sphere:
     """A sphere: ``center``, ``radius``, and ``outward``, 1 or -1, whether its normals point outwards.
+
     ``turned``: Mitsuba's ``sample_position`` rotates the point, but not its normal (and
-    ``eval_parameterization``, by which it samples a texture, does not rotate the point)."""
+    ``eval_parameterization``, by which it samples a texture, does not rotate the point).
+    """
 
     center: mi.ScalarPoint3f
     radius: float
@@ -39,9 +41,11 @@ class Sphere:
 
     @property
     def inner_radius(self) -> float:
-        """Distance from the center up to which Mitsuba samples the sphere by area, as from inside; 0 for one
-        whose normals point outwards: from its inside it lights nothing. (Its ``pdf_direction`` knows nothing
-        of `RAY_EPSILON`.)"""
+        """Distance from the center up to which Mitsuba samples the sphere by area, as from inside.
+
+        0 for one whose normals point outwards: from its inside it lights nothing. (Its ``pdf_direction``
+        knows nothing of `RAY_EPSILON`.)
+        """
         return self.radius * (1 + RAY_EPSILON) if self.outward < 0 else 0.0
 
     @staticmethod
@@ -86,12 +90,13 @@ def is_small(sphere: Sphere, extent: float) -> bool:
 
 
 def cone_pdf_w(center, radius, p):
-    """Density (solid angle) of a uniform direction in the cone from ``p`` to a sphere; 0 where the cone is
-    not narrow (`NARROW_SIN2`) or ``radius`` is 0.
+    """Density (solid angle) of a uniform direction in the narrow cone from ``p`` to a sphere.
+
+    0 where the cone is not narrow (`NARROW_SIN2`) or ``radius`` is 0.
 
     Mitsuba has 1 / (2 pi (1 - cos)) for it, which cancels: off by up to 0.4 % where the distance is 200 times
-    the radius, 5.8 % at 800, by factors of 2 to 4 from 4096 times on, infinite from 5793 = 2^12.5 times on.
-    1 - cos = sin^2 / (1 + cos) does not.
+    the radius, 5.8 % at 800, by factors of 2 to 4 from 4096 times on, infinite from 5793 = 2^12.5 times on. 1
+    - cos = sin^2 / (1 + cos) does not.
     """
     sin_2 = dr.square(radius) / dr.squared_norm(p - center)
     narrow = (sin_2 > 0) & (sin_2 < NARROW_SIN2)

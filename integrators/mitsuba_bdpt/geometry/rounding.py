@@ -37,18 +37,23 @@ FAR = 200
 
 
 def rounding_offset(p, o, t, reach):
-    """Offset that clears the rounding error of a hit ``p`` found from ``o`` at distance ``t``, on a shape of
-    this ``reach``."""
+    """Offset that clears the rounding error of a hit ``p`` on a shape of this ``reach``.
+
+    The hit was found from ``o`` at distance ``t``.
+    """
     magnitude = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(o)))
     return (OFFSET_ULPS * 2.0**-24) * dr.maximum(dr.maximum(magnitude, t), reach)
 
 
 @dataclass
 class Errors:
-    """What rounding does to hits on a shape: ``ends``, the curvature 1 / radius on spheres and cylinders,
-    which visibility rays that end there meet too early (negative if normals point inwards, as far as that is
-    asked, see `FAR`); ``starts``, that of shapes whose hits lie off their surface for the same reason:
-    cylinders, and all that is round within instances; ``reach``, the largest of `reaches`."""
+    """What rounding does to hits on a shape.
+
+    ``ends``, the curvature 1 / radius on spheres and cylinders, which visibility rays that end there meet too
+    early (negative if normals point inwards, as far as that is asked, see `FAR`); ``starts``, that of shapes
+    whose hits lie off their surface for the same reason: cylinders, and all that is round within instances;
+    ``reach``, the largest of `reaches`.
+    """
 
     ends: mi.Float | float
     starts: mi.Float | float
@@ -56,8 +61,11 @@ class Errors:
 
 
 class ShapeErrors:
-    """`Errors` of the scene's shapes, by pointer. ``any``: one of them is a sphere or cylinder; ``small``:
-    one of these is so small that rays ask what they meet, see `SMALL`."""
+    """`Errors` of the scene's shapes, by pointer.
+
+    ``any``: one of them is a sphere or cylinder; ``small``: one of these is so small that rays ask what they
+    meet, see `SMALL`.
+    """
 
     def __init__(self, scene: mi.Scene):
         shapes = scene.shapes()
@@ -88,8 +96,10 @@ class ShapeErrors:
         dr.make_opaque(self._table, self._triangles)
 
     def at(self, shape, active=True, instance=None, triangle=None) -> Errors:
-        """The `Errors` of hits on ``shape``, or on the ``instance`` in which it was met: of all its surface,
-        or of one ``triangle``."""
+        """The `Errors` of hits on ``shape``, or on the ``instance`` in which it was met.
+
+        Of all its surface, or of one ``triangle``.
+        """
         index = met(shape, instance)
         known = mi.Bool(active) & (index < self._size)
         found = Errors(mi.Float(0), mi.Float(0), dr.gather(mi.Float, self._table.reach, index, known))
@@ -114,8 +124,10 @@ def met(shape, instance=None):
 
 
 def _curvatures(shape, grouped, extent) -> tuple[float, float]:
-    """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent``; ``grouped``: the largest
-    ``ends`` of shapes in groups."""
+    """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent``.
+
+    ``grouped``: the largest ``ends`` of shapes in groups.
+    """
     kind = shape.shape_type()
     if kind in ROUND:
         matrix = matrix_of(shape)
@@ -139,13 +151,15 @@ def _stretch(shape) -> np.ndarray:
 
 
 def reaches(shape: mi.Shape) -> np.ndarray:
-    """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits: one
-    number, of a mesh one for each triangle.
+    """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits.
+
+    One number, of a mesh one for each triangle.
 
     Coordinates whose rounding moves hits within the surface do not count: those of corners of rectangles and
     edges of triangles weigh |n_i| / max |n|, so that a floor along the axes has 0, however large. Of spheres,
     cylinders and grids all coordinates count, of instances all within them. 0 for others: disks and curves
-    are as exact near by as far away."""
+    are as exact near by as far away.
+    """
     kind = shape.shape_type()
     if is_instance(shape):
         return np.array([_reach_within(shape)])

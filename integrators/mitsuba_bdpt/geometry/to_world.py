@@ -18,9 +18,11 @@ _TOLERANCE = 1e-3
 
 
 def check_to_world(shape, owner: str):
-    """Raise ``UsageError`` if ``shape``, on which ``owner`` is, has a ``to_world`` with which Mitsuba samples
-    other points or normals than rays find, or with another density than it states: `path` is wrong there too.
-    Meshes are right with every matrix."""
+    """Raise ``UsageError`` if Mitsuba samples ``shape`` wrongly with its ``to_world``.
+
+    That is, other points or normals than rays find, or with another density than it states: `path` is wrong
+    there too. ``owner`` is what is on the shape. Meshes are right with every matrix.
+    """
     check = _CHECKS.get(shape.shape_type())
     if check is None:
         return

@@ -49,8 +49,11 @@ class Image:
         return total + found, counted
 
     def splat(self, kernel, c, shared) -> Counters:
-        """Add a contribution with t <= 1; colours that are not finite count as zero
-        (`contribution.drop_non_finite` has seen the contribution, not what the film makes of it)."""
+        """Add a contribution with t <= 1.
+
+        Colours that are not finite (`contribution.drop_non_finite` has seen the contribution, not what the
+        film makes of it) count as zero.
+        """
         value = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
         finite = dr.all(dr.isfinite(value))
         self._film.put_light(c.position, value, c.active & finite)

@@ -34,8 +34,10 @@ SIGNIFICANCE = 1e-3
 
 
 def tile_means(image, tiles: int) -> np.ndarray:
-    """Means over ``tiles`` x ``tiles`` tiles of an image (height, width, channels), flattened to
-    (tiles * tiles, channels), row by row. The size must be divisible by ``tiles``."""
+    """Means over ``tiles`` x ``tiles`` tiles of an image (height, width, channels).
+
+    Flattened to (tiles * tiles, channels), row by row. The size must be divisible by ``tiles``.
+    """
     image = np.asarray(image, dtype=np.float64)
     h, w, c = image.shape
     if not isinstance(tiles, Integral) or tiles < 1 or h % tiles or w % tiles:
@@ -46,8 +48,11 @@ def tile_means(image, tiles: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Sample:
-    """Means (m,) of m quantities, their standard errors (m,), the errors' degrees of freedom, and the share
-    of the renders in which each is nonzero (m,)."""
+    """Means and standard errors of m quantities over several renders.
+
+    Means (m,), their standard errors (m,), the errors' degrees of freedom, and the share of the renders in
+    which each quantity is nonzero (m,).
+    """
 
     mean: np.ndarray
     error: np.ndarray
@@ -78,8 +83,11 @@ class Sample:
 
 
 def satterthwaite(variance_a, freedom_a, variance_b, freedom_b):
-    """Degrees of freedom of a sum of two estimated variances, 1 / (c^2 / n_a + (1 - c)^2 / n_b) with
-    c = a / (a + b), and 1 where both are 0. Source: B. L. Welch, Biometrika 34, 1947."""
+    """Degrees of freedom of a sum of two estimated variances, by Welch and Satterthwaite.
+
+    1 / (c^2 / n_a + (1 - c)^2 / n_b) with c = a / (a + b), and 1 where both are 0. Source: B. L. Welch,
+    Biometrika 34, 1947.
+    """
     total = np.asarray(variance_a + variance_b, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = variance_a / total
@@ -88,8 +96,11 @@ def satterthwaite(variance_a, freedom_a, variance_b, freedom_b):
 
 
 class Difference(NamedTuple):
-    """Of m quantities, each (m,): mean a - mean b, its standard error and degrees of freedom, the p-value,
-    and whether that one is uniform if nothing differs (not where rounding or a few lumps decide)."""
+    """Differences of the means of m quantities, and how significant they are, each (m,).
+
+    Mean a - mean b, its standard error and degrees of freedom, the p-value, and whether that one is uniform
+    if nothing differs (not where rounding or a few lumps decide).
+    """
 
     value: np.ndarray
     error: np.ndarray
@@ -145,8 +156,10 @@ class BiasCheck:
 
 
 def tile_columns(image, tiles=TILES) -> np.ndarray:
-    """What a bias check compares, (3 tiles^2 + 3,): `tile_means` by row, column and channel, then the mean
-    of the whole image by channel."""
+    """What a bias check compares, (3 tiles^2 + 3,): means of tiles and of the whole image.
+
+    `tile_means` by row, column and channel, then the mean of the whole image by channel.
+    """
     return np.concatenate([tile_means(image, tiles).ravel(), tile_means(image, 1).ravel()])
 
 

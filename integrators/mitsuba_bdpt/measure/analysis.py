@@ -141,8 +141,10 @@ def efficiency(ours, theirs, error="rel_mse_trimmed") -> Summary:
 
 
 def gap(rows) -> Summary:
-    """Summary of raw over trimmed relMSE: how much of the error the worst values of an image carry. Raises
-    `Refused` as `efficiency` does."""
+    """Summary of raw over trimmed relMSE: how much of the error the worst values of an image carry.
+
+    Raises `Refused` as `efficiency` does.
+    """
     if len(rows) < 2:
         raise Refused("fewer than two renders")
     for error in OWN:
@@ -153,8 +155,10 @@ def gap(rows) -> Summary:
 
 
 def widths(rows, methods) -> dict[str, float]:
-    """Width of the interval of the median ratio of efficiencies (trimmed) of the first method over each
-    other one, without regard to the reference."""
+    """Widths of the intervals of the median ratios of efficiencies (trimmed).
+
+    The ratios are of the first method over each other one, without regard to the reference.
+    """
     ours = select(rows, method=methods[0])
     found = {name: bootstrap_median(pair_ratios(ours, select(rows, method=name))) for name in methods[1:]}
     return {name: middle.high - middle.low for name, middle in found.items()}
@@ -166,8 +170,10 @@ def cost(ours, theirs) -> Summary:
 
 
 def convergence(rows, error="rel_mse") -> Estimate:
-    """Slope of log(error) over log(samples), all renders of one method in one scene; budgets whose error
-    the reference cannot judge are left out."""
+    """Slope of log(error) over log(samples), from all renders of one method in one scene.
+
+    Budgets whose error the reference cannot judge are left out.
+    """
     if not rows:
         raise Refused("not rendered")
     runs = {}
@@ -185,8 +191,10 @@ def convergence(rows, error="rel_mse") -> Estimate:
 
 
 def bias(rows, reference: Means) -> BiasCheck:
-    """Bias check of one method in one scene against the reference, with the budget that has most samples
-    among those with enough renders."""
+    """Bias check of one method in one scene against the reference.
+
+    With the budget that has most samples among those with enough renders.
+    """
     budgets = {row["budget"]: select(rows, budget=row["budget"]) for row in rows}
     enough = [at for at in budgets.values() if len(at) >= FEWEST_RUNS]
     if not enough:
@@ -220,16 +228,20 @@ class Results:
 
     @cached_property
     def rivals(self) -> list[str]:
-        """What the first integrator is compared with at equal time: `path`, then others that no figure of the
-        project's own looks for."""
+        """What the first integrator is compared with at equal time.
+
+        `path`, then others that no figure of the project's own looks for.
+        """
         known = {*RIVALS, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, LIGHT_TRACER}
         others = self.methods[1:]
         return [name for name in RIVALS if name in others] + [name for name in others if name not in known]
 
     @cached_property
     def standard(self) -> list[str]:
-        """What efficiencies by budget and costs are over: `path` with each sampler; other rivals if it was
-        not rendered under these names."""
+        """The integrators that efficiencies by budget and costs are over.
+
+        `path` with each sampler; other rivals if it was not rendered under these names.
+        """
         return [rival for rival in self.rivals if rival in RIVALS] or self.rivals
 
     @cached_property
@@ -281,8 +293,11 @@ class Results:
         return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
 
     def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Summary:
-        """As `efficiency`; raises `Biased` where the other fails the bias check. (With too few seeds for one
-        there is none to fail, but an image that is black where the reference is not.)"""
+        """As `efficiency`; raises `Biased` where the other fails the bias check.
+
+        With too few seeds for one there is none to fail, but an image that is black where the reference is
+        not.
+        """
         try:
             check = self.bias(scene, rival)
         except Refused:
@@ -295,8 +310,10 @@ class Results:
         return self.efficiency(scene, rival, error, budget)
 
     def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Summary:
-        """Over the strongest of `standard`, that with the smallest ratio, of those that were rendered and
-        pass the bias check; raises `Biased` if none does."""
+        """Efficiency over the strongest of `standard`, that with the smallest ratio.
+
+        Of those that were rendered and pass the bias check; raises `Biased` if none does.
+        """
         found, biased = [], {}
         rivals = [rival for rival in self.standard if self.of(scene, rival)]
         if not rivals:

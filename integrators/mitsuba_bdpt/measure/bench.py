@@ -51,8 +51,11 @@ class Bench:
         return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
     def compile_seconds(self, cell: Cell, spp: int) -> float:
-        """Seconds for the kernels of an integrator (less where they come from the cache on disk); afterwards
-        it is warm. Mitsuba's integrators have kernels of their own for each number of samples."""
+        """Seconds for the kernels of an integrator, which is warm afterwards.
+
+        Less where they come from the cache on disk. Mitsuba's integrators have kernels of their own for each
+        number of samples.
+        """
         key = cell.method, spp
         if key not in self._compile:
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
@@ -159,8 +162,10 @@ def _loaded_software() -> tuple:
 
 @lru_cache(maxsize=2)
 def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
-    """The bench of a scene, of these contents, of the preset in a file of this text; kept, so that it stays
-    warm."""
+    """The bench of a scene of a preset; kept, so that it stays warm.
+
+    The scene has these contents, the preset is in a file of this text.
+    """
     folder = tempfile.TemporaryDirectory(prefix="bdpt_sweep_")
     file = Path(folder.name) / "preset.toml"
     file.write_text(preset)

@@ -21,8 +21,11 @@ FIRST_SEED = 1  # seed 0 warms up
 
 @dataclass(frozen=True)
 class Cell:
-    """One render, and all that determines it; ``against``: for equal seconds, parameters and sampler of the
-    first integrator and the samples at which the two were timed."""
+    """One render, and all that determines it.
+
+    ``against``: for equal seconds, parameters and sampler of the first integrator and the samples at which
+    the two were timed.
+    """
 
     scene: str
     scene_sha256: str

@@ -47,15 +47,19 @@ class Side:
 
     @staticmethod
     def of(parameters: dict, job: Job) -> Side:
-        """From the ``parameters`` of the plugin, of which ``sampler`` is the sensor's; at the size and depth
-        of the ``job`` of the reference."""
+        """From the ``parameters`` of the plugin, of which ``sampler`` is the sensor's.
+
+        At the size and depth of the ``job`` of the reference.
+        """
         own = dict(parameters)
         sampler = own.pop("sampler", "independent")
         return Side(integrator_of(own, job.depth), job.scene.load(job.resolution, sampler))
 
     def measured(self, target: Reference, spp: int, seed: int) -> tuple[float, ...]:
-        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render; raises
-        `Refused` if it has no error."""
+        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render.
+
+        Raises `Refused` if it has no error.
+        """
         image, seconds = timed(self.scene, self.made, spp, seed)
         trimmed = rel_mse(image, target.image, TRIM)
         if trimmed == 0:

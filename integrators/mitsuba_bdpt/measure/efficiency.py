@@ -96,11 +96,11 @@ def _percentiles(value, drawn, confidence) -> Estimate:
 
 
 def bootstrap_median(values, confidence=CONFIDENCE, seed=0) -> Estimate:
-    """Median of a handful of values and its bootstrap interval: percentiles of `RESAMPLES` medians of
-    values drawn with replacement.
+    """Median of a handful of values and its bootstrap interval.
 
-    The interval cannot leave the range of the values, which with n of them holds the median with chance
-    1 - 2^(1 - n): 94 % for 5, 97 % for 6, 99.8 % for 10. Source: as `slope`, section 13.
+    The interval is from percentiles of `RESAMPLES` medians of values drawn with replacement. It cannot leave
+    the range of the values, which with n of them holds the median with chance 1 - 2^(1 - n): 94 % for 5, 97 %
+    for 6, 99.8 % for 10. Source: as `slope`, section 13.
     """
     values = values_of("values", values, 2)
     rng = np.random.default_rng(seed)

@@ -39,9 +39,12 @@ def length2(a):
 
 @dataclass
 class Lamp:
-    """An emitter: its ``kind`` and ``probability`` of being chosen, ``area`` of its shape, ``center`` and
-    ``radius`` of a sphere that shines outwards (0 of other shapes), solid angle ``cone`` into which it shines
-    from a point, direction of an environment map's ``pole``."""
+    """An emitter, as far as the densities of its points and directions ask.
+
+    Its ``kind`` and ``probability`` of being chosen, ``area`` of its shape, ``center`` and ``radius`` of a
+    sphere that shines outwards (0 of other shapes), solid angle ``cone`` into which it shines from a point,
+    direction of an environment map's ``pole``.
+    """
 
     emitter: mi.Emitter
     kind: int
@@ -96,8 +99,12 @@ class Lamp:
         return self.radius**2 / length2(x1 - self.center)
 
     def unsure(self, x1, d):
-        """Where rounding decides whether a sphere is seen from outside, or where an environment map has its
-        poles: the angle to one comes from its cosine, and the density is off by 6e-8 over its square."""
+        """Mask: rounding decides the density.
+
+        It does so at the rim of a sphere, of whether it is seen from outside, and near the poles of an
+        environment map: the angle to a pole comes from its cosine, and the density is off by 6e-8 over its
+        square.
+        """
         if self.pole is not None:
             return 1 - np.square(d @ self.pole) < NEAR_POLE**2
         return self._sin2(x1) > 1 - 1e-4 if self.radius else np.zeros(len(x1), dtype=bool)
@@ -105,14 +112,18 @@ class Lamp:
 
 @dataclass
 class Disks:
-    """Where light from infinity starts: ``spheres`` (centre, radius, share) of which disks are the outlines;
-    a single one is taken to be passed by all light."""
+    """Where light from infinity starts: disks that are the outlines of ``spheres``.
+
+    Each of the spheres is (centre, radius, share); a single one is taken to be passed by all light.
+    """
 
     spheres: list
 
     def passes(self, x, d):
-        """For each sphere: whether the line through ``x`` along ``d`` meets it, and whether it passes so
-        close to the rim that rounding decides."""
+        """For each sphere: masks of lines that meet it, and of those whose passing rounding decides.
+
+        The lines lead through ``x`` along ``d``; rounding decides close to the rim.
+        """
         for center, radius, _ in self.spheres:
             away = x - center
             miss = np.sqrt(np.maximum(length2(away - dot(away, d)[:, None] * d), 0))
@@ -179,8 +190,10 @@ def _faces_outwards(sphere, center) -> bool:
 
 @dataclass
 class Camera:
-    """A perspective camera, or with a ``radius`` of its lens a thin lens: optical ``axis``, ``area`` of the
-    film at distance 1."""
+    """A perspective camera, or with a ``radius`` of its lens a thin lens.
+
+    Optical ``axis``, ``area`` of the film at distance 1.
+    """
 
     axis: np.ndarray
     area: float

@@ -79,8 +79,11 @@ def seconds(scene, made, spp: int) -> float:
 
 
 def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int) -> list[Shot]:
-    """All integrators, parameters of plugins by what is written beneath; the last has ``spp`` samples per
-    pixel, others as many as its seconds allow."""
+    """A render by each integrator in the time of the last one.
+
+    ``ways``: parameters of plugins by what is written beneath. The last has ``spp`` samples per pixel, others
+    as many as its seconds allow.
+    """
     made = [integrator_of(parameters, depth) for parameters in ways.values()]
     with steps(1 + len(made)) as step:
         step(list(ways)[-1])
@@ -96,8 +99,10 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
 
 
 def windows(found: list[Shot], shape) -> list[tuple[int, int, int]]:
-    """Two windows (left, top, side) that do not overlap, where the errors of the first and the last image
-    differ most (on a logarithmic scale, so that no single pixel decides)."""
+    """Two windows (left, top, side) that do not overlap, where the first and the last image differ most.
+
+    The errors are compared, on a logarithmic scale, so that no single pixel decides.
+    """
     height, width = shape
     side = max(4, min(height, width) // WINDOW)
     first, last = (np.log10(shot.errors + 1e-4) for shot in (found[0], found[-1]))

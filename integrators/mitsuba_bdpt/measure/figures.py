@@ -54,8 +54,11 @@ def style(method: str) -> dict:
 
 
 def convergence(results: Results, against: str, path: Path):
-    """relMSE over ``against``, "seconds" or "spp", a panel per scene, medians over seeds with the range of
-    all; hollow where the reference is too noisy for the error; the dotted line falls with slope -1."""
+    """Draw relMSE over ``against``, "seconds" or "spp", a panel per scene.
+
+    Medians over seeds with the range of all; hollow where the reference is too noisy for the error; the
+    dotted line falls with slope -1.
+    """
     rows = math.ceil(len(results.scenes) / COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(11, 2.5 * rows), squeeze=False)
     for scene, axis in zip(results.scenes, axes.flat, strict=False):
@@ -123,8 +126,10 @@ def _ideal(axis, rows, against):
 
 
 def efficiencies(results: Results, rivals, path: Path):
-    """Ratio of efficiencies per scene, median and range over seeds, trimmed and raw; an integrator that
-    fails the bias check has none."""
+    """Draw the ratio of efficiencies per scene, median and range over seeds, trimmed and raw.
+
+    An integrator that fails the bias check has none.
+    """
     figure, axes = plt.subplots(1, len(rivals), figsize=(11, 0.28 * len(results.scenes) + 1.2), sharey=True)
     for rival, axis in zip(rivals, np.atleast_1d(axes), strict=True):
         for place, scene in enumerate(results.scenes):

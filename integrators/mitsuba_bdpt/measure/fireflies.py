@@ -39,10 +39,12 @@ AGREE = 1e-2
 
 @dataclass(frozen=True)
 class Firefly:
-    """A sample that stands out, with the path that adds most to it: ``off`` by so many values of its pixel,
-    ``error`` its sum of squared relative errors; ``kappa`` of the k + 2 strategies; ``rebuilt`` None if the
-    path could not be found anew, ``doubt`` why, or in what it then differed from what the render says, empty
-    if in nothing."""
+    """A sample that stands out, with the path that adds most to it.
+
+    ``off`` by so many values of its pixel, ``error`` its sum of squared relative errors; ``kappa`` of the k +
+    2 strategies; ``rebuilt`` None if the path could not be found anew, ``doubt`` why, or in what it then
+    differed from what the render says, empty if in nothing.
+    """
 
     path: recording.Path
     letters: str
@@ -222,8 +224,7 @@ def lines(project: Project, file: SceneFile, options: Namespace) -> tuple[list, 
 
 
 def run(options: Namespace) -> int:
-    """Print the table that the command line ``options`` ask for, and the errors of the renders, raw and
-    trimmed."""
+    """Print the table that the command line ``options`` ask for, and the renders' errors, raw and trimmed."""
     mi.set_variant("llvm_ad_rgb")
     project = Project(options.project)
     rows, said = [], []

@@ -27,8 +27,10 @@ SPP = 16
 
 @contextlib.contextmanager
 def recorded(calls: list):
-    """Scenes note in ``calls`` what they are asked to trace: (ray, active, coherent), the last None for
-    shadow rays."""
+    """Scenes note in ``calls`` what they are asked to trace.
+
+    As (ray, active, coherent), the last None for shadow rays.
+    """
     closest, shadow = mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test
 
     def note(ray, active, coherent):

@@ -20,9 +20,11 @@ PASS_SPP = 256
 
 
 class Halves:
-    """Sums of two independent halves and how many renders are in each pixel (``counts``), the tile means of
-    each render of the whole image, and the digests of the plugin's source that made them, kept in a file
-    between runs."""
+    """Sums of two independent halves of the renders, kept in a file between runs.
+
+    With them how many renders are in each pixel (``counts``), the tile means of each render of the whole
+    image, and the digests of the plugin's source that made them.
+    """
 
     def __init__(self, path: Path, key: str):
         self.path, self.key, self.rounds, self.columns = path, key, 0, []
@@ -52,8 +54,10 @@ class Halves:
         self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
 
     def go_on_from(self, stored: Reference, windows: list):
-        """Take a stored reference for the renders before the first; ``windows`` are slices of rows and
-        columns. Its seeds are not used again."""
+        """Take a stored reference for the renders before the first; its seeds are not used again.
+
+        ``windows`` are slices of rows and columns.
+        """
         spp = stored.provenance["spp"]
         whole, most = spp / (2 * PASS_SPP), stored.provenance.get("spp_in_windows", spp) / (2 * PASS_SPP)
         self.counts = np.full((*stored.image.shape[:2], 1), whole)
@@ -73,9 +77,12 @@ class Halves:
         return self.earlier.joined(made) if self.earlier else made
 
     def add(self, images, window=None, times: float = 1.0):
-        """Add an image to each half, and keep the sums. ``window`` (slices of rows and columns): the images
-        are of that part alone; ``times``: they have so many times the samples of a whole one. Raises
-        ``CommandError`` for values that are not finite, and leaves the sums as they are."""
+        """Add an image to each half, and keep the sums.
+
+        ``window`` (slices of rows and columns): the images are of that part alone; ``times``: they have so
+        many times the samples of a whole one. Raises ``CommandError`` for values that are not finite, and
+        leaves the sums as they are.
+        """
         if not all(np.isfinite(image).all() for image in images):
             raise CommandError(f"{self.path.name}: round {self.rounds} has values that are not finite")
         if not self.rounds:

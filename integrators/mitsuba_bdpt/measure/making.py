@@ -115,9 +115,11 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Job:
-    """A reference to be made: ``spp`` of the renders that it has to judge, ``seconds`` that it may take,
-    ``rounds`` of two renders that it has at least; ``max_depth`` None: the project's; ``by``, a key of
-    `WAYS`, in place of the recipe's."""
+    """A reference to be made.
+
+    ``spp`` of the renders that it has to judge, ``seconds`` that it may take, ``rounds`` of two renders that
+    it has at least; ``max_depth`` None: the project's; ``by``, a key of `WAYS`, in place of the recipe's.
+    """
 
     project: Project
     scene: SceneFile
@@ -148,8 +150,11 @@ class Job:
 
 
 def obtained(job: Job) -> Reference:
-    """The stored reference, made now if there is none, with renders enough for a bias check, and a word on
-    standard output. Raises ``CommandError`` if the stored one is of another scene."""
+    """The stored reference, made now if there is none.
+
+    One that is made has renders enough for a bias check, and is announced on standard output. Raises
+    ``CommandError`` if the stored one is of another scene.
+    """
     if not reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
         print(
             f"{job.scene.name}: no reference at {job.resolution} and depth {job.depth} yet; making one, "
@@ -171,8 +176,10 @@ def check(job: Job) -> None:
 
 
 def make(job: Job) -> tuple[Reference, bool]:
-    """Render until the reference is good enough or the time is over, and store it; also whether it is good
-    enough. One that the time has cut short does not replace a better one."""
+    """Render until the reference is good enough or the time is over, and store it.
+
+    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one.
+    """
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
     path = reference_path(job.project, job.scene.name, job.resolution, job.depth)
@@ -209,8 +216,11 @@ def _pixels(image):
 
 
 class Aim:
-    """What a reference has to judge: renders of default `bdpt` with ``spp`` samples per pixel, and of `path`
-    in the same time where that converges."""
+    """The renders that a reference has to judge.
+
+    Those of default `bdpt` with ``spp`` samples per pixel, and of `path` in the same time where that
+    converges.
+    """
 
     def __init__(self, job: Job, scene, by_path: bool):
         self.name, self.depth, spp = job.scene.name, job.depth, job.spp
@@ -312,8 +322,10 @@ def _pair(scene, integrator, halves: Halves, times: int = 1):
 
 
 class Window:
-    """A part of the image that needs more samples: the ``scene`` with that crop window, and the ``slices`` of
-    rows and columns."""
+    """A part of the image that needs more samples.
+
+    The ``scene`` with that crop window, and the ``slices`` of rows and columns.
+    """
 
     def __init__(self, job: Job, share):
         self.scene = job.scene.load(job.resolution, SAMPLER)
@@ -345,8 +357,10 @@ def said(job: Job, made: Reference, reached: bool) -> str:
 
 
 def run(options: Namespace) -> int:
-    """Make the references that the command line ``options`` name; the status is 1 if one failed or is not
-    good enough."""
+    """Make the references that the command line ``options`` name.
+
+    The status is 1 if one failed or is not good enough.
+    """
     if not (options.all or options.scenes):
         raise CommandError("reference: name a scene, or give --all")
     if options.all and options.scenes:

@@ -102,8 +102,11 @@ class Coefficients:
 
 
 def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Logarithms of the densities of each vertex: when sampled from the light and from the camera, shapes
-    (n, k + 1), and of x_0 by next-event estimation, (n,); area measure, at infinity solid angle."""
+    """Logarithms of the densities of each vertex.
+
+    When sampled from the light and from the camera, shapes (n, k + 1), and of x_0 by next-event estimation,
+    (n,); area measure, at infinity solid angle.
+    """
     k, n = paths.k, len(paths.kind)
     names = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
     names += ("first", "second", "direct", "lens_pdf", "sensor_pdf")
@@ -163,8 +166,10 @@ def log_densities(paths: Paths) -> np.ndarray:
 
 
 class Explicit:
-    """All strategies of ``paths`` under ``coefficients``: ``size`` log kappa p, (n, k + 2), and ``used``,
-    where that is finite."""
+    """All strategies of ``paths`` under ``coefficients``.
+
+    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite.
+    """
 
     def __init__(self, paths: Paths, coefficients: Coefficients):
         kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
@@ -181,8 +186,11 @@ class Explicit:
 
     @property
     def ambiguous(self):
-        """Mask (n,) of paths of which rounding decides under ``maximum``: a strategy lies about 1e-4 below
-        the best. Closer ones are equal to the kernel: that with the fewest light vertices counts."""
+        """Mask (n,) of paths of which rounding decides under ``maximum``.
+
+        A strategy lies about 1e-4 below the best. Closer ones are equal to the kernel: that with the fewest
+        light vertices counts.
+        """
         return ((self._ratio < 1 - 5e-5) & (self._ratio > 1 - 2e-4)).any(1)
 
     def weights(self, heuristic: str):

@@ -55,8 +55,10 @@ PLOTS = {
 
 
 def answer(results: Results, scene: str) -> tuple[float, str]:
-    """How the first integrator does against the stronger `path` in a scene: the ratio (infinite where `path`
-    fails, NaN where that cannot be said), and a sentence."""
+    """How the first integrator does against the stronger `path` in a scene: the ratio, and a sentence.
+
+    The ratio is infinite where `path` fails, NaN where that cannot be said.
+    """
     try:
         found = results.against_path(scene)
     except Biased as why:

@@ -50,9 +50,12 @@ MATCHES = ("seconds", "spp")
 
 @dataclass(frozen=True)
 class Method:
-    """An integrator of a preset: ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it
-    has in common with the first one, ``scenes`` where it takes part (None: everywhere), ``seeds`` of a budget
-    that it takes at most (None: all)."""
+    """An integrator of a preset.
+
+    ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it has in common with the first
+    one, ``scenes`` where it takes part (None: everywhere), ``seeds`` of a budget that it takes at most (None:
+    all).
+    """
 
     name: str
     parameters: tuple
@@ -79,8 +82,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class More:
-    """Further seeds of some ``methods`` in some scenes at one budget, ``at_least`` to ``at_most``, until the
-    interval of the median ratio of efficiencies is narrower than ``width``."""
+    """Further seeds of some ``methods`` in some scenes at one budget, ``at_least`` to ``at_most``.
+
+    Until the interval of the median ratio of efficiencies is narrower than ``width``.
+    """
 
     scenes: tuple
     methods: tuple

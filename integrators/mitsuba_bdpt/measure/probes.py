@@ -71,8 +71,10 @@ def _is_number(word) -> bool:
 
 
 def coldstart(project: Project, rounds: int) -> dict:
-    """Seconds from an empty kernel cache to the first image of the Cornell box, 256x256, depth 6, 16 spp, by
-    integrator, a value per round; imports and loading apart."""
+    """Seconds from an empty kernel cache to the first image, by integrator, a value per round.
+
+    Of the Cornell box, 256x256, depth 6, 16 spp; imports and loading apart.
+    """
     seconds = {"path": [], "bdpt": []}
     for _ in range(rounds):
         for name, values in seconds.items():
@@ -83,8 +85,10 @@ def coldstart(project: Project, rounds: int) -> dict:
 
 
 def memory(project: Project, rounds: int) -> dict:
-    """Peak resident GiB of a process that renders the Cornell box at 1920x1080, depth 8, by samples per
-    pixel, a value per round."""
+    """Peak resident GiB of a process that renders, by samples per pixel, a value per round.
+
+    It renders the Cornell box at 1920x1080, depth 8.
+    """
     return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
 
 

@@ -52,8 +52,10 @@ class Project:
         return sorted(path.stem for path in self.scenes.glob("*.xml"))
 
     def scene(self, name: str) -> SceneFile:
-        """A scene by its name, or by its file, seen from here or from the project's folder; raises
-        ``CommandError`` that says what there is if there is none."""
+        """A scene by its name, or by its file, seen from here or from the project's folder.
+
+        Raises ``CommandError`` that says what there is if there is none.
+        """
         for file in (Path(name), self.scenes / f"{name}.xml", self.root / name):
             if file.is_file():
                 return SceneFile(file.stem, file)
@@ -86,8 +88,10 @@ class Project:
         return text.rstrip("; ")
 
     def depth(self, scene: SceneFile) -> int:
-        """The ``max_depth`` at which a scene is rendered unless said: that of presets/benchmark.toml if there
-        is one, else that of the scene's file."""
+        """The ``max_depth`` at which a scene is rendered unless said.
+
+        That of presets/benchmark.toml if there is one, else that of the scene's file.
+        """
         benchmark = self.root / "presets" / "benchmark.toml"
         return depth_in(benchmark, read_toml(benchmark) if benchmark.is_file() else {}, scene)
 
@@ -105,8 +109,11 @@ class Project:
 
 
 def depth_in(file: Path, preset: dict, scene: SceneFile) -> int:
-    """The ``max_depth`` at which a preset, as read from a TOML ``file``, renders a scene: its own, else that
-    of all scenes, else that of the scene's file; raises ``CommandError`` for what is no such number."""
+    """The ``max_depth`` at which a preset, as read from a TOML ``file``, renders a scene.
+
+    Its own, else that of all scenes, else that of the scene's file. Raises ``CommandError`` for what is no
+    such number.
+    """
     own = table_of(file, "scene", preset.get("scene", {})).get(scene.name, {})
     merged = preset | table_of(file, f"scene.{scene.name}", own)
     return whole_of(file, "max_depth", merged["max_depth"]) if "max_depth" in merged else scene.max_depth

@@ -36,8 +36,11 @@ SHORTEST = 2  # edges: of single ones the emitters themselves are seen
 
 
 def technique_images(image, names: list, kind: str) -> dict:
-    """``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``, shape of ``image`` (..., 3),
-    out of a render whose last channels have these ``names``."""
+    """``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``.
+
+    They have the shape of ``image`` (..., 3), and come out of a render whose last channels have these
+    ``names``.
+    """
     first = image.shape[-1] - len(names)
     found = {}
     for i, name in enumerate(names):
@@ -73,7 +76,7 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """The pyramid as a picture: rows of path lengths, s rising to the right."""
+    """Draw the pyramid as a picture: rows of path lengths, s rising to the right."""
     lengths = sorted({k for k, _, _ in found})
     rows = [[key for key in found if key[0] == k] for k in lengths]
     columns = max(len(row) for row in rows)

@@ -30,11 +30,13 @@ class Lost(ValueError):
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """``f`` of a path, three colours, without the factors that change directions to areas; of its k + 2
-    strategies, s = 0 first, ``log_p`` over these factors (alone they leave floating point in long paths) as
-    the weights compare them, and ``log_turned``, the logarithm of what their delta events on
-    the light side add to f / p: these count in solid angle on the light's side, a light subpath has them on
-    the camera's."""
+    """``f`` of a path and the densities of its k + 2 strategies.
+
+    ``f``: three colours, without the factors that change directions to areas. Of the strategies, s = 0 first,
+    ``log_p`` over these factors (alone they leave floating point in long paths) as the weights compare them,
+    and ``log_turned``, the logarithm of what their delta events on the light side add to f / p: these count
+    in solid angle on the light's side, a light subpath has them on the camera's.
+    """
 
     f: np.ndarray
     log_p: np.ndarray
@@ -49,8 +51,10 @@ class Rebuilt:
         return _ratios(self.log_p - self.log_turned, s)
 
     def compared(self, s: int) -> np.ndarray:
-        """The same as the weights see them, which take both solid angles of a refraction for equal (Georgiev,
-        eqs. 53, 54)."""
+        """Densities of all strategies over that of one as the weights see them.
+
+        These take both solid angles of a refraction for equal (Georgiev, eqs. 53, 54).
+        """
         return _ratios(self.log_p, s)
 
 
@@ -60,9 +64,12 @@ def _ratios(log_p, s: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Event:
-    """What happens at a vertex: f cos (of delta events over their probability), densities of going on to the
-    light and to the camera, cosines with the geometric normal on the two sides, solid angle of a delta event
-    on the camera's side over that on the light's."""
+    """What happens at a vertex.
+
+    f cos (of delta events over their probability), densities of going on to the light and to the camera,
+    cosines with the geometric normal on the two sides, solid angle of a delta event on the camera's side over
+    that on the light's (``turned``).
+    """
 
     value: np.ndarray
     to_light: float
@@ -74,9 +81,12 @@ class _Event:
 
 @dataclass(frozen=True)
 class _Source:
-    """The emitter's end of a path: ``radiance`` (irradiance of a directional one), ``kind`` as in `oracle`,
-    cosine with the geometric normal, and densities: ``first`` and ``second`` of x_0 and x_1 in emission,
-    ``direct`` of x_0 in next-event estimation, as in `oracle.Paths`."""
+    """The emitter's end of a path.
+
+    ``radiance`` (irradiance of a directional one), ``kind`` as in `oracle`, cosine with the geometric normal,
+    and densities: ``first`` and ``second`` of x_0 and x_1 in emission, ``direct`` of x_0 in next-event
+    estimation, as in `oracle.Paths`.
+    """
 
     radiance: np.ndarray
     kind: int
@@ -211,8 +221,10 @@ def _lobe(ctx, bsdf, si, wo, i: int):
 
 
 def _turned(si, bs):
-    """Solid angle on the camera's side of a delta event over that on the light's: refraction keeps
-    eta^2 |m.w| dw, m the normal about which it refracts (along eta_c c + eta_l l)."""
+    """Solid angle on the camera's side of a delta event over that on the light's.
+
+    Refraction keeps eta^2 |m.w| dw, m the normal about which it refracts (along eta_c c + eta_l l).
+    """
     m = si.wi + bs.eta * bs.wo  # bs.eta = eta_l / eta_c
     ratio = dr.square(bs.eta) * dr.abs(dr.dot(m, bs.wo) / dr.dot(m, si.wi))
     refracted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission) & (dr.abs(bs.eta - 1) > 1e-5)
@@ -220,8 +232,10 @@ def _turned(si, bs):
 
 
 def _densities(scene, path, events, source):
-    """What the oracle asks for, with the first vertex on the emitter, and log of the sensor's importance, its
-    cosine and the density of its point included."""
+    """What the oracle asks for, with the first vertex on the emitter, and log of the sensor's importance.
+
+    Its cosine and the density of its point are included in the importance.
+    """
     sensor = scene.sensors()[0]
     lens, lens_pdf = sensor.class_name() == "ThinLensCamera", 1.0
     if lens:

@@ -48,9 +48,11 @@ class Launch:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A sample that adds ``value`` (three colours) over the samples of the pixel (``x``, ``y``) to it: the
-    camera sample ``slot`` of a ``launch``, or a splat of its light subpath; ``s`` and ``t`` of a splat, 0 for
-    camera samples, in which several strategies are summed."""
+    """A sample that adds ``value`` (three colours) over the pixel's samples to the pixel (``x``, ``y``).
+
+    The camera sample ``slot`` of a ``launch``, or a splat of its light subpath; ``s`` and ``t`` of a splat, 0
+    for camera samples, in which several strategies are summed.
+    """
 
     launch: Launch
     slot: int
@@ -62,8 +64,10 @@ class Outlier:
 
 
 class Collector(sink.Image):
-    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel). Raises
-    ``CommandError`` for a launch of too many ``lanes``."""
+    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel).
+
+    Raises ``CommandError`` for a launch of too many ``lanes``.
+    """
 
     def __init__(self, film, least, lanes: int):
         super().__init__(film)
@@ -114,8 +118,11 @@ class Collector(sink.Image):
 
 
 def _slots(launch: Launch, rows) -> list[int]:
-    """The camera samples that outliers are of: of those that share a lane, which lie in different pixels,
-    that in the outlier's; for splats that of the first part, whose slot is the lane."""
+    """The camera samples that outliers are of.
+
+    Of those that share a lane, which lie in different pixels, that in the outlier's; for splats that of the
+    first part, whose slot is the lane.
+    """
     if not len(rows):
         return []
     batch = launch.batch
@@ -137,8 +144,10 @@ def _outlier(launch: Launch, row, slot: int) -> Outlier:
 
 
 def render(scene, integrator, least, spp: int, seed: int):
-    """The image of a render, and the `Outlier` objects in it: all samples larger than ``least`` (of the
-    image's shape) in one of the colours, largest first. Raises ``CommandError`` for a film of other colours.
+    """The image of a render, and the `Outlier` objects in it, largest first.
+
+    They are all samples larger than ``least`` (of the image's shape) in one of the colours. Raises
+    ``CommandError`` for a film of other colours.
     """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -164,11 +173,14 @@ def render(scene, integrator, least, spp: int, seed: int):
 
 @dataclass
 class Path:
-    """A path by its vertices, z_0 first and y_0 last: positions ``p`` (k + 1, 3), of an emitter at infinity
-    the direction to it (``infinite``); ``shapes`` numbers of Dr.Jit, 0 for none; ``delta``: the event was a
-    delta event. ``value`` (three colours) what the strategy (``s``, ``t``) adds with the ``weight``, roulette
-    and the draw of a connection included; ``estimate`` without these two, unweighted. ``pdf_w`` of the
-    sensor's direction. ``survival``: the probability with which roulette let both subpaths live."""
+    """A path by its vertices, z_0 first and y_0 last, and what it adds.
+
+    Positions ``p`` (k + 1, 3), of an emitter at infinity the direction to it (``infinite``); ``shapes``
+    numbers of Dr.Jit, 0 for none; ``delta``: the event was a delta event. ``value`` (three colours) what the
+    strategy (``s``, ``t``) adds with the ``weight``, roulette and the draw of a connection included;
+    ``estimate`` without these two, unweighted. ``pdf_w`` of the sensor's direction. ``survival``: the
+    probability with which roulette let both subpaths live.
+    """
 
     s: int
     t: int
@@ -185,9 +197,11 @@ class Path:
 
 @dataclass
 class _Visit:
-    """What a walk left at a vertex, arrays of the lanes: ``joined`` position (or direction, where
-    ``infinite``) of the endpoint with which the vertex was joined, ``pdf_w`` of the sensor's direction
-    there."""
+    """What a walk left at a vertex, arrays of the lanes.
+
+    ``joined``: position (or direction, where ``infinite``) of the endpoint with which the vertex was joined;
+    ``pdf_w`` of the sensor's direction there.
+    """
 
     p: np.ndarray
     shape: np.ndarray
@@ -202,8 +216,10 @@ class _Visit:
 
 @dataclass
 class _Subpath:
-    """The position of its endpoint (at infinity, where ``infinite``, the direction to it), and the further
-    vertices."""
+    """A subpath: the position of its endpoint (``start``), and the further vertices (``visits``).
+
+    Of an endpoint at infinity, where ``infinite``, the direction to it.
+    """
 
     start: np.ndarray
     infinite: np.ndarray
@@ -224,8 +240,10 @@ def stepwise():
 
 
 class Recorder(Observer):
-    """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`: writes down contributions, and
-    the vertices of the walks."""
+    """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`.
+
+    Writes down contributions, and the vertices of the walks.
+    """
 
     alpha = False
 
@@ -328,8 +346,10 @@ class Recorder(Observer):
 
     def _distances(self, c, end):
         """How far the light vertex of a connection is from the ``end`` of a visibility ray, in each lane.
-        (Rays end short of the vertex drawn, by an offset that depends on the scene: it is the nearest one,
-        not one within a bound in units of the scene. One that is not seen adds nothing, drawn or not.)"""
+
+        Rays end short of the vertex drawn, by an offset that depends on the scene: it is the nearest one, not
+        one within a bound in units of the scene. One that is not seen adds nothing, drawn or not.
+        """
         y = np.array([self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))])
         return np.where(self._numbers(c.active) > 0, np.linalg.norm(end.T - y, axis=1), np.inf)
 
@@ -372,8 +392,10 @@ class Recorder(Observer):
         return Path(s, t, *numbers, pdf_w, np.array(p), list(shapes), list(delta), infinite, survival)
 
     def _vertices(self, subpath, count: int, i: int, joined: bool) -> list:
-        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath; no
-        event at the endpoint, and none of delta where it is ``joined``."""
+        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath.
+
+        No event at the endpoint, and none of delta where it is ``joined``.
+        """
         if not count:
             return []
         found = [(subpath.start[:, i], 0, False)]
@@ -384,8 +406,10 @@ class Recorder(Observer):
 
 
 def replay(outliers: list[Outlier]) -> list[list[Path]]:
-    """The paths in each outlier, those that add most first: of camera samples all that have t >= 2, of splats
-    those of the same strategy."""
+    """The paths in each outlier, those that add most first.
+
+    Of camera samples all that have t >= 2, of splats those of the same strategy.
+    """
     found: list[list[Path]] = [[] for _ in outliers]
     for launch in {id(o.launch): o.launch for o in outliers}.values():
         numbers = [i for i, o in enumerate(outliers) if o.launch is launch]

@@ -28,8 +28,11 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Reference:
-    """``image`` and ``difference`` (height, width, 3), half the difference of the halves; ``means`` for bias
-    checks, None if too few renders made it; ``provenance`` what made it."""
+    """A reference image, its error, and what made it.
+
+    ``image`` and ``difference`` (height, width, 3), half the difference of the halves; ``means`` for bias
+    checks, None if too few renders made it; ``provenance`` what made it.
+    """
 
     image: np.ndarray
     difference: np.ndarray
@@ -58,8 +61,10 @@ def make_command(project: Project, called: str, resolution: int, max_depth: int,
 
 
 def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
-    """The stored reference; raises ``CommandError`` with the command that makes it, if there is none, and
-    if it was made of another version of the scene's file."""
+    """The stored reference; raises ``CommandError`` with the command that makes it if it cannot serve.
+
+    That is if there is none, or if it was made of another version of the scene's file.
+    """
     path = reference_path(project, scene.name, resolution, max_depth)
     make = make_command(project, project.called(scene), resolution, max_depth)
     if not path.is_file():

@@ -47,8 +47,11 @@ from .tables import ranged, ratio, said, table
 
 
 def load(project: Project, folder: Path) -> tuple[Results, dict]:
-    """The data of a folder, and the references of its scenes by name; raises ``CommandError`` if no sweep has
-    filled it, and if the errors were taken against other references than those of the ``project``."""
+    """The data of a folder, and the references of its scenes by name.
+
+    Raises ``CommandError`` if no sweep has filled it, and if the errors were taken against other references
+    than those of the ``project``.
+    """
     try:
         rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
     except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
@@ -110,8 +113,10 @@ def efficiency_table(results: Results) -> str:
 
 
 def gaps_table(results: Results) -> str:
-    """How much of the error single values carry: raw over trimmed relMSE, of the first integrator and of the
-    first of `Results.standard`, scenes with most of it first."""
+    """Table of how much of the error single values carry: raw over trimmed relMSE.
+
+    Of the first integrator and of the first of `Results.standard`, scenes with most of it first.
+    """
     methods = results.methods[0], *results.standard[:1]
     rows = [
         [f"`{scene}`", *(said(lambda s=scene, m=method: results.gap(s, m)) for method in methods)]
@@ -486,8 +491,11 @@ def replace_part(text: str, name: str, part: str) -> str:
 
 
 def machine(results: Results) -> str:
-    """Where and with what it was measured; raises ``CommandError`` for rows of several machines or versions,
-    and for those of one scene by several sources of the plugin (a scene may be measured anew by itself)."""
+    """Where and with what it was measured.
+
+    Raises ``CommandError`` for rows of several machines or versions, and for those of one scene by several
+    sources of the plugin (a scene may be measured anew by itself).
+    """
     found, source_of, scenes = set(), {}, {}
     for row in results.rows:
         versions, scene = json.loads(row["versions"]), row["scene"]

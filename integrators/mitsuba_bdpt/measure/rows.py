@@ -34,8 +34,10 @@ def image_file(output: Path, cell: Cell) -> Path:
 
 
 def judge_of(project: Project, scene: SceneFile, resolution: int, depth: int):
-    """A reference, and the SHA-256 of its file, taken before: should another one replace it meanwhile, the
-    next run takes the errors anew."""
+    """A reference, and the SHA-256 of its file, taken before.
+
+    Should another one replace it meanwhile, the next run takes the errors anew.
+    """
     path = reference_path(project, scene.name, resolution, depth)
     sha256 = digest(path) if path.exists() else ""
     return load_reference(project, scene, resolution, depth), sha256
@@ -49,8 +51,11 @@ def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None
 
 
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
-    """All measures of an image; ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not
-    good enough for them. HDR-FLIP takes longer than most renders: only where ``flip``, else None."""
+    """All measures of an image.
+
+    ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not good enough for them.
+    HDR-FLIP takes longer than most renders: only where ``flip``, else None.
+    """
     raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
     own = [ref.share_of(image, trim) for trim in (0.0, metrics.TRIM)]
     return {
@@ -76,8 +81,10 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
 
 
 def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
-    """The rows of those cells, ``wanted`` ones of a scene's ``cells``, that are finished; their errors anew
-    where the reference is another now."""
+    """The rows of those cells, ``wanted`` ones of a scene's ``cells``, that are finished.
+
+    Their errors are taken anew where the reference is another now.
+    """
     project, scene, resolution, depth = cells.where()
     path, found = reference_path(project, scene.name, resolution, depth), []
     for cell in wanted:

@@ -24,8 +24,10 @@ class SceneFile:
     file: Path
 
     def load(self, resolution: int | None = None, sampler: str | None = None, **definitions):
-        """The ``mi.Scene`` with an image so many pixels wide, in the film's proportions, and its first
-        sensor's sampler of the type ``sampler``; what is None stays as in the file.
+        """The ``mi.Scene`` with an image so many pixels wide and a sampler of the type ``sampler``.
+
+        The image keeps the film's proportions, the sampler is the first sensor's; what is None stays as in
+        the file.
 
         Where the file has parameters ``$resolution`` and ``$sampler`` these are set, as are those of
         ``definitions``; else film and sampler are changed. Raises ``CommandError`` for a scene without
@@ -90,8 +92,10 @@ def integrator_of(parameters: dict, depth: int):
 
 
 def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) -> None:
-    """Raise ``CommandError`` if the plugin with these ``parameters``, called ``name``, or the ``sampler``
-    cannot be made."""
+    """Raise ``CommandError`` if a plugin or its sampler cannot be made.
+
+    The plugin has these ``parameters`` and is called ``name``; ``sampler`` is the sampler's type.
+    """
     for what, make in (
         (f"integrator {name!r}", lambda: integrator_of(parameters, depth)),
         (f"sampler of {name!r}", lambda: mi.load_dict({"type": sampler}) if sampler else None),

@@ -50,9 +50,11 @@ class Sweep:
         self._progress, self._task = Progress(), TaskID(0)  # those of `run`, until then shown nowhere
 
     def prepare(self, seconds: float):
-        """Complain of what cannot be rendered before hours of rendering, not after, and make references that
-        are missing, each for at most about so many ``seconds``. A scene without one is left out, and noted in
-        ``failed``: one scene must not cost the others."""
+        """Complain of what cannot be rendered, and make references that are missing.
+
+        Before hours of rendering, not after; each reference for at most about so many ``seconds``. A scene
+        without one is left out, and noted in ``failed``: one scene must not cost the others.
+        """
         wanted = [(cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing]
         for cells, missing in wanted:
             for method in {cell.method: cell for cell in missing}.values():
@@ -86,8 +88,10 @@ class Sweep:
         return found
 
     def run(self, progress: Progress, elsewhere=None):
-        """Render all that is not there yet, showing ``progress``; on a cluster if ``elsewhere``, a client and
-        the preset's text, is given."""
+        """Render all that is not there yet, showing ``progress``.
+
+        On a cluster if ``elsewhere``, a client and the preset's text, is given.
+        """
         scenes, todo = self.scenes, self._todo
         probed = 0 if elsewhere else len(self.preset.probes)
         self._progress = progress

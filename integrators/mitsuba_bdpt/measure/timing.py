@@ -1,5 +1,7 @@
-"""The one stopwatch of the scripts for renders in this process: seconds of a whole one. (What a new process
-takes is measured in that process, see `probes`.)"""
+"""The one stopwatch of the scripts for renders in this process: seconds of a whole one.
+
+What a new process takes is measured in that process, see `probes`.
+"""
 
 from __future__ import annotations
 

@@ -104,8 +104,10 @@ class _Ends:
 
 @dataclass
 class _Walk:
-    """A subpath on its way: its ray, what it carries, its edges, the distance that it has come; whether it
-    goes on."""
+    """A subpath on its way.
+
+    Its ray, what it carries, its edges, the distance that it has come; whether it goes on.
+    """
 
     ray: mi.Ray3f
     weight: mi.Spectrum

@@ -18,13 +18,16 @@ NET, NETS = 8, 2
 
 @dataclass(frozen=True)
 class Batch:
-    """The samples of one pass: pixels ``first_pixel`` and on, ``pixels`` of them (row by row in
-    the film region), samples ``first_sample`` and on, ``samples`` of each pixel.
+    """The samples of one pass, or of a pilot.
+
+    Pixels ``first_pixel`` and on, ``pixels`` of them (row by row in the film region), samples
+    ``first_sample`` and on, ``samples`` of each pixel.
 
     With ``spread``, for pilots, the pixels are not neighbours, but one by chance in each of equal parts of
     the first so many, and samples are independent of each other. Then come those of ``nets`` other pixels
-    chosen like that, `batch.NETS` of `batch.NET` samples each, which are points of a sequence of their
-    own; and so many times ``light`` as there are camera samples light subpaths."""
+    chosen like that, `batch.NETS` of `batch.NET` samples each, which are points of a sequence of their own;
+    and so many times ``light`` as there are camera samples light subpaths.
+    """
 
     first_pixel: int
     pixels: int

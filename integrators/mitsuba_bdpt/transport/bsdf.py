@@ -76,9 +76,11 @@ MANY = 10
 
 
 class Asked:
-    """Virtual calls of these BSDFs alone, which are `MANY` or not. (Mitsuba's visit all of the process, and a
-    kernel holds a function for each of them: those inside of others, which no ray meets, and those of other
-    scenes.)"""
+    """Virtual calls of these BSDFs alone, which are `MANY` or not.
+
+    Mitsuba's visit all of the process, and a kernel holds a function for each of them: those inside of
+    others, which no ray meets, and those of other scenes.
+    """
 
     def __init__(self, bsdfs: Iterable[mi.BSDF]):
         by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
@@ -95,8 +97,10 @@ class Asked:
         return len(self._bsdfs)
 
     def __call__(self, bsdf, question, *args):
-        """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask. A BSDF itself, in
-        place of a pointer, answers without a call."""
+        """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask.
+
+        A BSDF itself, in place of a pointer, answers without a call.
+        """
         # Run step by step, calls of functions of ours fail for `plastic`; its own methods do not.
         if isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
             return question(bsdf, *args)
@@ -104,8 +108,10 @@ class Asked:
         return dr.switch(number, [partial(question, b) for b in self._bsdfs], *args)
 
     def together(self, bsdf, questions, *args):
-        """Answers of ``questions(bsdf, *args)``, which asks through this object: in one call, or where there
-        are `MANY` BSDFs in one for each question."""
+        """Answers of ``questions(bsdf, *args)``, which asks through this object.
+
+        In one call, or where there are `MANY` BSDFs in one for each question.
+        """
         return questions(bsdf, *args) if self.many else self(bsdf, questions, *args)
 
 
@@ -115,8 +121,10 @@ def _registry_id(bsdf) -> int:
 
 @dataclass
 class Target:
-    """A local direction ``wo`` in which a BSDF is evaluated where ``active``; ``cos_ratio``, for light
-    vertices, |n.wo| / |n.wi| with the geometric normal."""
+    """A local direction ``wo`` in which a BSDF is evaluated where ``active``.
+
+    ``cos_ratio``, for light vertices: |n.wo| / |n.wi| with the geometric normal.
+    """
 
     wo: mi.Vector3f
     active: mi.Bool
@@ -154,8 +162,11 @@ def _evaluated(bsdf, si, wo, active, asked: Asked):
 
 
 def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
-    """The value is NaN, so that whoever uses it counts it, also where a density is not finite: no weight
-    follows from that. (Where the value is 0 it does not matter.)"""
+    """The `Evaluation` of a BSDF; its value is NaN also where a density is not finite.
+
+    NaN, so that whoever uses it counts it: no weight follows from such a density. (Where the value is 0 it
+    does not matter.)
+    """
     finite = dr.isfinite(pdf_fwd_w + pdf_rev_w)
     return Evaluation(dr.select(finite | is_zero(value), value, dr.nan), pdf_fwd_w, pdf_rev_w)
 
@@ -208,8 +219,10 @@ def sample(
 def sample_adjoint(
     bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
 ) -> tuple[Step, Evaluation | None]:
-    """Continue a light subpath; the adjoint factor is part of ``weight``, and of the evaluation's ``value``.
-    Arguments and results as of `sample`."""
+    """Continue a light subpath; arguments and results as of `sample`.
+
+    The adjoint factor is part of ``weight``, and of the evaluation's ``value``.
+    """
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
@@ -223,8 +236,10 @@ def sample_adjoint(
 
 
 def _answers(questions, asked: Asked, target, bsdf, *args):
-    """Answers of ``questions(bsdf, *args)``, the last of ``args`` a mask; direction and mask of a ``target``
-    follow."""
+    """Answers of ``questions(bsdf, *args)``, the last of ``args`` a mask.
+
+    Direction and mask of a ``target`` follow.
+    """
     joined = (target.wo, target.active) if target else ()
     mask = args[-1] | target.active if target else args[-1]
     # The last argument is the call's mask.
@@ -245,9 +260,11 @@ def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
 
 @dataclass
 class _Drawn:
-    """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode: its ``weight``, densities (that of the
-    event where it is delta) and, if `Traits.round_trip`, the weight ``back`` of a delta event made from its
-    other end, 0 if it does not lead back."""
+    """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode.
+
+    Its ``weight``, densities (that of the event where it is delta) and, if `Traits.round_trip`, the weight
+    ``back`` of a delta event made from its other end, 0 if it does not lead back.
+    """
 
     bs: mi.BSDFSample3f
     weight: mi.Spectrum
@@ -297,8 +314,10 @@ def _back(bsdf, si, bs, u1, u2, active):
 
 
 def _event_cos_ratio(si, bs):
-    """|m.l| / |m.c| about the normal m of a delta event, which under a bump or normal map is not
-    the shading frame's. Reflection and null: 1. Refraction: m along eta_c c + eta_l l.
+    """|m.l| / |m.c| about the normal m of a delta event.
+
+    Under a bump or normal map m is not the shading frame's. Reflection and null: 1. Refraction: m along eta_c
+    c + eta_l l.
     """
     m = bs.eta * bs.wo + si.wi  # bs.eta = eta_c / eta_l when sampling from l
     ratio = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))

@@ -111,9 +111,12 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
 
 @dataclass
 class _Drawn:
-    """A draw among inner connections: the weighted ``value`` of the one drawn, the ``total`` size of all, the
-    ``end`` of the visibility ray to it (its slot, if `ShapeErrors.small`), what is left of the random number
-    ``u``, and how many are not zero, and ``lost`` for want of a finite value."""
+    """A draw among inner connections.
+
+    The weighted ``value`` of the one drawn, the ``total`` size of all, the ``end`` of the visibility ray to
+    it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, and how many are not zero,
+    and ``lost`` for want of a finite value.
+    """
 
     value: mi.Spectrum
     total: mi.Float
@@ -162,7 +165,9 @@ def _sight(kernel: Kernel, z: Vertex, y: StoredVertex):
 
 
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
-    """Number of light vertices to try at ``z``: slot i holds y_{i+1} or a later one, and paths have at
-    most `Kernel.last_inner` edges."""
+    """Number of light vertices to try at ``z``.
+
+    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges.
+    """
     possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

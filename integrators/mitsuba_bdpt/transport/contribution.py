@@ -69,7 +69,8 @@ def roulette(
 def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool:
     """Mask: a strategy of this ``value`` and weight is worth a ray, or `drop_non_finite` has to count it.
 
-    (Of what is not finite the weight may be 0.) Technique images show unweighted ones too."""
+    Of what is not finite the weight may be 0. Technique images show unweighted ones too.
+    """
     return mi.Bool(True) if kernel.strategy_images else ~(weight == 0) | ~bsdf.is_finite(value)
 
 

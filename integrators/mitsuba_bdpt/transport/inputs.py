@@ -20,8 +20,10 @@ STORE_SIZES = (64, MAX_STORED)
 
 @dataclass
 class Coefficients:
-    """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`; the Python
-    number 0 for classes that are not in use."""
+    """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`.
+
+    The Python number 0 for classes that are not in use.
+    """
 
     hit: mi.Float | mi.Vector4f | int
     direct: mi.Float | mi.Vector4f | int
@@ -33,8 +35,10 @@ class Coefficients:
 
 @dataclass
 class Shared:
-    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves; ``u_wavelength``
-    chose the wavelengths, ``weight`` is 1 / their density."""
+    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves.
+
+    ``u_wavelength`` chose the wavelengths, ``weight`` is 1 / their density.
+    """
 
     time: mi.Float
     wavelengths: mi.Color0f | mi.Spectrum
@@ -72,8 +76,11 @@ class Kernel:
         self.inverse_threshold = f32(dr.inf)
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
-        """The kernel for one batch: with the batch's ``points`` and its exact count of light subpaths per
-        camera subpath, which the estimates of t <= 1 are divided by (weights keep the nominal one)."""
+        """The kernel for one batch, with the batch's ``points``.
+
+        ``count_light`` is the batch's exact count of light subpaths per camera subpath, which the estimates
+        of t <= 1 are divided by (weights keep the nominal one).
+        """
         other = copy(self)
         other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
         other.observer = observer
@@ -84,8 +91,11 @@ class Kernel:
         return k <= self._reach
 
     def set_threshold(self, size: mi.Float64):
-        """Contributions below this size play roulette (a power of two near it, so that the order of atomic
-        sums rarely changes a decision), none if it is 0. ``size``: ``Float64`` of width 1."""
+        """Contributions below ``size`` play roulette, none if it is 0.
+
+        The threshold is a power of two near it, so that the order of atomic sums rarely changes a decision.
+        ``size``: ``Float64`` of width 1.
+        """
         rounded = dr.exp2(dr.round(dr.log2(size)))
         self.inverse_threshold = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
         dr.eval(self.inverse_threshold)

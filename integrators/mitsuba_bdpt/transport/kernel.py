@@ -150,8 +150,10 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
 
 
 def _count_light(batch: Batch, sharing: Sharing) -> float:
-    """Light subpaths per camera subpath: exact also where S does not divide the batch. A pilot's estimates
-    are those of one, whose number it divides by itself."""
+    """Light subpaths per camera subpath: exact also where S does not divide the batch.
+
+    A pilot's estimates are those of one, whose number it divides by itself.
+    """
     return 1.0 if batch.spread else sharing.lanes / batch.size
 
 

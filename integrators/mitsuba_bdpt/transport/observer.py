@@ -19,9 +19,13 @@ class Observer:
         """A subpath is on its first edge; ``side`` is its `walk.Side`, ``stream`` its random numbers."""
 
     def vertex(self, side, walk, vertex, step):
-        """A subpath has reached a ``vertex`` (`walk.Vertex`) and sampled the next ``step`` (`bsdf.Step`, None
-        in scenes without surfaces); ``walk`` as it was before it arrived."""
+        """A subpath has reached a ``vertex`` (`walk.Vertex`) and sampled the next ``step``.
+
+        ``step`` is a `bsdf.Step`, None in scenes without surfaces; ``walk`` as it was before it arrived.
+        """
 
     def drawn(self, end):
-        """One inner connection of a camera vertex was drawn: the light vertex, or where a visibility ray ends
-        that is to reach it."""
+        """One inner connection of a camera vertex was drawn.
+
+        ``end``: the light vertex, or where a visibility ray ends that is to reach it.
+        """

@@ -42,8 +42,10 @@ _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # tell the keys of the rounds ap
 
 @dataclass
 class Seat:
-    """A lane's place in a part: ``row`` and ``column`` of its run, ``pixel`` in the run, ``sample`` of the
-    pixel."""
+    """A lane's place in a part.
+
+    ``row`` and ``column`` of its run, ``pixel`` in the run, ``sample`` of the pixel.
+    """
 
     lane: mi.UInt32
     row: mi.UInt32
@@ -53,10 +55,12 @@ class Seat:
 
 
 class Sharing:
-    """The map of a batch's camera samples to lanes. Slots number the camera samples, pixel by pixel with
-    ``samples`` of each of the ``pixels``; there are ``total`` of them. Each of the ``lanes`` serves
-    ``served`` slots or fewer, all in different pixels. The map is another for each ``seed`` (``UInt32``), so
-    that in the mean of several renders no two pixels share much.
+    """The map of a batch's camera samples to lanes.
+
+    Slots number the camera samples, pixel by pixel with ``samples`` of each of the ``pixels``; there are
+    ``total`` of them. Each of the ``lanes`` serves ``served`` slots or fewer, all in different pixels. The
+    map is another for each ``seed`` (``UInt32``), so that in the mean of several renders no two pixels share
+    much.
     """
 
     def __init__(self, pixels: int, samples: int, served: int, seed: mi.UInt32):
@@ -78,8 +82,10 @@ class Sharing:
         return Seat(lane, row, run - row * self._columns, pixel & self._last, lane - pixel * self._samples)
 
     def slot(self, seat: Seat, part: mi.UInt32) -> mi.UInt32:
-        """The sample of a ``part`` (``UInt32``) that a lane serves; there is none if this is not below
-        ``total``."""
+        """The sample of a ``part`` (``UInt32``) that a lane serves.
+
+        There is none if this is not below ``total``.
+        """
         keys = self._keys(part)
         row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))
         column = _turned(seat.column, self._columns, sobol.mix(row ^ keys[1]))
@@ -102,9 +108,11 @@ class Sharing:
         return [key ^ word for word in _ROUNDS]
 
     def _place(self, seat, part, row, column, hashed):
-        """Place in a part of what is dealt from a ``seat``; the first part stays as it is. Pixels of a run
-        change places too (by low bits of a hash whose high bits turned the column), or else those that share
-        lanes would lie a multiple of a run apart."""
+        """Place in a part of what is dealt from a ``seat``; the first part stays as it is.
+
+        Pixels of a run change places too (by low bits of a hash whose high bits turned the column), or else
+        those that share lanes would lie a multiple of a run apart.
+        """
         run = row * self._columns + column
         dealt = ((run << self._bits) + (seat.pixel ^ (hashed & self._last))) * self._samples + seat.sample
         return dr.select((seat.row < self._rows) & (part > 0), dealt, seat.lane)
@@ -119,9 +127,11 @@ def run_pixels(part: int) -> int:
 
 
 def table_size(runs: int) -> tuple[int, int]:
-    """Rows and columns of a table of ``runs`` or nearly so many: of those with between half and twice the
-    root of it as columns, the one that leaves out least, the squarest of these. 0 rows if there are no
-    runs."""
+    """Rows and columns of a table of ``runs`` or nearly so many; 0 rows if there are no runs.
+
+    Of those with between half and twice the root of it as columns, the one that leaves out least, the
+    squarest of these.
+    """
     root = isqrt(runs)
     sizes = ((runs // columns, columns) for columns in range(max(root // 2, 1), 2 * root + 2))
     return min(sizes, key=lambda size: (runs - size[0] * size[1], abs(size[0] - size[1])))

@@ -67,8 +67,10 @@ def _known(value, *pdfs):
 
 
 def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, bsdf.Target]:
-    """Sample an emitter for the camera vertex ``z``: an `emitters.Direct` and the `bsdf.Target` in which it
-    lies."""
+    """Sample an emitter for the camera vertex ``z``.
+
+    Returns an `emitters.Direct` and the `bsdf.Target` in which it lies.
+    """
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & bsdf.connectible(z.bsdf)
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
     e = kernel.emitters.sample_direct(z.si, u, active)
@@ -145,8 +147,10 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoin, bsdf.Target]:
-    """Join the light vertex ``y`` with the sensor: what `Sensor.join` returns, and the `bsdf.Target` in which
-    that lies."""
+    """Join the light vertex ``y`` with the sensor.
+
+    Returns what `Sensor.join` does, and the `bsdf.Target` in which that lies.
+    """
     active = y.hit & bsdf.connectible(y.bsdf) & (y.edges <= kernel.last_splat)
     join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.edges))
     active &= join.valid

@@ -72,10 +72,13 @@ class Walk:
 
 @dataclass
 class Vertex:
-    """A vertex that a walk has reached; ``partial`` is in the area measure (camera subpaths that
-    left the scene: solid angle). ``cos`` absolute geometric cosine of the edge to it; ``anchor``
-    starts rays; ``hit`` is false in the surroundings; ``endpoint`` with which it is to be joined and ``f``
-    the BSDF towards it (a `bsdf.Evaluation`), where ``endpoint_active``, see `Side`."""
+    """A vertex that a walk has reached.
+
+    ``partial`` is in the area measure (camera subpaths that left the scene: solid angle). ``cos`` absolute
+    geometric cosine of the edge to it; ``anchor`` starts rays; ``hit`` is false in the surroundings;
+    ``endpoint`` with which it is to be joined and ``f`` the BSDF towards it (a `bsdf.Evaluation`), where
+    ``endpoint_active``, see `Side`.
+    """
 
     si: mi.SurfaceInteraction3f
     bsdf: mi.BSDFPtr
@@ -96,17 +99,17 @@ class Vertex:
 
 @dataclass(frozen=True)
 class Side:
-    """What distinguishes the two kinds of subpath, and what stays the same along one: ``shared`` has its time
-    and wavelengths, roulette compares the throughput with ``reference``.
+    """What distinguishes the two kinds of subpath, and what stays the same along one.
+
+    ``shared`` has its time and wavelengths, roulette compares the throughput with ``reference``.
 
     ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
-    alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera
-    side). ``complete``: called with the first vertex of a light subpath, returns the density of
-    next-event estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event
-    other than null happened. ``parallel``: the first edge has one direction, its density is one across it.
-    ``join``: called with each vertex, returns the endpoint of the other side with which it is to be joined
-    (`emitters.Direct`, or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no
-    strategy does so.
+    alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera side).
+    ``complete``: called with the first vertex of a light subpath, returns the density of next-event
+    estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event other than null
+    happened. ``parallel``: the first edge has one direction, its density is one across it. ``join``: called
+    with each vertex, returns the endpoint of the other side with which it is to be joined (`emitters.Direct`,
+    or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no strategy does so.
     """
 
     name: str
@@ -154,8 +157,10 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
 
 
 def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
-    """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1 (s = 0 differs,
-    see `techniques.hit_emitter`); ``first`` is that at vertex 1, see `Side`."""
+    """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1.
+
+    s = 0 differs, see `techniques.hit_emitter`. ``first`` is that at vertex 1, see `Side`.
+    """
     return choose(edges == 1, first, kernel.kappa.inner)
 
 
