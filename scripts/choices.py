@@ -78,8 +78,10 @@ def measured(scene, integrator, seed: int, expected) -> np.ndarray:
 
 
 def product(rows, seeds=slice(None)) -> np.ndarray:
-    """Time times error, raw and trimmed, from `measured` of several seeds, of which the errors' means are
-    over ``seeds``; the time is the least, which neighbours disturbed least."""
+    """Time times error, raw and trimmed, from `measured` of several seeds.
+
+    Errors are means over ``seeds``; the time is the least, which neighbours disturbed least.
+    """
     rows = np.array(rows)
     return rows[:, 0].min() * rows[seeds, 1:].mean(axis=0)
 
@@ -103,8 +105,11 @@ def piloted(scene, settings) -> Counter:
 
 
 def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
-    """Integrators, by their names, of the candidates that are among the best or ``chosen``. Where those among
-    the best are ``known``, only of the best, by which the machine's speed is told, and the chosen."""
+    """Integrators, by their names, of the candidates that are among the best or ``chosen``.
+
+    Where those among the best are ``known``, only of the best, by which the machine's speed is told, and the
+    chosen.
+    """
     settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
     render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
     mean = pilot.measure(render.prepared, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
@@ -125,8 +130,10 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
 
 
 def as_fast(known: dict, found: dict) -> dict:
-    """``known`` rows with the times that they would have at the machine's present speed, which ``found``,
-    rows of some of the same choices, tell."""
+    """``known`` rows with the times that they would have at the machine's present speed.
+
+    That is told by ``found``, rows of some of the same choices.
+    """
     both = known.keys() & found.keys()
     speeds = [np.array(found[name])[:, 0].min() / np.array(known[name])[:, 0].min() for name in both]
     return {name: np.array(rows) * [np.median(speeds), 1, 1] for name, rows in known.items()}
@@ -140,8 +147,10 @@ def named(way: Configuration) -> str:
 
 
 def measure(name: str, known: dict) -> dict:
-    """A row: `measured` with each seed, of the default and of fixed choices (those ``known`` are kept, their
-    times scaled to the machine's present speed), and how often pilots have chosen which of these."""
+    """A row: `measured` with each seed, of the default and of fixed choices, and what pilots have chosen.
+
+    Choices that are ``known`` are kept, their times scaled to the machine's present speed.
+    """
     scene, depth, expected = loaded(name)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles

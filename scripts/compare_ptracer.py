@@ -35,10 +35,13 @@ RIGHT = 0.02  # relative: `bdpt` must be nearer to the right number, `ptracer` i
 
 @dataclass(frozen=True)
 class Case:
-    """``name`` (Markdown); ``scene`` makes it, depth ``depth`` and the parameters of both integrators.
+    """A scene that both integrators render.
+
+    ``name`` (Markdown); ``scene`` makes it, depth ``depth`` and the parameters of both integrators.
     ``right``: the known value, None: from `path`, which renders the scene ``equal`` instead where it is wrong
     about the first. ``measure`` makes a number of an image and `path`'s; ``what`` names it. ``errors``: the
-    number is an error, 0 where all is right, and ``limit`` what noise makes of it."""
+    number is an error, 0 where all is right, and ``limit`` what noise makes of it.
+    """
 
     name: str
     scene: Callable

@@ -64,8 +64,10 @@ WRONG = ("non_finite", "non_finite_in_pilot", "pixels_not_finite", "failed")
 
 
 def settings(number: int) -> tuple[dict, int]:
-    """Parameters of the plugin and width of the film for the ``number``-th render of a scene: over 48 renders
-    every size meets both kinds of skip and every heuristic."""
+    """Parameters of the plugin and width of the film for the ``number``-th render of a scene.
+
+    Over 48 renders every size meets both kinds of skip and every heuristic.
+    """
     turn = number // len(SKIPS)
     return {
         "skip": SKIPS[number % len(SKIPS)],
@@ -112,8 +114,11 @@ def peak() -> int:
 
 
 class Interruption:
-    """Whether Ctrl-C or SIGTERM came. No exception: Python drops one that comes in a destructor, and Mitsuba
-    makes another one of it while it loads a scene."""
+    """Whether Ctrl-C or SIGTERM came.
+
+    No exception: Python drops one that comes in a destructor, and Mitsuba makes another one of it while it
+    loads a scene.
+    """
 
     def __init__(self):
         self.asked = False
@@ -198,8 +203,7 @@ def add(path: Path, name: str, found: dict, source: str) -> dict:
 
 
 def left_out(record: dict, source: str) -> list[str]:
-    """Scenes that have failed too often with this version of the ``source`` to be tried again; with another
-    one they are."""
+    """Scenes that have failed too often with this version of the ``source`` to be tried again with it."""
     return [
         name
         for name, entry in record["scenes"].items()

@@ -34,8 +34,11 @@ PASSED, FAILED = 0, 1  # exit statuses of pytest
 
 @dataclass(frozen=True)
 class Mutant:
-    """``old`` stands exactly once in the module ``file``; with ``new`` in its place each of ``tests`` (names
-    that pytest takes) must fail."""
+    """A planted bug.
+
+    ``old`` stands exactly once in the module ``file``; with ``new`` in its place each of ``tests`` (names that
+    pytest takes) must fail.
+    """
 
     name: str
     file: str
@@ -487,8 +490,10 @@ MUTANTS = (
 
 
 def planted(folder: Path, mutant: Mutant | None) -> Path:
-    """A copy of the package in ``folder``, with the bug if there is one; returns what PYTHONPATH must begin
-    with. `ValueError` if the text to replace is not there once."""
+    """Copy the package into ``folder``, with the bug if there is one; returns what PYTHONPATH must begin with.
+
+    Raises ``ValueError`` if the text to replace is not there once.
+    """
     package = folder / PACKAGE.name
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
     if mutant is not None:

@@ -16,8 +16,10 @@ SCENES = PROJECT.scenes
 
 
 def verb(name: str) -> int:
-    """The exit status of ``python -m mitsuba_bdpt NAME`` with this process's arguments, in this repository
-    unless they say otherwise."""
+    """The exit status of ``python -m mitsuba_bdpt NAME`` with this process's arguments.
+
+    In this repository, unless they say otherwise.
+    """
     return main([name, "--project", str(ROOT), *sys.argv[1:]])
 
 

@@ -38,8 +38,11 @@ SAMPLES = 1 << 17  # in all pixels together: a correlation of 0 is found as 0.00
 
 
 def numbers(kind: str, count: int, draws, samples: int = SAMPLES, seed: int = 0) -> np.ndarray:
-    """What a sampler draws, (pixels, samples of a pixel, dimensions): ``draws`` names the dimensions of one
-    draw after the other, ``count`` the samples of a pixel before the sampler rounds it."""
+    """What a sampler draws, (pixels, samples of a pixel, dimensions).
+
+    ``draws`` names the dimensions of one draw after the other, ``count`` the samples of a pixel before the
+    sampler rounds it.
+    """
     sampler = mi.load_dict({"type": kind, "sample_count": count})
     count = sampler.sample_count()
     pixels = samples // count
@@ -105,8 +108,7 @@ SEEDS = 5
 
 
 def relative_error(name: str, depth: int, sampler: str, points: str, spp: int) -> float:
-    """relMSE without the worst 0.1 % of the values, times the samples per pixel that were traced: median
-    over seeds."""
+    """Median over seeds of relMSE without the worst 0.1 % of the values, times the samples per pixel traced."""
     scene = load_scene(name, resolution=RESOLUTION, sampler=sampler, spp=spp)
     reference = load_reference(name, RESOLUTION, depth)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "points": points})

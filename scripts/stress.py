@@ -139,8 +139,10 @@ def tried(case: Case) -> dict:
 
 
 def run(chosen: list[Case], jobs: int) -> list[dict]:
-    """Rows of the ``chosen`` cases, ``jobs`` at a time; what took longest the last time begins first, so that
-    no long one is left at the end."""
+    """Rows of the ``chosen`` cases, ``jobs`` at a time.
+
+    What took longest the last time begins first, so that no long one is left at the end.
+    """
     last = {row["name"]: row["seconds"] for row in json.loads(RECORD.read_text())} if RECORD.exists() else {}
     order = sorted(chosen, key=lambda case: -last.get(case.name, 0))
     with ThreadPoolExecutor(jobs) as pool:

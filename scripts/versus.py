@@ -66,8 +66,10 @@ for line in sys.stdin:
 
 
 class Checkout:
-    """A process that renders with the plugin of the checkout in a folder; raises ``ValueError`` if there is
-    none."""
+    """A process that renders with the plugin of the checkout in a folder.
+
+    Raises ``ValueError`` if there is none.
+    """
 
     def __init__(self, folder: Path, images: Path):
         sources = folder / "integrators"

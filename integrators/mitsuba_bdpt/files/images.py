@@ -23,8 +23,10 @@ MOST_CHANNELS = 1023
 
 
 def check_channels(film: mi.Film, layers: list[str]) -> None:
-    """Raise ``CommandError`` for more ``layers``, names of channels, than a file can hold, which would come
-    out after the render."""
+    """Raise ``CommandError`` for more ``layers``, names of channels, than a file can hold.
+
+    Before the render: writing would find it out after it.
+    """
     if len(layers) + film.base_channels_count() > MOST_CHANNELS // 2:
         count = film.prepare(layers)
         if count > MOST_CHANNELS:

@@ -99,8 +99,10 @@ def check_judged(rows, error: str) -> None:
 
 
 def unjudged(rows) -> dict[tuple[str, int], NotJudged]:
-    """Integrators and budgets of the ``rows`` of a scene whose errors, raw or trimmed, the reference is too
-    noisy for, with the refusal, of both errors the worse."""
+    """Integrators and budgets of the ``rows`` of a scene for whose errors the reference is too noisy.
+
+    With the refusal, of raw and trimmed errors that of the worse.
+    """
     found = {}
     for method, budget in dict.fromkeys((row["method"], row["budget"]) for row in rows):
         for error in OWN:

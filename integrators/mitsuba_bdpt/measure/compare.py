@@ -78,8 +78,10 @@ def line(name: str, sides: list[Side], target: Reference, spp: int, pairs: int) 
 
 
 def ratios(sides: list[Side], target: Reference, spp: int, pairs: int, on_render) -> list[str]:
-    """The figures of a scene's line; ``on_render`` is called with the seed before each render. Raises
-    `Refused` for an image without an error."""
+    """The figures of a scene's line; ``on_render`` is called with the seed before each render.
+
+    Raises `Refused` for an image without an error.
+    """
     found = []
     for seed in range(pairs + 1):
         pair = [None, None]

@@ -167,8 +167,10 @@ def obtained(job: Job) -> Reference:
 
 
 def check(job: Job) -> None:
-    """Raise ``CommandError`` for a reference that cannot be made or used, as far as that is known before
-    anything is rendered."""
+    """Raise ``CommandError`` for a reference that cannot be made or used.
+
+    As far as that is known before anything is rendered.
+    """
     Recipe.of(job.project, job.scene.name)
     check_size(job)
     if reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
@@ -195,8 +197,7 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def check_size(job: Job) -> None:
-    """Raise ``CommandError`` for an image that the tiles of a bias check do not divide, or without
-    colours."""
+    """Raise ``CommandError`` for an image without colours, or that the tiles of a bias check do not divide."""
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
@@ -232,8 +233,10 @@ class Aim:
                 self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
 
     def reached(self, reference: Reference) -> bool:
-        """Whether the reference carries little enough of their errors, and can serve in a bias check; raises
-        ``CommandError`` if it is black: no error is relative to that."""
+        """Whether the reference carries little enough of their errors, and can serve in a bias check.
+
+        Raises ``CommandError`` if it is black: no error is relative to that.
+        """
         if not reference.image.any():
             raise CommandError(
                 f"scene={self.name!r} is black: the samples of its reference found no light; check its "

@@ -64,8 +64,10 @@ def render(file: SceneFile, options: Namespace):
 
 
 def panels(images: dict) -> dict:
-    """Those `technique_images` to which anything contributes, but for single edges; raises ``CommandError``
-    if there are none."""
+    """Those `technique_images` to which anything contributes, but for single edges.
+
+    Raises ``CommandError`` if there are none.
+    """
     found = {key: image for key, image in images.items() if key[0] >= SHORTEST and image.any()}
     if not found:
         raise CommandError(

@@ -46,8 +46,10 @@ class SceneFile:
         return scene
 
     def film(self, resolution: int | None = None):
-        """The film of the first sensor; raises ``CommandError`` for one without colours, which no measure of
-        errors takes."""
+        """The film of the first sensor.
+
+        Raises ``CommandError`` for one without colours, which no measure of errors takes.
+        """
         film = choose_sensor(self.load(resolution), 0).film()
         if film.base_channels_count() < 3:
             raise CommandError(

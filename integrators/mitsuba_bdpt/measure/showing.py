@@ -1,5 +1,7 @@
-"""How far a measurement is: a bar on standard error, as from the command render; silent where that is no
-terminal. Words of the command itself belong before or after a bar, not inside."""
+"""How far a measurement is: a bar on standard error, as from the command render.
+
+Silent where that is no terminal. Words of the command itself belong before or after a bar, not inside.
+"""
 
 from __future__ import annotations
 

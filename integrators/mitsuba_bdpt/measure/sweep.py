@@ -207,8 +207,10 @@ def chosen(preset: Preset, names) -> Preset:
 
 
 def poor_reference(cells: Cells, table: list[dict]) -> list[str]:
-    """What the report will refuse of the rows of a scene since its reference is too poor, as it says it, and
-    the command that goes on with the reference."""
+    """What the report will refuse of the rows of a scene since its reference is too poor.
+
+    In its words, with the command that goes on with the reference.
+    """
     rows = analysis.select(table, scene=cells.subject.name)
     if not rows:
         return []
@@ -229,8 +231,7 @@ def poor_reference(cells: Cells, table: list[dict]) -> list[str]:
 
 
 def short_of_target(table: list[dict]) -> list[str]:
-    """A text about each integrator whose renders, of those in the ``table``, ended before they reached the
-    target error that the preset asks for."""
+    """A text about each integrator of which renders ended before they reached the preset's target error."""
     renders = {}
     for row in table:
         parameters = json.loads(row["parameters"])
