@@ -36,8 +36,8 @@ PASSED, FAILED = 0, 1  # exit statuses of pytest
 class Mutant:
     """A planted bug.
 
-    ``old`` stands exactly once in the module ``file``; with ``new`` in its place each of ``tests`` (names that
-    pytest takes) must fail.
+    ``old`` stands exactly once in the module ``file``; with ``new`` in its place each of ``tests`` (names
+    that pytest takes) must fail.
     """
 
     name: str
@@ -490,7 +490,7 @@ MUTANTS = (
 
 
 def planted(folder: Path, mutant: Mutant | None) -> Path:
-    """Copy the package into ``folder``, with the bug if there is one; returns what PYTHONPATH must begin with.
+    """Copy the package into ``folder``, with the bug if there is one; return what PYTHONPATH begins with.
 
     Raises ``ValueError`` if the text to replace is not there once.
     """

@@ -108,7 +108,7 @@ SEEDS = 5
 
 
 def relative_error(name: str, depth: int, sampler: str, points: str, spp: int) -> float:
-    """Median over seeds of relMSE without the worst 0.1 % of the values, times the samples per pixel traced."""
+    """Median over seeds of relMSE without the worst 0.1 % of the values, times samples per pixel traced."""
     scene = load_scene(name, resolution=RESOLUTION, sampler=sampler, spp=spp)
     reference = load_reference(name, RESOLUTION, depth)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "points": points})

@@ -197,7 +197,7 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def check_size(job: Job) -> None:
-    """Raise ``CommandError`` for an image without colours, or that the tiles of a bias check do not divide."""
+    """Raise ``CommandError`` for an image without colours, or that a bias check cannot divide into tiles."""
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
