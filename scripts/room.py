@@ -83,7 +83,7 @@ def room(materials: int, size: int = 128) -> dict:
     """A scene of so many materials for ``mi.load_dict``, ``size``^2 pixels.
 
     Walls, floor and a lamp of the first kind, and a grid of balls and blocks on the floor, one for each of
-    the other materials. The mix is that of `KINDS`, over and over; no two materials are equal. `MOST` at most.
+    the other materials. The mix is that of `KINDS`, over and over; no two are equal. `MOST` at most.
     """
     if not 1 <= materials <= MOST:
         raise ValueError(f"materials={materials} is out of range; a room has 1 to {MOST} of them")
