@@ -350,7 +350,7 @@ def test_row_bands_equal_one_launch(monkeypatch):
     scene = lamp_in_a_sphere()
     bdpt = integrator(max_depth=3, skip="none", light_paths=0)
     whole = image(bdpt, scene, spp=4)
-    monkeypatch.setattr(schedule, "PASS_SAMPLES", 16 * 3)
+    monkeypatch.setattr(schedule, "LAUNCH_SAMPLES", 16 * 3)
     np.testing.assert_allclose(image(bdpt, scene, spp=4), whole, rtol=1e-4)
 
 

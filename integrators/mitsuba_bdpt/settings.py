@@ -1,6 +1,6 @@
 """The integrator's parameters: the one place that knows their names, defaults, bounds and meanings.
 
-`parameters.read_settings` reads them, the plugin's manual is `manual` and docs/user/parameters.md is `table`.
+`properties.read_settings` reads them, the plugin's manual is `manual` and docs/user/parameters.md is `table`.
 """
 
 from __future__ import annotations

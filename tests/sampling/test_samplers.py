@@ -170,7 +170,7 @@ def test_passes_and_bands_keep_what_the_sampler_spreads(monkeypatch):
     independent = noise(scene, bdpt(**DIRECT | {"points": "independent"}), 1000)
     assert independent > 1.5 * whole
 
-    monkeypatch.setattr(schedule, "PASS_SAMPLES_SAMPLER", 2048)
+    monkeypatch.setattr(schedule, "LAUNCH_SAMPLES_SAMPLER", 2048)
     cut = bdpt(spp_per_pass=5, **DIRECT)
     assert noise(scene, cut, 2000) == pytest.approx(whole, rel=0.15)
     assert cut.statistics["passes"] == [4] * 4

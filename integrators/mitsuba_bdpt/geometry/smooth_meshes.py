@@ -1,4 +1,7 @@
-"""Geometric normals of meshes that have vertex normals."""
+"""Meshes that have vertex normals: which face Mitsuba's sampler has chosen, and its geometric normal.
+
+The choice is repeated here, and checked against Mitsuba's where a scene is prepared, see `mitsubas_choices`.
+"""
 
 from __future__ import annotations
 

@@ -8,16 +8,17 @@ from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport.batch import Batch
 
-# Samples in one kernel launch. Nothing per sample is kept in memory, so this only bounds how long
+# Samples in one kernel launch, but for launches of one row, which may have four times as many (see
+# `batches`). Nothing per sample is kept in memory, so this only bounds how long
 # a launch runs (seconds on a few cores) and with it the delay of Ctrl-C, timeout and progress.
-PASS_SAMPLES = 1 << 21
+LAUNCH_SAMPLES = 1 << 21
 
 # Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
 # every pass and does not average out (constant radiance, 2^12: 4e-6; 2^16: 5e-5; 2^20: 1e-3).
 MOST_SPP = 1 << 12
 
 # With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
-PASS_SAMPLES_SAMPLER = 1 << 20
+LAUNCH_SAMPLES_SAMPLER = 1 << 20
 
 # Independent images whose spread gives the variance: as few as the contract allows, since each has a
 # point sequence of its own and short sequences are worse.
@@ -29,7 +30,7 @@ FIRST_REPLICATE = 4
 
 def _most_samples(settings: Settings) -> int:
     """Samples in one launch."""
-    return PASS_SAMPLES_SAMPLER if settings.points == "sampler" else PASS_SAMPLES
+    return LAUNCH_SAMPLES_SAMPLER if settings.points == "sampler" else LAUNCH_SAMPLES
 
 
 def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:

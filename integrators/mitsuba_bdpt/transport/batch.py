@@ -1,4 +1,4 @@
-"""The samples of one pass, and where each of them lies."""
+"""The samples of one kernel launch, and where each of them lies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NET, NETS = 8, 2
 
 @dataclass(frozen=True)
 class Batch:
-    """The samples of one pass, or of a pilot.
+    """The samples of one launch: of a pass, of a band of its rows, or of a pilot.
 
     Pixels ``first_pixel`` and on, ``pixels`` of them (row by row in the film region), samples
     ``first_sample`` and on, ``samples`` of each pixel.

@@ -1,4 +1,4 @@
-"""One batch (a pass, or a band of its rows) as one kernel.
+"""One batch (a pass, a band of its rows, or a pilot) as one kernel.
 
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
 subpaths that it serves, in S different pixels (see `sharing`); all strategies of a pair are evaluated by that
@@ -11,42 +11,45 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
     time, wavelengths <- drawn for all subpaths of the lane                 _shared
 
     # The light subpath                                                     _light_subpath
-    y_0, direction <- an emitter, with pdf_first * pdf_second               _emission
+    y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   _emission
     (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
-    d_vcm <- 1 / densities of y_0 and direction (eq. 31)                    _light_walk
+    the first edge <- a ray; it ends here for want of a throughput          _light_walk
+    d_vcm <- 1 / densities of y_0 and direction (eq. 31)
     d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
-    the first edge <- a ray
-    for y in y_1, y_2, ...:                                                 walk.random_walk
-        d_vcm, d_vc <- in the area measure at y (eqs. 31, 32, 34, 35); at   walk._vertex
-            y_1 with next-event estimation's density of y_0 in d_vcm
-        direction of the next edge, BSDF towards the sensor <- one call     walk._interact
+    for y in y_1, y_2, ... up to where the subpath misses or ends:          walk.random_walk
+        if y is a hit: d_vcm, d_vc <- in the area measure (eqs. 31, 32,     walk._vertex
+            34, 35); at y_1 with next-event estimation's density of y_0
+            in d_vcm
+        a point of the sensor; direction of the next edge and BSDF towards  walk._interact
+            that point <- one virtual call
         t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
         t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
         keep y, if on a surface whose BSDF is not delta, for inner          stored_vertices
             connections, unless no camera subpath could reach it in time
-        throughput, d_vcm, d_vc <- the event at y (eqs. 34, 35, 53, 54)     walk._leave
+        d_vcm, d_vc (eqs. 34, 35, 53, 54), throughput <- the event at y     walk._leave
         roulette of the subpath; the next edge <- a ray
 
     # Its camera subpaths
-    for S pixels (one, without light subpaths):                             _serve_all, _camera_subpath
-        z_0, direction <- the sensor, at a point of the pixel               _camera_sample
-        d_vcm <- 1 / density of the direction                               _camera_walk
+    for S pixels (fewer in the last lanes; one without light subpaths):     _serve_all, _camera_subpath
+        z_0, direction, throughput <- the sensor, at a point of the pixel   _camera_sample
+        the first edge <- a ray                                             _camera_walk
+        d_vcm <- 1 / density of the direction (of z_0, if all are parallel) _first_partial
         d_vc <- kappa of t = 0 * cos / densities of z_0 and direction;
             0 without area
-        the first edge <- a ray
         total <- 0
-        for z in z_1, z_2, ...:                                             walk.random_walk
-            d_vcm, d_vc <- in the area measure at z                         walk._vertex
-            direction of the next edge, BSDF towards an emitter <- one call walk._interact
+        for z in z_1, z_2, ... up to where the subpath misses or ends:      walk.random_walk
+            if z is a hit: d_vcm, d_vc <- in the area measure               walk._vertex
+            a point of an emitter; direction of the next edge and BSDF      walk._interact
+                towards that point <- one virtual call
             s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
                         (eqs. 42, 43)
-            s = 1:  total += z lit by a point of an emitter (eqs. 44, 45)   techniques.next_event
+            s = 1:  total += z lit by the point (eqs. 44, 45)               techniques.next_event
             s >= 2: total += z joined with kept vertices y (eqs. 40, 41):
                         each of them,                                       connections.connect_all
                         or one, drawn by what it would add unshadowed       connections.connect_one
-            throughput, d_vcm, d_vc <- the event at z                       walk._leave
+            d_vcm, d_vc, throughput <- the event at z                       walk._leave
             roulette of the subpath; the next edge <- a ray
-        add the total to the pixel                                          sink.end
+        add the total to the film                                           sink.end
 
 Each strategy i of a path adds w_i f / (n_i p_i). n_i is its number of samples per camera sample: the light
 subpaths per camera subpath for t <= 1, else 1. The weights w_i are those of a `mis.Heuristic`; of the balance
@@ -56,13 +59,17 @@ heuristic (eq. 37)
 
 with kappa_j p_j / p_i added up over the strategies of fewer light vertices (light side) and of more (camera
 side), from the partial sums of y and z. kappa_i contains n_i, as 1 / S for t <= 1 (where S does not divide
-the batch, the estimate's n_i is the exact one: weights need only sum to 1). Classes of strategies that the
+the batch's pixels, the estimate's n_i is the exact one: weights need only sum to 1), beside what the plan
+gives the class (`inputs._coefficients`). Classes of strategies that the
 plan leaves out have kappa = 0 and are not recorded.
 
 What t = 1 or a drawn inner connection would add plays roulette before its shadow ray is traced
 (`contribution.roulette`). What is not finite is stopped, and counted: the walk ends a subpath
-(`walk.not_finite`), a contribution is dropped on its way to the sink (`contribution.drop_non_finite`), and
-the sink drops what the film would make of a colour.
+(`walk.not_finite`), a contribution is dropped before it is added up or drawn (`contribution.drop_non_finite`),
+and the sink drops colours of the film and features.
+
+A pilot's batch has several light subpaths per camera sample, most of them without one; its estimates are
+those of one each.
 """
 
 from __future__ import annotations
@@ -150,7 +157,7 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
 
 
 def _count_light(batch: Batch, sharing: Sharing) -> float:
-    """Light subpaths per camera subpath: exact also where S does not divide the batch.
+    """Light subpaths per camera subpath: exact also where S does not divide the batch's pixels.
 
     A pilot's estimates are those of one, whose number it divides by itself.
     """

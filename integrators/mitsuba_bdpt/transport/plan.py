@@ -11,7 +11,7 @@ class Plan:
 
     Classes: ``hit`` s=0, ``direct`` s=1 with t>=2, ``splat`` t=1 with s>=2, ``endpoints`` (1,1),
     ``arrival`` t=0, ``inner`` s,t>=2. ``camera_paths_per_light_path``: camera subpaths per light subpath (S).
-    ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t=1 over its count;
+    ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t<=1 over its count;
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out.
