@@ -65,8 +65,8 @@ plan leaves out have kappa = 0 and are not recorded.
 
 What t = 1 or a drawn inner connection would add plays roulette before its shadow ray is traced
 (`contribution.roulette`). What is not finite is stopped, and counted: the walk ends a subpath
-(`walk.not_finite`), a contribution is dropped before it is added up or drawn (`contribution.drop_non_finite`),
-and the sink drops colours of the film and features.
+(`walk.not_finite`), a contribution is dropped before it is added up or drawn
+(`contribution.drop_non_finite`), and the sink drops colours of the film and features.
 
 A pilot's batch has several light subpaths per camera sample, most of them without one; its estimates are
 those of one each.
