@@ -9,8 +9,8 @@ from ..settings import Settings
 from ..transport.batch import Batch
 
 # Samples in one kernel launch, but for launches of one row, which may have four times as many (see
-# `batches`). Nothing per sample is kept in memory, so this only bounds how long a launch runs (seconds on a few
-# cores) and with it the delay of Ctrl-C, timeout and progress.
+# `batches`). Nothing per sample is kept in memory, so this only bounds how long a launch runs (seconds on a
+# few cores) and with it the delay of Ctrl-C, timeout and progress.
 LAUNCH_SAMPLES = 1 << 21
 
 # Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
