@@ -274,7 +274,7 @@ NO_DERIVATIVES = (
 )
 
 
-def _result(film, develop: bool, evaluate: bool):
+def _result(film, develop: bool, evaluate: bool) -> mi.TensorXf:
     """What ``mi.Integrator.render`` returns."""
     if develop:
         result = film.develop()

@@ -588,7 +588,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))
-    lane = kernel._Lane(place, shared, path)
+    lane = kernel.Lane(place, shared, path)
     kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)

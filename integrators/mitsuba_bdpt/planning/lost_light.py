@@ -1,3 +1,7 @@
+# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
 """How much of an image's light no strategy finds: from a delta emitter by delta events to the eye.
 
 It leaves a delta emitter through glass (or another delta surface) and is seen through glass. Such a path has
@@ -10,7 +14,9 @@ taken to reflect evenly what it reflects in all, glossy ones too: of these a sin
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -25,6 +31,9 @@ from ..transport import bsdf
 from ..transport.inputs import Shared
 from ..transport.plan import Plan
 from .possible import unreachable_paths
+
+if TYPE_CHECKING:
+    from drjit.auto.ad import PCG32  # that of Mitsuba, of which its stubs do not know
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
 # deviation (24 seeds) is 0.06 for a block of glass that fills the view, and 0.07, 0.18, 0.28 and 0.31 in the
@@ -154,7 +163,7 @@ def lost_radiance(prepared: PreparedScene, plan: Plan, max_depth: int) -> dict[i
     return {int(i): float(single[i]) for i in np.flatnonzero(single)}
 
 
-def _warn_of_not_finite(prepared, indices):
+def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     """Say of which emitters, by their ``indices``, the light that is lost cannot be told."""
     emitters = prepared.scene.emitters()
     lamps = " and ".join(_called(emitters[i]) for i in indices[:NAMED])
@@ -190,23 +199,22 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float]) -> s
     return f"bdpt: {what}: this light, {share} of the image's, is missing, because {why}; {remedy}"
 
 
-def _called(emitter) -> str:
+def _called(emitter: mi.Emitter) -> str:
     """An emitter by its kind and the nearest id."""
     kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
     if emitter.id():
         return f"{kind} '{emitter.id()}'"
-    return (
-        f"the {kind} on shape '{shape.id()}'" if shape is not None and shape.id() else f"a {kind} without id"
-    )
+    on_shape = shape is not None and shape.id()  # pyright: ignore[reportUnnecessaryComparison]
+    return f"the {kind} on shape '{shape.id()}'" if on_shape else f"a {kind} without id"
 
 
-def _remedy(emitters) -> str:
+def _remedy(emitters: Iterable[mi.Emitter]) -> str:
     if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
         return "give the sun a disk: sunsky, an envmap, or an area light far away"
     return "give it a small area: an area light on a small sphere or disk"
 
 
-def _shared(prepared, generator) -> Shared:
+def _shared(prepared: PreparedScene, generator: PCG32) -> Shared:
     """Time and wavelengths of subpaths."""
     sensor = prepared.camera.sensor
     time = sensor.shutter_open() + generator.next_float32() * sensor.shutter_open_time()
@@ -217,21 +225,21 @@ def _shared(prepared, generator) -> Shared:
     return Shared(time, wavelengths, weight, u)
 
 
-def _two(generator):
+def _two(generator: PCG32) -> mi.Point2f:
     return mi.Point2f(generator.next_float32(), generator.next_float32())
 
 
-def _carried(value):
+def _carried(value: mi.Spectrum):
     """What a subpath carries: its colour.
 
     In spectral variants the mean over the wavelengths in each of them, since those of the other end are
     others.
     """
-    value = mi.unpolarized_spectrum(value)
-    return dr.mean(value) + dr.zeros(mi.UnpolarizedSpectrum) if mi.is_spectral else value
+    colour = mi.unpolarized_spectrum(value)
+    return dr.mean(colour) + dr.zeros(mi.UnpolarizedSpectrum) if mi.is_spectral else colour
 
 
-def _lit(prepared, plan, max_depth):
+def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi.UInt32, mi.Bool]:
     """Where light of delta emitters arrives by delta events and next-event estimation does not find it.
 
     Also the emitters' indices, and the mask of subpaths whose ray is not finite, which hit nothing.
@@ -251,7 +259,7 @@ def _lit(prepared, plan, max_depth):
     return ends, index, astray
 
 
-def _seen(prepared, plan, max_depth):
+def _seen(prepared: PreparedScene, plan: Plan, max_depth: int) -> _Ends:
     """What is seen by delta events in a way that t = 1 does not find.
 
     Weights are those of the irradiance there, distances the radii of the disks that stand for these points.
@@ -277,7 +285,15 @@ def _seen(prepared, plan, max_depth):
     return ends
 
 
-def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) -> _Ends:
+def _follow(
+    prepared: PreparedScene,
+    ray: mi.Ray3f,
+    weight: mi.Spectrum,
+    active: mi.Bool,
+    generator: PCG32,
+    max_depth: int,
+    adjoint: bool,
+) -> _Ends:
     """Follow rays by delta events to the first surface that has another lobe.
 
     Where one has both, a coin decides. One kernel for both sides.
@@ -285,7 +301,7 @@ def _follow(prepared, ray, weight, active, generator, max_depth, adjoint: bool) 
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
     last, is_adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
 
-    def body(walk, generator, ends):
+    def body(walk: _Walk, generator: PCG32, ends: _Ends) -> tuple[_Walk, PCG32, _Ends]:
         ray, weight = walk.ray, walk.weight
         si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=walk.active)
         active = walk.active & si.is_valid()
@@ -323,7 +339,7 @@ def _nowhere() -> _Ends:
     return _Ends(mi.Point3f(0), mi.Normal3f(0), no, black, mi.UInt32(0), mi.Float(0), black, no)
 
 
-def _reflectance(si, surface, generator, active):
+def _reflectance(si: mi.SurfaceInteraction3f, surface: mi.BSDFPtr, generator: PCG32, active: mi.Bool):
     """What a surface reflects of all that arrives from where ``si`` is seen.
 
     Known for diffuse ones; of others one sample, whose mean it is.
@@ -337,7 +353,9 @@ def _reflectance(si, surface, generator, active):
     return _carried(dr.select(diffuse, dr.minimum(even, 1), glossy))
 
 
-def _end(si, surface, walk: _Walk, reflectance) -> _Ends:
+def _end(
+    si: mi.SurfaceInteraction3f, surface: mi.BSDFPtr, walk: _Walk, reflectance: mi.UnpolarizedSpectrum
+) -> _Ends:
     """The end of a subpath at ``si``."""
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
@@ -355,16 +373,16 @@ def _end(si, surface, walk: _Walk, reflectance) -> _Ends:
     )
 
 
-def _has(surface, kind):
+def _has(surface: mi.BSDFPtr, kind: mi.BSDFFlags):
     return mi.has_flag(surface.flags(), kind)
 
 
-def _meetings(photons: _Ends, points: _Ends, max_depth):
+def _meetings(photons: _Ends, points: _Ends, max_depth: int):
     """What each of the ``photons`` adds to the ``points`` around it."""
     count = dr.opaque(mi.UInt32, dr.width(points.p))
     longest = dr.opaque(mi.UInt32, max_depth)
 
-    def body(i, total):
+    def body(i: mi.UInt32, total: mi.UnpolarizedSpectrum) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum]:
         point = dr.gather(_Ends, points, i)
         cos = dr.dot(point.n, photons.n)
         cos = dr.select(point.through, dr.abs(cos), cos)

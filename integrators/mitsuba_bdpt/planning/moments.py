@@ -1,3 +1,7 @@
+# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
 """Statistics of a pilot: variances of every way to render, and what points take off them.
 
 Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. The equations are those of
@@ -7,12 +11,17 @@ Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. T
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from ..transport.batch import NET, NETS
 from .rows import SAMPLE, SPLAT
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    Lanes = TypeVar("Lanes", np.ndarray, mi.UInt32)
 
 # Tiles of the image in each direction: of those whose brightness is known by itself, and of the larger ones
 # that stand in for them as far as it is noise. (A caustic and its shadow are smaller than the larger ones: in
@@ -141,7 +150,7 @@ class Splats:
     lanes: int
 
 
-def group(lane):
+def group(lane: Lanes) -> Lanes:
     """The independent part to which a sample, or the light subpath of a lane, belongs.
 
     The `PER_PIXEL` samples of a pixel, whose products are taken, are in the same.

@@ -1,3 +1,7 @@
+# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
 """A pilot: a few thousand bidirectional samples that tell the variance of every way to render.
 
 Whether light subpaths and inner connections pay is decided per image (`choice.choose`), by cost times
@@ -27,7 +31,9 @@ All is relative to the brightness of the place: a splat in a shadow weighs as mu
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -46,6 +52,18 @@ from . import moments
 from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Moments
 from .rows import SAMPLE, SPLAT, SUMS, Layout
+
+if TYPE_CHECKING:
+    from ..sampling.points import Stream
+    from ..sensors.records import CameraStart, Region
+    from ..transport.contribution import Contribution
+    from ..transport.inputs import Shared
+    from ..transport.kernel import CameraSample, Lane
+    from ..transport.walk import Vertex
+
+    # One number for each of the last weightings; of a camera sample by the name of a part of its row.
+    Row = list[mi.Float64]
+    Total = dict[str, Row | mi.UInt32]
 
 # A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
 # many as a sample of the pilot stands for: what a render is not likely to meet is missing from its image, not
@@ -84,7 +102,7 @@ class Pilot:
 
     alpha = False
 
-    def __init__(self, region, batch: Batch, rarest: float):
+    def __init__(self, region: Region, batch: Batch, rarest: float):
         self._region, self._lanes = region, batch.lanes
         self._first_net = batch.pixels * batch.samples
         self._least = dr.opaque(mi.Float64, 1 / rarest)
@@ -92,20 +110,22 @@ class Pilot:
         self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * SPLAT.width)
         dr.make_opaque(self._samples, self._splats)
 
-    def begin(self):
+    def begin(self) -> Total:
         """Nothing found yet."""
         return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {"joined": mi.UInt32(0)}
 
-    def add(self, kernel, c, total, start, shared):
+    def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
         """Add a contribution with t >= 2."""
         own, squares = self._parts(self._size(c), c)
         new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
-    def connect(self, kernel, z, lane, stream, total, start):
+    def connect(
+        self, kernel: Kernel, z: Vertex, lane: Lane, stream: Stream, total: Total, start: CameraStart
+    ) -> tuple[Total, Counters]:
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
-        def add(c, visible, total):
+        def add(c: Contribution, visible: mi.Bool, total: dict[str, Row]) -> dict[str, Row]:
             own, squares = self._parts(self._size(c), c)
             seen = {"visible": own, **squares}
             new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
@@ -125,7 +145,7 @@ class Pilot:
         found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
         return total | found, counted
 
-    def splat(self, kernel, c, shared) -> Counters:
+    def splat(self, kernel: Kernel, c: Contribution, shared: Shared) -> Counters:
         """Add a contribution with t <= 1."""
         size = self._size(c)
         row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(c.position)
@@ -134,7 +154,7 @@ class Pilot:
         _add(self._splats, SPLAT, found, row, size > 0)
         return Counters()
 
-    def end(self, kernel, lane, sample, total, seen) -> Counters:
+    def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
         """Add a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
         others = {"joined": total["joined"], "tile": self._tile(sample.start.position)}
@@ -142,11 +162,11 @@ class Pilot:
         _add(self._samples, SAMPLE, found, slot, sample.covered)
         return Counters()
 
-    def evaluate(self, counts):
+    def evaluate(self, counts: mi.UInt64):
         """Run what was recorded, and ``counts`` with it."""
         dr.eval(self._samples, self._splats, counts)
 
-    def moments(self, counts: dict) -> Moments:
+    def moments(self, counts: dict[str, int]) -> Moments:
         """What was found; ``counts`` what the lanes counted."""
         rows = np.array(self._samples).reshape(-1, SAMPLE.width)
         parts = slice(self._first_net), slice(self._first_net, None)
@@ -159,7 +179,7 @@ class Pilot:
         rays["joined"] = SAMPLE.of(rows, "joined").mean()
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
-    def _parts(self, size, c):
+    def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of this weighted ``size`` adds.
 
         Its estimates, of the weightings that have its class, and a dictionary of what it adds to ``moment``
@@ -187,7 +207,7 @@ class Pilot:
                 lights.append(dr.select(possible, square * (w.light**2 * shares["light"]), 0))
         return own, {"moment": squares, "light": lights}
 
-    def _rare(self, size, c, squares) -> list:
+    def _rare(self, size: mi.Float64, c: Contribution, squares: Row) -> Row:
         """Of the ``squares`` of a contribution of light tracing, those that points do not help.
 
         They are of paths that camera subpaths make too rarely, see `SELDOM`. (Not light that comes from a
@@ -200,7 +220,7 @@ class Pilot:
             for w, square in zip(WEIGHTINGS, squares, strict=True)
         ]
 
-    def _size(self, c):
+    def _size(self, c: Contribution) -> mi.Float64:
         """Weighted size of a contribution that counts, in double precision.
 
         Its square, in any unit of radiance, is too large or too small for single (at 1e12 outliers are, at
@@ -212,7 +232,7 @@ class Pilot:
         """
         return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
 
-    def _tile(self, position):
+    def _tile(self, position: mi.Point2f):
         uv = dr.clip(self._region.to_uv(position), 0, 1)
         xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
         return xy.y * FINE + xy.x
@@ -259,7 +279,7 @@ def measure(
     return replace(found, rays=found.rays | known)
 
 
-def _add(target, layout: Layout, found: dict, row, active):
+def _add(target: mi.Float64, layout: Layout, found: Mapping[str, Row], row: mi.UInt32, active: mi.Bool):
     """Add what was ``found`` to a row of ``target``, as a packet.
 
     (`dr.scatter` would evaluate what was recorded so far.)
@@ -269,22 +289,22 @@ def _add(target, layout: Layout, found: dict, row, active):
     dr.scatter_reduce(dr.ReduceOp.Add, target, packet, row, active)
 
 
-def _shares(size, c) -> dict:
+def _shares(size: mi.Float64, c: Contribution) -> dict[str, mi.Float | int]:
     """Shares of the classes in the sum of all densities; where there is nothing they may be 0 / 0."""
     return dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
 
 
-def _mean_colour(c):
+def _mean_colour(c: Contribution) -> mi.Float64:
     """Mean of the colours of a contribution, in double precision, which adds up unlike the largest."""
     colours = [mi.Float64(dr.abs(colour)) for colour in mi.unpolarized_spectrum(c.value)]
     return sum(colours) / len(colours) * mi.Float64(c.weight)
 
 
-def _none(n: int) -> list:
+def _none(n: int) -> Row:
     return [mi.Float64(0) for _ in range(n)]
 
 
-def _sums(total: list, more: list) -> list:
+def _sums(total: Row, more: Row) -> Row:
     """``total`` with ``more``, which has an entry for the last weightings only, added to these.
 
     What gets nothing is left as it is: loops do not hold it, see `walk.Walk`.
@@ -293,7 +313,7 @@ def _sums(total: list, more: list) -> list:
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 
 
-def _dot(w: Weighting, shares, power: int):
+def _dot(w: Weighting, shares: Mapping[str, mi.Float | int], power: int):
     """sum_i kappa_i^power share_i over the classes in use."""
     terms = [(w.of(kind) and w.of(kind) ** power, share) for kind, share in shares.items()]
     used = [

@@ -1,3 +1,7 @@
+# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
 """Decides how a render goes on: by parameters, by the scene alone, or by pilots."""
 
 from __future__ import annotations
@@ -52,7 +56,7 @@ class Decided:
     ``no_pilot``: why the first pilot was not asked, or decided nothing; ``moments`` of all pilots."""
 
     decisions: tuple[Decision, ...] = ()
-    left_out: tuple[dict, ...] = ()
+    left_out: tuple[dict[str, str], ...] = ()
     no_pilot: str = ""
     moments: Moments | None = None
     pilots: Pilots = Pilots()
@@ -87,7 +91,7 @@ class Planner:
             self.adopt(decision, even_sky.LEFT_OUT)
         return not settled
 
-    def is_repeat_due(self, passes: tuple) -> bool:
+    def is_repeat_due(self, passes: tuple[int, ...]) -> bool:
         """Whether it is time for another pilot, early in a long render; true once for each time."""
         pilots, done = self.decided.pilots, sum(passes)
         if not passes or done < pilots.repeat or self._settings.variance or self._settings.decisions:
@@ -99,7 +103,7 @@ class Planner:
         # A scene's sampler cannot start again in the middle of its samples.
         return done <= LATEST_REPEAT * self._spp and self._settings.points != "sampler"
 
-    def ask(self, passes: tuple) -> list[choice.Prediction]:
+    def ask(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Ask a pilot and adopt what it says; returns its predictions, the best first."""
         samples = self._expected(passes)
         moments = self._measured(budget.lanes(samples), samples)
@@ -135,7 +139,7 @@ class Planner:
         self.decided = replace(self.decided, pilots=pilots)
         return found if before is None else before.joined(found)
 
-    def replay(self, passes: tuple):
+    def replay(self, passes: tuple[int, ...]):
         """Adopt the decision that the parameters give for the next pass, if there is one."""
         for decision in self._settings.decisions or ():
             if decision.first_pass == len(passes):
@@ -168,7 +172,7 @@ class Planner:
             self.adopt(decision, decided.left_out)
         self.decided = decided
 
-    def certainty(self, passes: tuple) -> float:
+    def certainty(self, passes: tuple[int, ...]) -> float:
         """`choice.certainty` of what the pilots decided."""
         return choice.certainty(self.decided.moments, self._alternatives(self._expected(passes)))
 
@@ -177,11 +181,11 @@ class Planner:
         moments = self.decided.moments
         return 0 if moments is None else round(moments.rays["non_finite"] * moments.lanes)
 
-    def why_no_pilot(self, passes: tuple = ()) -> str:
+    def why_no_pilot(self, passes: tuple[int, ...] = ()) -> str:
         """Why there is no table of a pilot's, as a sentence."""
         return f"no pilot: {self._settled(passes)[0] or SAW_NOTHING}"
 
-    def _settled(self, passes: tuple) -> tuple[str, Decision | None]:
+    def _settled(self, passes: tuple[int, ...]) -> tuple[str, Decision | None]:
         """Why no pilot is asked about the rest of the render, and what is decided without one.
 
         The reason is empty if one is asked; the decision is ``None`` if there is none.
@@ -205,7 +209,7 @@ class Planner:
         possible = candidates(self._prepared, self.full, self._settings)
         return choice.Alternatives(possible, self._has_stratified_points(), samples)
 
-    def _expected(self, passes: tuple) -> int:
+    def _expected(self, passes: tuple[int, ...]) -> int:
         """Samples still to come, as far as that is known."""
         done = sum(passes)
         left = (self._spp - done) * self._pixels

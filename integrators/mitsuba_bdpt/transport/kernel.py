@@ -92,7 +92,7 @@ from .walk import Side, Walk, not_finite, random_walk
 
 
 @dataclass
-class _Lane:
+class Lane:
     """What a lane's camera subpaths share: the map of samples, time and wavelengths, light vertices."""
 
     place: Places
@@ -101,7 +101,7 @@ class _Lane:
 
 
 @dataclass
-class _Sample:
+class CameraSample:
     """A camera sample: its `CameraStart`, random numbers, point of the lens, and whether there is one."""
 
     start: CameraStart
@@ -164,7 +164,7 @@ def _count_light(batch: Batch, sharing: Sharing) -> float:
     return 1.0 if batch.spread else sharing.lanes / batch.size
 
 
-def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[_Lane, Counters]:
+def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     """The lanes of these numbers with their light subpaths, which are traced."""
     stream = kernel.points.stream("light", place.index(index), index)
     shared = _shared(kernel, stream)
@@ -172,7 +172,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[_Lane, Counters]
     counters = Counters()
     if kernel.plan.light:
         path, counters = _light_subpath(kernel, sink, stream, shared, path)
-    return _Lane(place, shared, path), counters
+    return Lane(place, shared, path), counters
 
 
 def _shared(kernel: Kernel, stream) -> Shared:
@@ -284,7 +284,7 @@ def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     return counters
 
 
-def _camera_subpath(kernel: Kernel, sink, lane: _Lane, slot, active) -> Counters:
+def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and join it with the lane's light subpath."""
     sample = _camera_sample(kernel, lane, slot, active)
     active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
@@ -297,7 +297,7 @@ def _camera_subpath(kernel: Kernel, sink, lane: _Lane, slot, active) -> Counters
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 
-def _camera_sample(kernel: Kernel, lane: _Lane, slot, active) -> _Sample:
+def _camera_sample(kernel: Kernel, lane: Lane, slot, active) -> CameraSample:
     """z_0 and the first direction."""
     points = kernel.points
     stream = points.stream("camera", lane.place.index(slot), slot)
@@ -306,7 +306,7 @@ def _camera_sample(kernel: Kernel, lane: _Lane, slot, active) -> _Sample:
     if kernel.camera.needs_aperture_sample:
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
     start = kernel.camera.start(lane.place.pixel(slot), u_film, u_lens, lane.shared)
-    return _Sample(start, stream, u_lens, active)
+    return CameraSample(start, stream, u_lens, active)
 
 
 def _camera_walk(kernel: Kernel, start, active) -> Walk:
@@ -329,7 +329,7 @@ def _first_partial(kernel: Kernel, start):
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
 
 
-def _camera_side(kernel: Kernel, sink, sample: _Sample, shared, walk) -> Side:
+def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Side:
     def choose_emitter(z):
         return techniques.choose_emitter(kernel, z, sample.stream)
 
@@ -346,7 +346,7 @@ def _camera_side(kernel: Kernel, sink, sample: _Sample, shared, walk) -> Side:
     )
 
 
-def _camera_visit(kernel: Kernel, sink, lane: _Lane, sample: _Sample):
+def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
     """What is done at each vertex of a camera subpath: the strategies with t >= 2."""
     plan, start, shared = kernel.plan, sample.start, lane.shared
 

@@ -1,3 +1,7 @@
+# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
 """Multiple importance sampling of all strategies (s, t) by recursive partial sums.
 
 Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland
@@ -116,9 +120,12 @@ class Heuristic:
             return dr.select(inverse_pdf > 0, 1.0, 0.0)
         return dr.minimum(inverse_pdf, SATURATION)
 
-    def weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
+    def weigh(
+        self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
+    ) -> tuple[mi.Float, mi.Vector4f | None]:
         """`weight`, and the classes' shares of it, which only `ByClass` knows."""
-        return self.weight(coefficient, light_side, camera_side), None
+        # The stubs take numbers and sums of entries for something else.
+        return self.weight(coefficient, light_side, camera_side), None  # pyright: ignore[reportReturnType]
 
     def weight(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
         """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
@@ -154,11 +161,13 @@ class ByClass(Heuristic):
     def zero(self) -> mi.Vector4f:
         return mi.Vector4f(0)
 
-    def weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
+    def weigh(
+        self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
+    ) -> tuple[mi.Float, mi.Vector4f | None]:
         """Weight of the strategy at hand, and the share of each class in the sum of all strategies."""
         total = self.combine(self.combine(light_side, camera_side), coefficient)
         shares = total / dr.sum(total)
-        return dr.sum(coefficient) / dr.sum(total), shares
+        return dr.sum(coefficient) / dr.sum(total), shares  # pyright: ignore[reportReturnType]
 
 
 def to_area(heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float) -> Partial:
