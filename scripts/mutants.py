@@ -492,7 +492,7 @@ MUTANTS = (
 def planted(folder: Path, mutant: Mutant | None) -> Path:
     """Copy the package into ``folder``, with the bug if there is one; return what PYTHONPATH begins with.
 
-    Raises ``ValueError`` if the text to replace is not there once.
+    Raises ``CommandError`` if the text to replace is not there once.
     """
     package = folder / PACKAGE.name
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))

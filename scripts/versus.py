@@ -68,7 +68,7 @@ for line in sys.stdin:
 class Checkout:
     """A process that renders with the plugin of the checkout in a folder.
 
-    Raises ``ValueError`` if there is none.
+    Raises ``CommandError`` if there is none.
     """
 
     def __init__(self, folder: Path, images: Path):

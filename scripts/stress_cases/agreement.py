@@ -59,8 +59,11 @@ class Judged(Outcome):
 
 
 def judged(ours, theirs: Sample, reach: float, what: str) -> Judged:
-    """Welch's test of the tiles of ``ours``, Sidak over them; ``reach``: the largest relative error of the
-    image's mean that it may overlook (seen with a chance of one half), else it shows nothing."""
+    """Welch's test of the tiles of ``ours``, Sidak over them.
+
+    ``reach``: the largest relative error of the image's mean that it may overlook (seen with a chance of one
+    half), else it shows nothing.
+    """
     ours = Sample.of(ours)
     found = welch(ours, theirs)
     p = sidak(found.p)
@@ -83,8 +86,10 @@ def against_known(ours, expected, reach: float) -> Judged:
 
 
 def family(pairs, most_error: float) -> Outcome:
-    """t-tests of ``pairs`` of `Sample`s together, and whether the mean standard error of each pair's
-    differences is at most ``most_error`` of its mean, else the tests show nothing."""
+    """t-tests of ``pairs`` of `Sample`s together; they show nothing where the noise is too large.
+
+    That is where the mean standard error of a pair's differences is more than ``most_error`` of its mean.
+    """
     p, gap, error = [], 0.0, 0.0
     for a, b in pairs:
         found = welch(a, b)
@@ -99,8 +104,10 @@ def family(pairs, most_error: float) -> Outcome:
 
 
 def deviation(a: Sample, b: Sample) -> tuple[float, float]:
-    """Root mean square of what the tiles of ``b`` are off, over the mean of ``a``, less noise; and that
-    noise, the root mean square of their standard errors."""
+    """Root mean square of what the tiles of ``b`` are off, less noise, and that noise.
+
+    Both over the mean of ``a``; the noise is the root mean square of their standard errors.
+    """
     difference = welch(a, b)
     noise = (difference.error**2).mean()
     square = (difference.value**2).mean() - noise
@@ -108,8 +115,10 @@ def deviation(a: Sample, b: Sample) -> tuple[float, float]:
 
 
 def worst(outcomes: dict[str, Judged]) -> Outcome:
-    """Several tests, by what was tried, as one: expected if all are. Of those that are, only the one with
-    the smallest p is told."""
+    """Several tests, by what was tried, as one: expected if all are.
+
+    Of those that are, only the one with the smallest p is told.
+    """
     wrong = {name: outcome for name, outcome in outcomes.items() if not outcome.ok}
     if wrong:
         return together(wrong)

@@ -1,5 +1,6 @@
-"""Load scene files and render each, saying what happened: one line of JSON per file. A process for what may
-crash or hang.
+"""Load scene files and render each, saying what happened: one line of JSON per file.
+
+A process for what may crash or hang.
 
     python -m stress_cases.attempt INTEGRATOR FILE ...
 """
@@ -22,9 +23,12 @@ MEMORY = 16 << 30
 
 
 def attempt(path: str, integrator: str) -> dict:
-    """``stage`` that was reached (``load``, ``render`` or ``image``), and an exception's ``kind`` and
-    ``text``, or of the images of all seeds: their ``means``, how many values of them are ``bad``, not finite,
-    and how many were ``counted`` and left out."""
+    """What became of a scene file: the ``stage`` that was reached, and an error or figures of the images.
+
+    ``stage``: ``load``, ``render`` or ``image``. Of an exception its ``kind`` and ``text``; of the images of
+    all seeds their ``means``, how many values of them are ``bad``, not finite, and how many were ``counted``
+    and left out.
+    """
     stage = "load"
     try:
         scene = mi.load_file(path, parallel=False, resolution=SIZE, integrator=integrator)

@@ -34,8 +34,11 @@ MOST_TURNED = 1e-3
 
 @dataclass
 class Point:
-    """A vertex of paths: position, geometric normal, densities of the directions to both neighbours, and
-    whether its event is a delta one."""
+    """A vertex of paths.
+
+    Position, geometric normal, densities of the directions to both neighbours, and whether its event is a
+    delta one.
+    """
 
     p: np.ndarray
     n: np.ndarray
@@ -49,8 +52,10 @@ POINT = tuple(f.name for f in fields(Point))
 
 @dataclass
 class Walked:
-    """What a walk passed by, from vertex 1 on: ``vertices``, directions ``d`` of the edges to them, `Point`
-    where the walk went on; ``origin`` vertex 0."""
+    """What a walk passed by, from vertex 1 on.
+
+    ``vertices``, directions ``d`` of the edges to them, `Point` where the walk went on; ``origin`` vertex 0.
+    """
 
     origin: object = None
     vertices: list = field(default_factory=list)
@@ -60,10 +65,12 @@ class Walked:
 
 @dataclass
 class Made:
-    """Paths that the kernel made with ``s`` light vertices: the ``weights`` it gave them; ``unsure`` counts
-    those left out, where rounding decides which disk light from infinity has started on, whether a point
-    lies on a lamp, what the density of an environment map is at its poles, or what the cosines of a short
-    edge are (`MOST_TURNED`)."""
+    """Paths that the kernel made with ``s`` light vertices, and the ``weights`` it gave them.
+
+    ``unsure`` counts those left out, where rounding decides which disk light from infinity has started on,
+    whether a point lies on a lamp, what the density of an environment map is at its poles, or what the
+    cosines of a short edge are (`MOST_TURNED`).
+    """
 
     s: int
     weights: np.ndarray
@@ -77,16 +84,20 @@ def rows(v) -> np.ndarray:
 
 
 def densities(si, to_light, to_camera):
-    """Solid-angle densities with which the BSDF at ``si`` samples each of two local directions from the
-    other: ``to_camera``, ``to_light``."""
+    """Solid-angle densities with which the BSDF at ``si`` samples each of two directions from the other.
+
+    The directions are local: ``to_camera``, then ``to_light``.
+    """
     ctx, plugin = mi.BSDFContext(), si.bsdf()
     forward = plugin.pdf(ctx, bsdf.with_wi(si, to_light), to_camera)
     return forward, plugin.pdf(ctx, bsdf.with_wi(si, to_camera), to_light)
 
 
 class Capture(Observer):
-    """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer; `made` yields
-    all paths."""
+    """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer.
+
+    `made` yields all paths.
+    """
 
     def __init__(self, scene, integrator, lanes: int, seed: int):
         self.scene, self.lanes = scene, lanes
@@ -229,8 +240,10 @@ class Capture(Observer):
         return Made(s, weights[sure], paths.of(sure), int((~sure).sum()))
 
     def _paths(self, index, stacked, d):
-        """The `Paths` through vertices, fields of `Point` side by side, along the directions ``d``; and where
-        their densities are certain."""
+        """The `Paths` through vertices along the directions ``d``; and where their densities are certain.
+
+        ``stacked``: fields of `Point` side by side.
+        """
         x, n, *pdfs = stacked
         kind = np.array([lamp.kind for lamp in self.lamps])[index]
         infinite = (kind == ENVIRONMENT) | (kind == DIRECTIONAL)

@@ -29,9 +29,12 @@ COEFFICIENTS = {
 
 
 def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
-    """``n`` random paths: densities spread over ``2 decades`` orders of magnitude, squared
-    distances over ``2 geometry``, a share ``delta`` of delta vertices, all kinds of emitters and
-    both kinds of sensors. All numbers are float32 exactly."""
+    """``n`` random paths of ``k`` edges.
+
+    Densities spread over ``2 decades`` orders of magnitude, squared distances over ``2 geometry``, a share
+    ``delta`` of delta vertices, all kinds of emitters and both kinds of sensors. All numbers are float32
+    exactly.
+    """
 
     def spread(shape, width):
         return (10.0 ** rng.uniform(-width, width, shape)).astype(np.float32)
@@ -81,8 +84,10 @@ def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
 
 @dataclass
 class Columns:
-    """`Paths` as Dr.Jit arrays: a list of one for each edge or vertex where `Paths` has columns; masks of the
-    kinds of emitters in place of ``kind``, and ``ratio``, see `emitters.Direct.emission_ratio`."""
+    """`Paths` as Dr.Jit arrays: a list of one for each edge or vertex where `Paths` has columns.
+
+    Masks of the kinds of emitters in place of ``kind``, and ``ratio``, see `emitters.Direct.emission_ratio`.
+    """
 
     k: int
     dist2: list
@@ -134,8 +139,10 @@ class Columns:
 
 
 class Recursion:
-    """The partial sums along both subpaths of each path, and the weight of each strategy from them, in the
-    order of calls of ``walk.py`` and ``techniques.py``."""
+    """The partial sums along both subpaths of each path, and the weight of each strategy from them.
+
+    In the order of calls of ``walk.py`` and ``techniques.py``.
+    """
 
     def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic):
         self.path, self.kappa, self.h = path, kappa, heuristic
@@ -156,8 +163,10 @@ class Recursion:
         return mis.scatter(self.h, partial, coefficient, step)
 
     def _along_light(self):
-        """Light subpath (kernel._light_walk, walk._vertex and _leave): the partial sums at y_e = x_e,
-        and those with which the last edge sets out."""
+        """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
+
+        As in kernel._light_walk, walk._vertex and _leave.
+        """
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * x.second)
         start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))

@@ -46,8 +46,11 @@ def command(*arguments, limit: float = 120, **keywords) -> subprocess.CompletedP
 
 @contextlib.contextmanager
 def small_disk(size: int):
-    """A folder on a disk of so many bytes, and what to pass to `python` or `command` besides; files can't
-    grow beyond so many bytes where this user can't mount one. A third value names which of both it is."""
+    """A folder on a disk of so many bytes, and what to pass to `python` or `command` besides.
+
+    Files can't grow beyond so many bytes where this user can't mount one. A third value names which of both
+    it is.
+    """
     with tempfile.TemporaryDirectory(prefix="bdpt_stress_") as name:
         options = ["-t", "tmpfs", "-o", f"size={size}", "tmpfs", name]
         mounted = subprocess.run(["mount", *options], capture_output=True, check=False).returncode == 0
@@ -67,8 +70,10 @@ def small_disk(size: int):
 
 @contextlib.contextmanager
 def read_only_folder():
-    """A folder that this user can't write to, holding an empty folder ``in``; ``None`` where there is no way
-    to make one (root writes everywhere, and may not be allowed to mount)."""
+    """A folder that this user can't write to, holding an empty folder ``in``.
+
+    ``None`` where there is no way to make one (root writes everywhere, and may not be allowed to mount).
+    """
     with tempfile.TemporaryDirectory(prefix="bdpt_stress_") as name:
         folder = Path(name)
         root, mounted = os.geteuid() == 0, False

@@ -377,9 +377,11 @@ def _hidden() -> Outcome:
 
 
 def _large() -> Outcome:
-    """A ball under a lamp on floors of half-width 30 to 3e3, all turned by an odd angle: rectangles,
-    triangles, spheres and cylinders so large that they are as flat, and an instance of a cube far from its
-    origin."""
+    """A ball under a lamp on floors of half-width 30 to 3e3, all turned by an odd angle.
+
+    Rectangles, triangles, spheres and cylinders so large that they are as flat, and an instance of a cube far
+    from its origin.
+    """
     turn = _transform().rotate([0.6, 0, 0.8], 33)
     lamp = turn @ _transform().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(0.5)
     common = {
@@ -484,8 +486,11 @@ def _scaled_spheres() -> Outcome:
 
 
 def _lit_through() -> Outcome:
-    """A lamp on a ball of rough glass 8 above a floor: all is scaled by the ball's radius but the distance,
-    and the radiance by its inverse square, so that the image is the same."""
+    """A lamp on a ball of rough glass 8 above a floor.
+
+    All is scaled by the ball's radius but the distance, and the radiance by its inverse square, so that the
+    image is the same.
+    """
 
     def light(radius, depth):
         lamp = _transform().look_at([0, 0, 8 + 1.5 * radius], [0, 0, 8], [0, 1, 0]).scale(0.5 * radius)

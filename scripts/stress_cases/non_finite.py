@@ -94,8 +94,10 @@ def heuristics_case():
 
 
 def own_lamps():
-    """What is said of a user's environment, how it is made with a number, and a bad number. (Rendered under
-    ``hide_emitters``, for a sky seen directly is asked for no density.)"""
+    """What is said of a user's environment, how it is made with a number, and a bad number.
+
+    Rendered under ``hide_emitters``, for a sky seen directly is asked for no density.
+    """
 
     def make(name):
         def made(value):
@@ -198,8 +200,11 @@ def lit(value):
 
 @dataclass(frozen=True)
 class Counted:
-    """``tried``: what is not finite in the scene of ``make`` under ``parameters``; ``count`` in words, and
-    the ``number`` of values of each of ``SPP`` samples, over the poisoned pixels or ``everywhere``."""
+    """A scene with numbers that are not finite, and how many of its values count as such.
+
+    ``tried``: what is not finite in the scene of ``make`` under ``parameters``; ``count`` in words, and the
+    ``number`` of values of each of ``SPP`` samples, over the poisoned pixels or ``everywhere``.
+    """
 
     tried: str
     count: str
@@ -313,8 +318,10 @@ def _poisoned(name):
 
 
 def finite_and_counted(make, bad, parameters, count, spp) -> Outcome:
-    """Whether ``make(bad)``, which has no other light, renders black, counts ``count`` values and says so
-    once."""
+    """Whether ``make(bad)`` renders black, counts ``count`` values and says so once.
+
+    The scene has no other light.
+    """
     image, statistics, warnings = rendered(make(bad), parameters, spp)
     found = statistics["non_finite"]
     ok = (image == 0).all() and found == count and len(warnings) == 1 and "intensity" in warnings[0]
@@ -345,8 +352,10 @@ def _pilot() -> Outcome:
 
 
 def spectrally_painted(value):
-    """`reflecting` under a spectral variant: the coefficients of its texels set after loading, since Mitsuba
-    fits a spectrum to NaN as well; where ``value`` is 0, to those of black."""
+    """`reflecting` under a spectral variant: the coefficients of its texels set after loading.
+
+    Mitsuba fits a spectrum to NaN as well. Where ``value`` is 0, they are set to those of black.
+    """
     scene = reflecting(0.5)
     parameters = mi.traverse(scene)
     (name,) = [name for name, _ in parameters if name.endswith("reflectance.data")]

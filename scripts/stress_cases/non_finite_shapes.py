@@ -20,8 +20,10 @@ LIT = 0.01
 
 
 def _lost_whole(lamp: Callable, parameter: str) -> Outcome:
-    """Whether nothing is left of the only light, ``lamp(NAN)``, and ``parameter`` is named; with a number in
-    its place there is light, and nothing to say."""
+    """Whether nothing is left of the only light, ``lamp(NAN)``, and ``parameter`` is named.
+
+    With a number in its place there is light, and nothing to say.
+    """
     texts, ok = [], True
     scene, sound = (room(wall=None, lamp=None, other=lamp(value)) for value in (NAN, 1.0))
     for parameters, spp in RENDERS.values():

@@ -258,8 +258,10 @@ def _sweep(folder: Path, preset: Path, keywords: dict):
 
 
 def _full_sweep(folder: Path, keywords: dict) -> list[str]:
-    """A sweep whose images don't fit (they have noise: an even one would), and once more where there is
-    room."""
+    """A sweep whose images don't fit, and once more where there is room.
+
+    The images have noise: an even one would fit.
+    """
     wrong = []
     with tempfile.TemporaryDirectory() as name:
         preset = Path(name) / "tiny.toml"

@@ -35,8 +35,11 @@ def rotation(axis, degrees):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a scene is put: all lengths times ``scale`` (and intensities times its square, so that radiances
-    stay), turned, moved by ``shift``; ``light``: times what all emitters shine."""
+    """Where a scene is put, and how bright its light is.
+
+    All lengths times ``scale`` (and intensities times its square, so that radiances stay), turned, moved by
+    ``shift``; ``light``: times what all emitters shine.
+    """
 
     scale: float = 1.0
     turn: object = None
@@ -146,8 +149,11 @@ def _spot_for_point(root):
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene of scenes/: what of it matters here, what is changed in its file, whether `path` sees its
-    light, how many times the usual samples it takes, and how far off its tiles may be far away."""
+    """A scene of scenes/ and how it is compared.
+
+    What of it matters here, what is changed in its file, whether `path` sees its light, how many times the
+    usual samples it takes, and how far off its tiles may be far away.
+    """
 
     scene: str
     words: str
@@ -228,14 +234,18 @@ MEANS = 1e-3
 
 
 def _exact(subject: Subject, places: dict) -> Outcome:
-    """One seed; images in all ``places`` equal the plain one (times the light) in every digit, so do the
-    decisions."""
+    """Images in all ``places`` equal the plain one (times the light) in every digit; so do the decisions.
+
+    One seed.
+    """
     return _equal(subject, Place(), places, EXACT)
 
 
 def _equal(subject: Subject, first: Place, places: dict, digits: float) -> Outcome:
-    """One seed; images in all ``places`` equal that of the ``first`` one (times the light), up to ``digits``
-    of its mean in all but `DRAWN` of the pixels, and so do the decisions."""
+    """Images in all ``places`` equal that of the ``first`` one (times the light), and so do the decisions.
+
+    One seed; up to ``digits`` of its mean in all but `DRAWN` of the pixels.
+    """
     worst, differing, ok, words = 0.0, 0.0, True, []
     for way, parameters in WAYS.items():
         plain, statistics = _render(subject.load(first), parameters, SPP[way], 3)
@@ -260,8 +270,10 @@ def _tiles(scene, parameters, spp, seeds) -> Sample:
 
 
 def _turned(subject: Subject) -> Outcome:
-    """Tile means of the turned scene agree with those of the plain one; and in other units it looks the
-    same, seed for seed."""
+    """Tile means of the turned scene agree with those of the plain one.
+
+    In other units it looks the same, seed for seed.
+    """
     pairs = []
     for way, parameters in WAYS.items():
         parameters = {"type": "bdpt"} | parameters

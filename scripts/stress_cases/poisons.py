@@ -30,8 +30,10 @@ def poison():
     """The class of the BSDF ``poison``. (Mitsuba's classes exist once a variant is chosen.)"""
 
     class Poison(mi.BSDF):
-        """Diffuse; where u > 0.5, the scales multiply the sampled weight, the direction, eta, the value, the
-        density."""
+        """Diffuse; where u > 0.5, the scales multiply what it answers.
+
+        The sampled weight, the direction, eta, the value, the density.
+        """
 
         def __init__(self, props):
             super().__init__(props)
@@ -69,8 +71,10 @@ def poison_lamp():
     """The class of the emitter ``poison_lamp``."""
 
     class PoisonLamp(mi.Emitter):
-        """Surroundings of radiance 1; in the half x > 0 of all directions, the scales multiply radiance and
-        density. The weight of a sampled direction is what a sound density would make it."""
+        """Surroundings of radiance 1; in half of all directions the scales multiply radiance and density.
+
+        The half is x > 0. The weight of a sampled direction is what a sound density would make it.
+        """
 
         def __init__(self, props):
             super().__init__(props)
@@ -163,8 +167,10 @@ def camera(**keys):
 
 
 def room(bsdf=None, **parts):
-    """A closed sphere with a plate of the ``bsdf`` that fills a part of the view, and a lamp; or other
-    ``parts`` in their place."""
+    """A closed sphere with a plate of the ``bsdf`` that fills a part of the view, and a lamp.
+
+    Or other ``parts`` in their place.
+    """
     grey = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
     lamp_at = mi.ScalarTransform4f().translate([0.3, 0.8, 0]).rotate([1, 0, 0], 90).scale(0.2)
     inside = {
@@ -177,8 +183,10 @@ def room(bsdf=None, **parts):
 
 
 def filled(bsdf, **parts):
-    """A plate that fills the film: each texel covers 4 x 4 pixels; lit by a point above all of it, which each
-    of its points sees."""
+    """A plate that fills the film, lit by a point above all of it, which each of its points sees.
+
+    Each texel covers 4 x 4 pixels.
+    """
     fov = float(np.rad2deg(2 * np.arctan(0.25)))
     facing = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     scene = {

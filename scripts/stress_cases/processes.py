@@ -173,8 +173,11 @@ def _once(scene, integrator, number: int, spp: int = 1) -> int:
 
 
 def _growth(count: int, once: Callable[[int], int]) -> tuple[int, int, int]:
-    """Bytes that this process has more and variables of Dr.Jit that there are more at the end of ``count``
-    calls than after half of them, and kernels compiled after a tenth of them."""
+    """How much this process grows over the second half of ``count`` calls of ``once``.
+
+    Bytes and variables of Dr.Jit that there are more at the end than after half of the calls, and kernels
+    compiled after a tenth of them.
+    """
     compiled = 0
     for number in range(count):
         made = once(number)
@@ -290,8 +293,10 @@ def _way(decision: dict) -> list:
 
 @contextlib.contextmanager
 def _sigint_after(seconds: float):
-    """SIGINT to this process when it has used so many ``seconds`` of CPU time, if it is still in here: on the
-    clock a render takes longer where something else runs, and the moment would be another one."""
+    """SIGINT to this process when it has used so many ``seconds`` of CPU time, if it is still in here.
+
+    On the clock a render takes longer where something else runs, and the moment would be another one.
+    """
     armed = [True]
 
     def interrupt(*_):
@@ -394,8 +399,11 @@ def _side_by_side() -> Outcome:
 
 
 def _without_cache(made: Callable) -> Outcome:
-    """Render with the cache as ``made`` leaves it, a context manager of an environment and further keywords,
-    and with one that works. (Keywords are for what stands in for a disk.)"""
+    """Render with the cache as ``made`` leaves it, and with one that works.
+
+    ``made`` is a context manager of an environment and further keywords, which are for what stands in for a
+    disk.
+    """
     with tempfile.TemporaryDirectory() as folder:
         try:
             _, expected = _told(child.python(RENDER, env=child.environment(DRJIT_CACHE_DIR=folder)))

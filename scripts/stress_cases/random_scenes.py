@@ -169,8 +169,10 @@ def scenes(draw, kinds):
 
 @st.composite
 def renders(draw, kinds):
-    """A scene, the first of whose lamps is the next one of ``kinds``, and parameters that put strategies in
-    use with different coefficients."""
+    """A scene, and parameters that put strategies in use with different coefficients.
+
+    The first of the scene's lamps is the next one of ``kinds``.
+    """
     share = draw(st.sampled_from([1.0, 0.25, 0.0625]))
     skip = draw(st.sampled_from(["none", "impossible"]))
     connections = draw(st.sampled_from(["all", "one"]))

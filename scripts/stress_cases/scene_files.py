@@ -22,8 +22,11 @@ from .mutations import mutate
 
 
 def attempts(paths: list[Path], integrator: str, limit: float = 60) -> list[dict]:
-    """What `attempt.attempt` says of each file; of one where the process dies or takes longer than ``limit``
-    seconds: a ``stage`` ``dies`` or ``hangs``. The rest go on in a process anew."""
+    """What `attempt.attempt` says of each file.
+
+    Of one where the process dies or takes longer than ``limit`` seconds: a ``stage`` ``dies`` or ``hangs``.
+    The rest go on in a process anew.
+    """
     found = []
     while len(found) < len(paths):
         rest = [str(path) for path in paths[len(found) :]]
@@ -41,8 +44,11 @@ def attempts(paths: list[Path], integrator: str, limit: float = 60) -> list[dict
 
 @dataclass(frozen=True)
 class Made:
-    """A scene file; what is wrong with it, in ``words``; and ``names`` of it, one of which an error has to
-    name: of an element, a parameter, a value."""
+    """A scene file, and what is wrong with it.
+
+    That in ``words``; and ``names`` of it, one of which an error has to name: of an element, a parameter, a
+    value.
+    """
 
     path: Path
     words: str
@@ -60,8 +66,10 @@ def _is_named(text: str, names) -> bool:
 
 
 def _is_clear(result: dict, made: Made) -> bool:
-    """Whether what `bdpt` did needs no excuse: a finite image, a mistake found while loading and named, or
-    one that our own words say."""
+    """Whether what `bdpt` did needs no excuse.
+
+    That is a finite image, a mistake found while loading and named, or one that our own words say.
+    """
     stage, text = result["stage"], result.get("text", "")
     if stage == "image":
         return not result["bad"]
@@ -71,16 +79,20 @@ def _is_clear(result: dict, made: Made) -> bool:
 
 
 def _differ(ours: dict, theirs: dict) -> bool:
-    """Whether means of images differ by more than ten of their standard errors and 2 %: few seeds, whose
-    means have heavy tails."""
+    """Whether means of images differ by more than ten of their standard errors and 2 %.
+
+    There are few seeds, whose means have heavy tails.
+    """
     a, b = np.array(ours["means"]), np.array(theirs["means"])
     error = np.sqrt((a.var(ddof=1) + b.var(ddof=1)) / len(a))
     return abs(a.mean() - b.mean()) > 10 * error + 0.02 * abs(b.mean()) + 1e-6
 
 
 def _survey(made: list[Made], compared: bool) -> Outcome:
-    """Render files; where something happens that needs an excuse, and if ``compared`` for all images, by
-    `path` too. The means of images have to agree."""
+    """Render files; where something happens that needs an excuse, by `path` too.
+
+    All images by both if ``compared``. The means of images have to agree.
+    """
     counts, wrong = Counter(), []
     ours = attempts([file.path for file in made], "bdpt")
     clear = [_is_clear(result, file) for result, file in zip(ours, made, strict=True)]

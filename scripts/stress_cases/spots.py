@@ -27,8 +27,10 @@ CELLS = 512
 
 
 def orientations():
-    """Transformations: Mitsuba rounds a direction's cosine in another way in each. Along an axis, and others
-    at random, at the origin and away from it."""
+    """Transformations: Mitsuba rounds a direction's cosine in another way in each.
+
+    Along an axis, and others at random, at the origin and away from it.
+    """
     rng, t = np.random.default_rng(2), mi.ScalarTransform4f()
     found = [t, t.look_at([0, 3, 0], [0, 0, 0], [1, 0, 0])]
     for number in range(2, ORIENTATIONS):
@@ -38,8 +40,10 @@ def orientations():
 
 
 def exact(angle: float) -> float:
-    """Light of a spot of intensity 1, over the small angles of its cone: 1 up to three quarters of the
-    cutoff ``angle`` (radians), from there down to 0 in proportion to the angle."""
+    """Light of a spot of intensity 1, over the small angles of its cone.
+
+    1 up to three quarters of the cutoff ``angle`` (radians), from there down to 0 in proportion to the angle.
+    """
     beam = 0.75 * angle
     ramp = angle * (angle**2 - beam**2) / 2 - (angle**3 - beam**3) / 3
     return np.pi * beam**2 + 2 * np.pi * ramp / (angle - beam)
@@ -73,8 +77,10 @@ def by_emission(scene) -> float:
 
 
 def measured(angle: float) -> tuple[list, list, list]:
-    """At ``angle`` degrees, over all orientations: by how much `path` is off, light subpaths differ from
-    `path`, as shares; and what is warned of."""
+    """By how much light of a spot of ``angle`` degrees is off, over all orientations; and what is warned of.
+
+    By how much `path` is off, and by how much light subpaths differ from `path`, as shares.
+    """
     off, apart, texts = [], [], []
     for to_world in orientations():
         lamp = {"type": "spot", "cutoff_angle": angle, "to_world": to_world}

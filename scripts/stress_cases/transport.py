@@ -58,8 +58,10 @@ def bdpt(**parameters) -> dict:
 
 
 def point_in_sphere(albedo: float, depth: int):
-    """A point light of intensity pi in the unit sphere: after m reflections the radiance is albedo^m. The
-    scene, and the sum for paths of up to ``depth`` edges (-1: of all)."""
+    """A point light of intensity pi in the unit sphere: after m reflections the radiance is albedo^m.
+
+    The scene, and the sum for paths of up to ``depth`` edges (-1: of all).
+    """
     wall = {"type": "sphere", "bsdf": diffuse(albedo)}
     lamp = {"type": "point", "intensity": float(np.pi)}
     total = sum(albedo**m for m in range(1, depth)) if depth >= 0 else albedo / (1 - albedo)
@@ -175,8 +177,10 @@ def _black() -> Outcome:
 
 
 def corridor(reflectance: float, end: dict):
-    """A square tube of mirrors, 100 times as long as wide, seen from one end; the steepest rays meet 64 of
-    them before the ``end``."""
+    """A square tube of mirrors, 100 times as long as wide, seen from one end.
+
+    The steepest rays meet 64 of them before the ``end``.
+    """
     mirror = {"type": "conductor", "material": "none", "specular_reflectance": reflectance}
     sides = {
         f"side{i}": {
@@ -293,8 +297,10 @@ def surface(bsdf: dict):
 
 
 def like_path(bsdf: dict, parameters: dict, spoilt=False, reach=0.02) -> Judged:
-    """Whether `surface` looks as under `path`, and every value is finite, or not where Mitsuba's plugin is
-    ``spoilt``."""
+    """Whether `surface` looks as under `path`, and every value is finite.
+
+    Where Mitsuba's plugin is ``spoilt``, some value must not be.
+    """
     target = surface(bsdf)
     made = mi.load_dict(bdpt(max_depth=6, **parameters))
     made.render(target, spp=16)

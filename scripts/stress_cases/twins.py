@@ -47,8 +47,11 @@ def means(statistics) -> list[float]:
 
 
 def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
-    """Whether ``make(bad)`` renders as ``make(0.0)`` does, counts ``count`` values (some, if None) and says
-    so once, and the twin none; with `PILOTED` samples also whether a pilot was asked."""
+    """Whether ``make(bad)`` renders as ``make(0.0)`` does, and only the bad one is counted and told.
+
+    It counts ``count`` values (some, if None) and says so once, the twin none; with `PILOTED` samples also
+    whether a pilot was asked.
+    """
     image, statistics, warnings = rendered(make(bad), parameters, spp)
     twin, of_twin, quiet = rendered(make(0.0), parameters, spp)
     same = decided(statistics) == decided(of_twin)

@@ -42,12 +42,14 @@ WIDE, LEAST_WIDE = 60, 0.005
 
 @dataclass
 class Tally:
-    """What the weights of ``paths`` were: sums that are ``off`` by more than the tolerance and the ``worst``
-    error of one; paths with a weight that is negative, above 1 or not finite are ``bad``; ``ties``: left out
-    because rounding decides which density is the largest; ``span``: most orders of magnitude between two
-    densities of one path, ``wide`` paths with more than `WIDE`. Of the kernel: ``differ``: its largest
-    difference from the weight by explicit densities, and how many weights are ``wrong`` by more than the
-    tolerance; ``unsure`` see `capture.Made`."""
+    """What the weights of ``paths`` were.
+
+    Sums that are ``off`` by more than the tolerance and the ``worst`` error of one; paths with a weight that
+    is negative, above 1 or not finite are ``bad``; ``ties``: left out because rounding decides which density
+    is the largest; ``span``: most orders of magnitude between two densities of one path, ``wide`` paths with
+    more than `WIDE`. Of the kernel: ``differ``: its largest difference from the weight by explicit densities,
+    and how many weights are ``wrong`` by more than the tolerance; ``unsure`` see `capture.Made`.
+    """
 
     paths: int = 0
     off: int = 0
@@ -93,8 +95,11 @@ class Tally:
 
 
 def wide_paths(rng, n: int, k: int) -> Paths:
-    """Random paths, each density over twelve orders of magnitude at most, but larger from one end than from
-    the other all along a path, so that those of its strategies are far apart."""
+    """Random paths with densities so different that their strategies are far apart.
+
+    Each density is over twelve orders of magnitude at most, but larger from one end than from the other all
+    along a path.
+    """
     paths = random_paths(rng, n, k, decades=rng.choice([1.0, 3.0, 6.0]))
     drift = 10 ** rng.uniform(-5, 5, (n, 1))
     paths.to_camera = (paths.to_camera * drift).astype(np.float32)
@@ -138,8 +143,10 @@ LEAST_HELD = 0.3
 
 
 def held(paths: Paths) -> np.ndarray:
-    """Mask of paths all of whose products of densities, as the recursion forms them along either subpath,
-    stay within `HELD` orders of magnitude."""
+    """Mask of paths all of whose products of densities stay within `HELD` orders of magnitude.
+
+    The products are those that the recursion forms along either subpath.
+    """
     light, camera, direct = oracle.log_steps(paths)
     towards, last = np.log(paths.direct.astype(np.float64)), paths.k
     largest = np.abs(light[:, 0] + light[:, 1] - towards)  # of emission over next-event estimation
@@ -166,8 +173,11 @@ def extreme_paths(rng, n: int, k: int, extreme: float) -> Paths:
 
 
 def extremes(batches: int, size: int) -> Outcome:
-    """Every density 1e-30, 1 or 1e30, or 1e-10, 1 or 1e10: weights of all heuristics are numbers in [0, 1],
-    and sum to 1 where the products of the densities are numbers of single precision."""
+    """Weights of all heuristics for densities of the ends of single precision.
+
+    Every density 1e-30, 1 or 1e30, or 1e-10, 1 or 1e10: weights are numbers in [0, 1], and sum to 1 where the
+    products of the densities are numbers of single precision.
+    """
     rng, tally, sound, kappa = np.random.default_rng(8), Tally(), Tally(), COEFFICIENTS["odd"]
     for batch in range(batches):
         heuristic = HEURISTICS[batch // 8 % len(HEURISTICS)]
@@ -190,8 +200,10 @@ def extremes(batches: int, size: int) -> Outcome:
 
 
 def weigh(tally: Tally, capture: Capture, heuristic: str):
-    """Add the paths of a run: the kernel's own weight of the strategy that made a path, with those of the
-    others by the recursion."""
+    """Add the paths of a run to the ``tally``.
+
+    The kernel's own weight of the strategy that made a path, with those of the others by the recursion.
+    """
     made = [m for m in capture.made() if len(m.weights)]
     for k in sorted({m.paths.k for m in made}):
         group = [m for m in made if m.paths.k == k]
@@ -210,8 +222,11 @@ def weigh(tally: Tally, capture: Capture, heuristic: str):
 
 
 def of_the_kernel(heuristic: str, count: int, lanes: int, number: int, least: int) -> Outcome:
-    """At ``least`` so many paths of the kernel in ``count`` random scenes, with all kinds of lamps
-    where there are as many scenes; ``number`` is the seed, and that of the first kind."""
+    """At ``least`` so many paths of the kernel in ``count`` random scenes.
+
+    With all kinds of lamps where there are as many scenes; ``number`` is the seed, and that of the first
+    kind.
+    """
     tally, failed, seen = Tally(), [], Counter()
     kinds = [*LAMPS][number:] + [*LAMPS][:number]
 
@@ -251,8 +266,10 @@ def _counted(seen: Counter, names) -> str:
 
 
 def glint(lanes: int, least: int) -> Outcome:
-    """At ``least`` so many paths of the kernel around a lamp on a sphere of radius 1e-3, above a diffuse box
-    and floor."""
+    """At ``least`` so many paths of the kernel around a small lamp.
+
+    The lamp is on a sphere of radius 1e-3, above a diffuse box and floor.
+    """
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
     view = T().look_at([0, 0.5, 4], [0, -0.3, 0], [0, 1, 0])
     below = T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(4)
