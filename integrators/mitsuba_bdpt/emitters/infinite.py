@@ -107,8 +107,8 @@ def _is_directional(emitter) -> bool:
 def contrast(emitter) -> float:
     """The largest radiance of an environment over its mean; infinite where that is not known.
 
-    Infinite, that is, for other emitters, and where it would take long to find out, where the numbers of an
-    ``envmap`` are not radiances, or none that has a ratio.
+    Infinite, that is, for other emitters, where it would take long to find out, and where the numbers of an
+    ``envmap`` are not radiances or not finite. 1 for one that is black everywhere.
     """
     kind = emitter.class_name()
     if kind == "ConstantBackgroundEmitter":

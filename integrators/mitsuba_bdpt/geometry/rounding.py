@@ -63,8 +63,8 @@ class Errors:
 class ShapeErrors:
     """`Errors` of the scene's shapes, by pointer.
 
-    ``any``: one of them is a sphere or cylinder; ``small``: one of these is so small that rays ask what they
-    meet, see `SMALL`.
+    ``any``: one of them is a sphere or cylinder, or an instance of a group that has one; ``small``: one of
+    these is so small that rays ask what they meet, see `SMALL`.
     """
 
     def __init__(self, scene: mi.Scene):
@@ -153,7 +153,7 @@ def _stretch(shape) -> np.ndarray:
 def reaches(shape: mi.Shape) -> np.ndarray:
     """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits.
 
-    One number, of a mesh one for each triangle.
+    One number; of a mesh one for each triangle, but one of an ``ellipsoidsmesh``.
 
     Coordinates whose rounding moves hits within the surface do not count: those of corners of rectangles and
     edges of triangles weigh |n_i| / max |n|, so that a floor along the axes has 0, however large. Of spheres,

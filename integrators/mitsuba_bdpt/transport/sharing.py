@@ -44,7 +44,8 @@ _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # tell the keys of the rounds ap
 class Seat:
     """A lane's place in a part.
 
-    ``row`` and ``column`` of its run, ``pixel`` in the run, ``sample`` of the pixel.
+    Of the ``lane`` of this number: ``row`` and ``column`` of its run, ``pixel`` in the run, ``sample`` of the
+    pixel.
     """
 
     lane: mi.UInt32
