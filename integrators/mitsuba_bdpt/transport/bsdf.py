@@ -262,9 +262,9 @@ def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
 class _Drawn:
     """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode.
 
-    Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is no
-    ``pdf_rev_w``) and, if `Traits.round_trip`, the weight ``back`` of a delta event made from its other end, 0
-    if it does not lead back.
+    Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is
+    no ``pdf_rev_w``) and, if `Traits.round_trip`, the weight ``back`` of a delta event made from its other
+    end, 0 if it does not lead back.
     """
 
     bs: mi.BSDFSample3f
