@@ -309,6 +309,9 @@ class Recorder(Observer):
     def _numbers(self, x, rows: int = 0):
         """An array of Dr.Jit as one of NumPy, with an entry for each lane."""
         shape = (rows, self._count) if rows else (self._count,)
+        # Finished first: what a kernel divides by zero meanwhile NumPy would take for its own cast's.
+        dr.eval(x)
+        dr.sync_thread()
         return np.broadcast_to(np.array(x, dtype=float).reshape(*shape[:-1], -1), shape).copy()
 
     def begin(self):
