@@ -251,17 +251,6 @@ def check_not_frozen():
 
 def check_scene(scene, sensor):
     """Raise ``UnsupportedError`` for what the method cannot render."""
-    if sensor.get_medium() is not None:
-        raise UnsupportedError(
-            f"sensor {named(sensor)} lies in a participating medium, which is not supported; "
-            "use integrator type 'volpath'"
-        )
-    for shape in all_shapes(scene):
-        if shape.is_medium_transition():
-            raise UnsupportedError(
-                f"shape {named(shape)} bounds a participating medium, which is not supported; "
-                "use integrator type 'volpath'"
-            )
 
 
 def check_film(sensor, settings: Settings):

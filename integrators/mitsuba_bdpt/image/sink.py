@@ -7,8 +7,6 @@ is done, ``splat`` for contributions with t <= 1. The last three return `Counter
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 
@@ -41,10 +39,10 @@ class Image:
         """Join the camera vertex ``z`` with the light vertices of its lane: the ``total``, and `Counters`."""
         if kernel.plan.connections == "all":
 
-            def add(c, visible, total):
-                return self.add(kernel, replace(c, active=visible), total, start, lane.shared)
+            def add(_, seen, total):
+                return self.add(kernel, seen, total, start, lane.shared)
 
-            return connections.connect_all(kernel, z, lane.path, total, add)
+            return connections.connect_all(kernel, z, lane.path, stream, total, add)
         found, counted = connections.connect_one(kernel, z, lane.path, stream)
         return total + found, counted
 

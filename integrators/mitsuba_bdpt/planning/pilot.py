@@ -125,15 +125,19 @@ class Pilot:
     ) -> tuple[Total, Counters]:
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
-        def add(c: Contribution, visible: mi.Bool, total: dict[str, Row]) -> dict[str, Row]:
+        def add(c: Contribution, seen: Contribution, total: dict[str, Row]) -> dict[str, Row]:
             own, squares = self._parts(self._size(c), c)
-            seen = {"visible": own, **squares}
-            new = {"unshadowed": own} | {n: [dr.select(visible, x, 0) for x in v] for n, v in seen.items()}
+            unshadowed = own
+            if kernel.space is not None:  # its weight was not known before
+                own, squares = self._parts(self._size(seen), seen)
+            found = {"visible": own, **squares}
+            new = {n: [dr.select(seen.active, x, 0) for x in v] for n, v in found.items()}
+            new = {"unshadowed": unshadowed} | new
             return {name: _sums(total[name], more) for name, more in new.items()}
 
         found = {name: _none(SAMPLE.parts["draw"]) for name in ("unshadowed", "visible")}
         found |= {name: total[name] for name in ("moment", "light")}
-        found, counted = connections.connect_all(kernel, z, lane.path, found, add)
+        found, counted = connections.connect_all(kernel, z, lane.path, stream, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
         # sizes times that of the visible ones, where that of all connections is the square of the latter.

@@ -43,6 +43,9 @@ class Purpose(IntEnum):
     ROULETTE = 9
     CONNECTION = 10
     LENS = 11
+    FLIGHT = 12
+    CHANNEL = 13
+    TRACKING = 14
 
 
 _PURPOSES = 16  # room per vertex in the numbering of dimensions
@@ -64,6 +67,7 @@ STRATIFIED = {
         Purpose.LOBE: 3,
         Purpose.ROULETTE: None,
         Purpose.CONNECTION: None,
+        Purpose.FLIGHT: None,
     },
     "light": {
         Purpose.TIME: None,
@@ -74,6 +78,7 @@ STRATIFIED = {
         Purpose.LOBE: 3,
         Purpose.ROULETTE: None,
         Purpose.CONNECTION: None,
+        Purpose.FLIGHT: None,
     },
 }
 
@@ -159,6 +164,11 @@ class Points:
         """A point in [0, 1)^2 for ``purpose`` at ``vertex`` (a Python or Dr.Jit integer)."""
         return self._draw(side, stream, purpose, vertex, 2)
 
+    def series(self, stream: Stream, purpose: Purpose, vertex, number=0) -> mi.UInt32:
+        """The first word of a series of hashed numbers, for `sequential`; the ``number``-th of several."""
+        word = sobol.mix(stream.key ^ _seed(stream, purpose, vertex))
+        return word if isinstance(number, int) and number == 0 else sobol.mix(word + number)
+
     def _draw(self, side, stream, purpose, vertex, dims):
         # The seed is in the dimension's word, not in the key: else the hashed numbers of two dimensions
         # would be the same pairs for every seed, in another order.
@@ -195,6 +205,11 @@ def _hashed(word, dims):
     if dims == 1:
         return _to_unit(word)
     return mi.Point2f(_to_unit(word), _to_unit(sobol.mix(word ^ _SECOND)))
+
+
+def sequential(word: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
+    """One number in [0, 1) of a series, and the word of the next one; `Points.series` has the first."""
+    return _to_unit(sobol.mix(word)), word + _SPREAD
 
 
 def _to_unit(word):

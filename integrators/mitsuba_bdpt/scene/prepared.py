@@ -7,15 +7,18 @@ import mitsuba as mi
 
 from ..emitters.emitters import Emitters
 from ..host.introspection import all_shapes, children, is_instance
+from ..media.media import Media, Space
 from ..sensors.kinds import prepare
 from ..transport import bsdf
+from .light_media import LightMedia
 
 
 class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
     ``emitters`` and ``camera`` are the two kinds of endpoints, ``smooth``, ``delta`` and ``refracts``:
-    whether some BSDF has such a lobe; ``traits`` see `bsdf.Traits`.
+    whether some BSDF has such a lobe; ``traits`` see `bsdf.Traits`; ``space`` what lies between vertices and
+    ``light_media`` where light subpaths start, None in scenes without media.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
@@ -29,6 +32,10 @@ class PreparedScene:
         self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         self.traits = bsdf.Traits.of(found)
+        self.space = self.light_media = None
+        if media := Media.of(scene, sensor, found):
+            self.space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
+            self.light_media = LightMedia(self.space, self.emitters, sensor)
 
 
 def _prepare_bitmaps(found):

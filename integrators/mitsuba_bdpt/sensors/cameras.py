@@ -217,6 +217,7 @@ class Camera(Sensor):
                 vertex.si.time,
                 vertex.si.wavelengths,
             ),
+            near=view.near / slope,
         )
 
 

@@ -63,7 +63,8 @@ class SensorHit:
     ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_a`` density of z_0 (area measure) and ``pdf_w``
     (solid angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
     ``active``. ``surroundings`` see `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light
-    comes from infinity, None where the subpath's own ray has shown it.
+    comes from infinity, None where the subpath's own ray has shown it; ``near`` distance from z_0 at which camera
+    rays along its last edge start.
     """
 
     dist2: mi.Float
@@ -74,6 +75,7 @@ class SensorHit:
     position: mi.Point2f
     active: mi.Bool
     surroundings: mi.Ray3f | None = None
+    near: mi.Float | float = 0.0
 
 
 class Region:

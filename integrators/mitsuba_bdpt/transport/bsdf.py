@@ -61,6 +61,14 @@ class Traits:
     round_trip: bool
     asked: Asked
 
+    def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+        """What the surface ``si`` lets pass straight on."""
+
+        def ask(self, si, active):
+            return mi.Spectrum(self.eval_null_transmission(si, active))
+
+        return self.asked(si.bsdf(), ask, si, active)
+
     @staticmethod
     def of(bsdfs: Sequence[mi.BSDF]) -> Traits:
         """Of BSDFs that one virtual call may visit."""

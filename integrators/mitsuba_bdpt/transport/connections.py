@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream
-from . import bsdf, mis
+from . import bsdf, mis, scattering
 from .contribution import Contribution, drop_non_finite, roulette, size_of, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
+from .visibility import Sight, guessed, seen
 from .walk import Vertex, newest_coefficient
 
 
@@ -32,9 +33,9 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     inverse = dr.rcp(dist2)
     d = between * dr.sqrt(inverse)
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
-    cos_z, cos_y = dr.abs(dr.dot(z.si.n, d)), dr.abs(dr.dot(y.si.n, d))
-    f_z = bsdf.evaluate(z.bsdf, z.si, wo_z, active, kernel.traits)
-    f_y = bsdf.evaluate_adjoint(y.bsdf, y.si, wo_y, active, kernel.traits, cos_y)
+    cos_z, cos_y = z.cosine(d), y.cosine(d)
+    f_z = scattering.evaluate(kernel, z, wo_z, active)
+    f_y = scattering.evaluate_adjoint(kernel, y, wo_y, active, cos_y)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~bsdf.is_zero(value)
 
@@ -52,28 +53,28 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
         f_z.pdf_rev_w,
         f_y.pdf_fwd_w * cos_z * inverse,
     )
-    weight, shares = h.weigh(kernel.kappa.inner, light_side, camera_side)
+    sides = kernel.kappa.inner, light_side, camera_side
+    weight, shares = h.weigh(*sides)
     active &= worth_a_ray(kernel, value, weight)
-    return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner")
+    return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
 
 
 @dr.syntax
-def connect_all(kernel: Kernel, z: Vertex, path: LightPath, total, add):
+def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
-    ``add(contribution, visible, total)`` adds a contribution to the running ``total`` and returns it;
-    ``visible``: it is active and nothing is in between. Returns the ``total`` and `Counters`.
+    ``add(contribution, seen, total)`` adds a contribution to the running ``total`` and returns it: as it was
+    before its visibility ray, and after (`visibility.seen`). Returns the ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, add, candidates]):
+    while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
         lost += c.counted.non_finite
-        ray, own = _sight(kernel, z, y)
-        visible = c.active & ~rays.occluded(kernel.scene, ray, c.active, own)
-        total = add(c, visible, total)
+        sight = _sight(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
+        total = add(c, seen(kernel, c, sight), total)
         slot += 1
     counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
     return total, counted
@@ -85,7 +86,7 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     The estimate is that of all of them. Returns what it adds to the sample, weighted, and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
-    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.edges)
+    u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
     drawn = _draw(kernel, z, path, candidates, u)
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
@@ -100,13 +101,19 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     end, own = drawn.end, None
     if kernel.shape_errors.small:
         y = read_light_vertex(kernel, path, drawn.end)
-        ray, own = _sight(kernel, z, y)
-        end = y.si.p
+        sight = _sight(kernel, z, y)
+        ray, own, end = sight.ray, sight.own, y.si.p
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     kernel.observer.drawn(end)
-    active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return dr.select(active, value / survival, 0), counted
+    if kernel.space is None:
+        active &= ~rays.occluded(kernel.scene, ray, active, own)
+        return dr.select(active, value / survival, 0), counted
+    sight = Sight(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
+    estimate = drawn.joined * (drawn.total / drawn.size / survival)
+    c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
+    c = drop_non_finite(seen(kernel, c, sight))
+    return c.weighted(), counted + c.counted
 
 
 @dataclass
@@ -115,7 +122,8 @@ class _Drawn:
 
     The weighted ``value`` of the one drawn, the ``total`` size of all, the ``end`` of the visibility ray to
     it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, and how many are not zero,
-    and ``lost`` for want of a finite value.
+    and ``lost`` for want of a finite value. In scenes with media, where the weight is known after the ray only,
+    also its unweighted value (``joined``), its ``sides`` (see `Contribution`) and its ``size`` in the draw.
     """
 
     value: mi.Spectrum
@@ -124,6 +132,9 @@ class _Drawn:
     u: mi.Float
     nonzero: mi.UInt32
     lost: mi.UInt32
+    joined: mi.Spectrum | None = None
+    sides: tuple | None = None
+    size: mi.Float | None = None
 
 
 @dr.syntax
@@ -137,12 +148,16 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     slot, value, total = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0)
     end = mi.UInt32(0) if small else mi.Point3f(z.si.p)
     nonzero, lost = mi.UInt32(0), mi.UInt32(0)
+    kept = None
+    if kernel.space is not None:
+        empty = kernel.heuristic.zero()
+        kept = dr.zeros(mi.Spectrum), empty, empty, mi.Float(0)
     while dr.hint(
         slot < candidates, label="draw an inner connection", exclude=[kernel, z, path, candidates, small]
     ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
-        of_this = c.weighted()
+        of_this = c.weighted() if kept is None else c.weighted() * _guess(kernel, z, y)
         size = size_of(of_this)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
@@ -151,17 +166,31 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
         u = dr.select(total > 0, rest, u)
         value = dr.select(take, of_this, value)
+        kept = None if kept is None else dr.select(take, (c.value, *c.sides[1:], size), kept)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
         nonzero += one(c.active)
         lost += c.counted.non_finite
         slot += 1
-    return _Drawn(value, total, end, u, nonzero, lost)
+    drawn = _Drawn(value, total, end, u, nonzero, lost)
+    if kept is not None:
+        joined, light_side, camera_side, size = kept
+        sides = kernel.kappa.inner, light_side, camera_side
+        drawn = replace(drawn, joined=joined, sides=sides, size=size)
+    return drawn
 
 
-def _sight(kernel: Kernel, z: Vertex, y: StoredVertex):
-    """`rays.sight` from ``z`` to the light vertex ``y``."""
-    return rays.sight(kernel.shape_errors, z.anchor, y.anchor, rounding.met(y.si.shape, y.si.instance), z.si)
+def _guess(kernel: Kernel, z: Vertex, y: StoredVertex) -> mi.Float:
+    """The guessed transmittance between ``z`` and ``y``."""
+    between = y.si.p - z.si.p
+    return guessed(kernel, z.medium_towards(kernel, between), dr.norm(between))
+
+
+def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:
+    """From ``z`` to the light vertex ``y``."""
+    met = rounding.met(y.si.shape, y.si.instance)
+    ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
+    return Sight(ray, own, z.medium_towards(kernel, ray.d))
 
 
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
@@ -169,5 +198,5 @@ def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
 
     Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges.
     """
-    possible = z.hit & bsdf.connectible(z.bsdf) & (z.edges + 2 <= kernel.last_inner)
+    possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

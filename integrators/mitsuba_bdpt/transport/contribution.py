@@ -22,7 +22,8 @@ class Contribution:
     ``value`` unweighted (a spectrum), ``weight`` in [0, 1], numbers of light vertices ``s`` and camera
     vertices ``t``, ``active``; ``shares`` see `mis.ByClass`, ``kind`` the class among `mis.CLASSES`;
     ``position`` on the film in pixels, None where it adds to the lane's own pixel (t >= 2); ``counted`` what
-    was done for it.
+    was done for it. In scenes with media ``value`` and ``weight`` are those of an edge without any until
+    `visibility.seen` has looked; it needs the ``sides``: what `mis.Heuristic.weigh` takes.
     """
 
     value: mi.Spectrum
@@ -34,6 +35,7 @@ class Contribution:
     kind: str = ""
     position: mi.Point2f | None = None
     counted: Counters = field(default_factory=Counters)
+    sides: tuple | None = None
 
     def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""

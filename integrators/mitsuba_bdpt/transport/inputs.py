@@ -55,16 +55,19 @@ class Kernel:
     observer: Observer
 
     def __init__(self, prepared, plan: Plan, settings: Settings, heuristic: mis.Heuristic):
+        u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
         self.scene, self.camera, self.emitters = prepared.scene, prepared.camera, prepared.emitters
         self.plan, self.heuristic = plan, heuristic
         self.shape_errors = prepared.emitters.shape_errors
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
-        self.traits = prepared.traits
+        self.traits, self.space = prepared.traits, prepared.space
+        self.light_media = prepared.light_media
+        self.sensor_medium = None if self.space is None else u32(self.space.media.sensor)
+        self.scatters = self.surfaces or (self.space is not None and self.space.media.scatters)
         depth = settings.max_depth
         reach = min(depth, settings.stored_vertices)
         self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
         self.strategy_images = settings.strategy_images
-        u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
         self._reach = u32(reach)
         self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)

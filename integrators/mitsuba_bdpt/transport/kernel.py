@@ -80,6 +80,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
+from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
 from . import bsdf, contribution, mis, stored_vertices, techniques
@@ -210,7 +211,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_v
             stored_vertices.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    walk = _light_walk(kernel, e, shared)
+    walk = _light_walk(kernel, e, stream, shared)
     active, side = walk.active, _light_side(kernel, e, stream, shared, walk)
     state = path, counted_by_light(plan)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
@@ -231,7 +232,7 @@ def _emission(kernel: Kernel, stream, shared):
     return e
 
 
-def _light_walk(kernel: Kernel, e, shared) -> Walk:
+def _light_walk(kernel: Kernel, e, stream, shared) -> Walk:
     """A light subpath on its first edge."""
     h = kernel.heuristic
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
@@ -243,8 +244,22 @@ def _light_walk(kernel: Kernel, e, shared) -> Walk:
     # s = 0 is an older alternative, that of making y_0 by a hit.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
-    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active)
+    edge = None
+    if kernel.space is not None:
+        edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
+    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
     return replace(walk, broken=broken)
+
+
+def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
+    """The first edge of a subpath in a scene with media, along ``ray``, which starts in ``medium``."""
+    points = kernel.points
+
+    def u_channel():
+        return points.draw_1d(side, stream, Purpose.CHANNEL)
+
+    u = points.draw_1d(side, stream, Purpose.FLIGHT, 1)
+    return flight.Edge.begin(kernel.space.media, medium, ray.maxt, u, u_channel)
 
 
 def _light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
@@ -288,7 +303,7 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and join it with the lane's light subpath."""
     sample = _camera_sample(kernel, lane, slot, active)
     active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
-    walk = _camera_walk(kernel, sample.start, active)
+    walk = _camera_walk(kernel, sample, active)
     side = _camera_side(kernel, sink, sample, lane.shared, walk)
     visit = _camera_visit(kernel, sink, lane, sample)
     state = sink.begin(), counted_by_camera(kernel.plan)
@@ -309,15 +324,18 @@ def _camera_sample(kernel: Kernel, lane: Lane, slot, active) -> CameraSample:
     return CameraSample(start, stream, u_lens, active)
 
 
-def _camera_walk(kernel: Kernel, start, active) -> Walk:
+def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
     """A camera subpath on its first edge."""
+    start, edge = sample.start, None
     ray = start.ray
-    if kernel.plan.hide_emitters:
+    if kernel.space is not None:
+        edge = _first_edge(kernel, "camera", sample.stream, kernel.sensor_medium, ray)
+    if kernel.plan.hide_emitters and edge is None:
         pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     partial = _first_partial(kernel, start)
-    return Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active)
+    return Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
 
 
 def _first_partial(kernel: Kernel, start):
@@ -367,7 +385,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             )
             counters = replace(counters, non_finite=lost)
         if plan.direct:
-            c = contribution.drop_non_finite(techniques.next_event(kernel, z))
+            c = contribution.drop_non_finite(techniques.next_event(kernel, z, sample.stream))
             total, counters = sink.add(kernel, c, total, start, shared), counters + c.counted
         if plan.connections != "none":
             total, counted = sink.connect(kernel, z, lane, sample.stream, total, start)

@@ -121,9 +121,23 @@ class Heuristic:
         return dr.minimum(inverse_pdf, SATURATION)
 
     def weigh(
+        self,
+        coefficient: Coefficient,
+        light_side: PartialSum,
+        camera_side: PartialSum,
+        tr: mi.Float | None = None,
+    ) -> tuple[mi.Float, mi.Vector4f | None]:
+        """`weight`, and the classes' shares of it, which only `ByClass` knows.
+
+        ``tr``: T~ of the edge that the strategy joins, which the others sample; None without media.
+        """
+        if tr is not None:
+            light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)
+        return self._weigh(coefficient, light_side, camera_side)
+
+    def _weigh(
         self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
     ) -> tuple[mi.Float, mi.Vector4f | None]:
-        """`weight`, and the classes' shares of it, which only `ByClass` knows."""
         # The stubs take numbers and sums of entries for something else.
         return self.weight(coefficient, light_side, camera_side), None  # pyright: ignore[reportReturnType]
 
@@ -161,24 +175,27 @@ class ByClass(Heuristic):
     def zero(self) -> mi.Vector4f:
         return mi.Vector4f(0)
 
-    def weigh(
+    def _weigh(
         self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
     ) -> tuple[mi.Float, mi.Vector4f | None]:
-        """Weight of the strategy at hand, and the share of each class in the sum of all strategies."""
+        # The weight of the strategy at hand, and the share of each class in the sum of all strategies.
         total = self.combine(self.combine(light_side, camera_side), coefficient)
         shares = total / dr.sum(total)
         return dr.sum(coefficient) / dr.sum(total), shares  # pyright: ignore[reportReturnType]
 
 
-def to_area(heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float) -> Partial:
+def to_area(
+    heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float, tr: mi.Float | None = None
+) -> Partial:
     """Convert to the area measure at a new vertex (the part of eqs. 31, 32, 34, 35 that is known there).
 
     ``dist2`` squared length of the edge; 1 on the first edge of a light subpath, where ``d_vcm`` contains it
     (from infinity there is none), and of a parallel sensor, whose density is one across the edge;
-    ``cos`` absolute geometric cosine at the new vertex.
+    ``cos`` absolute geometric cosine at the new vertex; ``tr`` T~ of the edge, which this subpath sampled and
+    the newest alternative joins (None without media).
     """
     return Partial(
-        d_vcm=heuristic.scale(partial.d_vcm, dist2 / cos),
+        d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),
         d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
     )
 

@@ -8,9 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
-from . import bsdf, mis
+from . import mis
 from .inputs import Kernel
-from .walk import Vertex
+from .walk import Vertex, volume_cosine
 
 
 @dataclass
@@ -18,9 +18,10 @@ class StoredVertex:
     """A light vertex y_{s-1}, s >= 2, as an inner connection needs it.
 
     ``throughput_over_cos`` f cos / pdf of all events before this vertex, the edge to it included, over the
-    geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi|;
-    ``partial`` partial sums in the area measure; ``edges`` number of edges up to it, s - 1; ``anchor`` starts
-    rays.
+    geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi|
+    (in volumes both are 1); ``partial`` partial sums in the area measure; ``edges`` number of edges up to it,
+    s - 1; ``anchor`` starts rays; ``medium`` the number of that in which it lies, 0 on surfaces, None in scenes
+    without media.
     """
 
     si: mi.SurfaceInteraction3f
@@ -29,6 +30,16 @@ class StoredVertex:
     throughput_over_cos: mi.Spectrum
     partial: mis.Partial
     edges: mi.UInt32
+    medium: mi.UInt32 | None = None
+
+    @property
+    def volume(self) -> mi.Bool | None:
+        """Mask: in a medium; None in scenes without."""
+        return None if self.medium is None else self.medium != 0
+
+    def cosine(self, d: mi.Vector3f) -> mi.Float:
+        """Absolute geometric cosine of ``d``, 1 in volumes."""
+        return volume_cosine(self.si, d, self.volume)
 
     @staticmethod
     def of(vertex: Vertex) -> StoredVertex:
@@ -40,6 +51,7 @@ class StoredVertex:
             throughput_over_cos=mi.Spectrum(vertex.throughput / vertex.cos),
             partial=vertex.partial,
             edges=vertex.edges,
+            medium=None if vertex.volume is None else dr.select(vertex.volume, vertex.edge.medium, 0),
         )
 
 
@@ -48,7 +60,8 @@ class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory, ``count`` of them.
 
     ``d_vcm`` and ``d_vc`` are their ``partial``; ``rounding`` offset and curvature of their anchors, the rest
-    of which is in ``si``; ``s`` the number of light vertices up to and including each.
+    of which is in ``si``; ``s`` the number of light vertices up to and including each; ``medium`` None in scenes
+    without media.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
@@ -58,6 +71,7 @@ class LightPath:
     rounding: dr.Local[mi.Vector2f]
     s: dr.Local[mi.UInt32]
     count: mi.UInt32
+    medium: dr.Local[mi.UInt32] | None = None
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
@@ -72,12 +86,13 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
+        medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
     )
 
 
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     """Keep a light vertex that inner connections can use."""
-    keep = vertex.hit & (vertex.edges <= kernel.last_stored) & bsdf.connectible(vertex.bsdf)
+    keep = vertex.hit & (vertex.edges <= kernel.last_stored) & vertex.connectible()
     y, slot = StoredVertex.of(vertex), path.count
     path.si.write(y.si, slot, keep)
     path.throughput_over_cos.write(y.throughput_over_cos, slot, keep)
@@ -85,6 +100,8 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     path.d_vc.write(y.partial.d_vc, slot, keep)
     path.rounding.write(mi.Vector2f(y.anchor.offset, y.anchor.curvature), slot, keep)
     path.s.write(y.edges + 1, slot, keep)
+    if path.medium is not None:
+        path.medium.write(y.medium, slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
@@ -101,4 +118,5 @@ def read_light_vertex(kernel: Kernel, path: LightPath, slot: mi.UInt32) -> Store
         throughput_over_cos=path.throughput_over_cos[slot],
         partial=mis.Partial(path.d_vcm[slot], path.d_vc[slot]),
         edges=s - 1,
+        medium=None if path.medium is None else path.medium[slot],
     )

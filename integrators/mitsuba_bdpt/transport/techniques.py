@@ -8,26 +8,33 @@ the vertex. Equation numbers: Georgiev 2012, see `mis`.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..emitters.records import Direct, Emission
 from ..geometry import rays
+from ..media import transmittance
+from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
-from ..sensors.records import CameraJoin
+from ..sensors.records import CameraJoin, SensorHit
 from . import bsdf, mis
 from .contribution import Contribution, roulette, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
-from .walk import Vertex, newest_coefficient
+from .visibility import Sight, seen
+from .walk import Vertex, Walk, newest_coefficient
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     """Mask: the camera subpath has hit an emitter that may be seen."""
     active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
-    if kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
+    if z.volume is not None:
+        active &= ~z.volume
+        if kernel.plan.hide_emitters:  # as in `volpath`
+            active &= z.seen
+    elif kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
         active &= z.hit | z.seen
     return active
 
@@ -71,13 +78,13 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
 
     Returns an `emitters.Direct` and the `bsdf.Target` in which it lies.
     """
-    active = z.hit & (z.edges + 1 <= kernel.max_depth) & bsdf.connectible(z.bsdf)
-    u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.edges)
+    active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
+    u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
     e = kernel.emitters.sample_direct(z.si, u, active)
     return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
 
 
-def next_event(kernel: Kernel, z: Vertex) -> Contribution:
+def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
@@ -93,17 +100,19 @@ def next_event(kernel: Kernel, z: Vertex) -> Contribution:
         mis.Partial(z.partial.d_vcm, older),
         newest,
         f.pdf_rev_w,
-        e.emission_ratio * dr.abs(dr.dot(z.si.n, e.d)),
+        e.emission_ratio * z.cosine(e.d),
     )
-    weight, shares = h.weigh(kernel.kappa.direct, light_side, camera_side)
+    sides = kernel.kappa.direct, light_side, camera_side
+    weight, shares = h.weigh(*sides)
     active &= worth_a_ray(kernel, value, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    counted = Counters(shadow_s1=one(active))
-    active &= ~rays.occluded(kernel.scene, ray, active, own)
-    return Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", counted=counted)
+    c = Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", sides=sides)
+    c = replace(c, counted=Counters(shadow_s1=one(active)))
+    sight = Sight(ray, own, z.medium_towards(kernel, e.d))
+    return seen(kernel, c, sight.numbered(kernel, stream, z.event))
 
 
 def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
@@ -132,18 +141,21 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
         covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
         pdf_second = dr.select(covered, pdf_second, 0)
         camera_side = h.scale(h.start(pdf_second * join.arrival), kernel.kappa.arrival)
-    weight, shares = h.weigh(kernel.kappa.endpoints, light_side, camera_side)
+    sides = kernel.kappa.endpoints, light_side, camera_side
+    weight, shares = h.weigh(*sides)
     active &= worth_a_ray(kernel, value, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
+    if kernel.space is not None:  # the sensor knows its medium in every direction
+        ray = rays.segment(join.anchor, emission.anchor, emission.si)
     # From the sensor into the distance, for light from infinity.
     away = rays.spawn(join.anchor, -join.d, emission.si)
     away.maxt = join.reach  # camera rays see the surroundings behind the far plane
     ray = dr.select(emission.infinite, away, ray)
     counted = Counters(shadow_t1=one(active))
-    active &= ~rays.occluded(kernel.scene, ray, active)
     ends = mi.UInt32(1), mi.UInt32(1)
-    return Contribution(value, weight, *ends, active, shares, "light", join.position, counted)
+    c = Contribution(value, weight, *ends, active, shares, "light", join.position, counted, sides)
+    return seen(kernel, c, Sight(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoin, bsdf.Target]:
@@ -151,19 +163,20 @@ def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoi
 
     Returns what `Sensor.join` does, and the `bsdf.Target` in which that lies.
     """
-    active = y.hit & bsdf.connectible(y.bsdf) & (y.edges <= kernel.last_splat)
-    join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.edges))
+    active = y.hit & y.connectible() & (y.edges <= kernel.last_splat)
+    join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.event))
     active &= join.valid
     if kernel.plan.hide_emitters:
-        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)
-    cos_ratio = dr.abs(dr.dot(y.si.n, join.d)) / y.cos
+        on_emitter = y.si.shape.emitter() != dr.zeros(mi.EmitterPtr)
+        active &= ~on_emitter
+    cos_ratio = y.cosine(join.d) / y.cos
     return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
 
 
 def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47)."""
-    h, scene, join, f = kernel.heuristic, kernel.scene, y.endpoint, y.f
-    to_area = dr.abs(dr.dot(y.si.n, join.d)) / join.dist2
+    h, join, f = kernel.heuristic, y.endpoint, y.f
+    to_area = y.cosine(join.d) / join.dist2
     estimate = y.throughput * f.value * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~bsdf.is_zero(value)
@@ -173,20 +186,18 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     camera_side = 0
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
-    weight, shares = h.weigh(kernel.kappa.splat, light_side, camera_side)
+    sides = kernel.kappa.splat, light_side, camera_side
+    weight, shares = h.weigh(*sides)
     active &= worth_a_ray(kernel, value, weight)
 
-    u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.edges)
+    u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
     active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
-    if kernel.plan.hide_emitters:
-        pi, _ = rays.intersect_past_emitters(scene, kernel.shape_errors, ray, active, coherent=False)
-        active &= ~pi.is_valid()
-    else:
-        active &= ~rays.occluded(scene, ray, active)
-    return replace(c, value=value / survival, active=active, counted=counted)
+    sight = Sight(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
+    c = replace(c, value=value / survival, active=active, counted=counted, sides=sides)
+    return seen(kernel, c, sight.numbered(kernel, stream, y.event))
 
 
 def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
@@ -197,8 +208,12 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     """
     h = kernel.heuristic
     directly = walk.edges == 1
-    z = kernel.camera.hit(walk, y, emission.infinite & directly)
+    z = kernel.camera.hit(_reaching(walk, y), y, emission.infinite & directly)
     active = z.active & (walk.edges <= kernel.last_arrival)
+    tr = None
+    if kernel.space is not None:
+        begun, tr = _edge_to_sensor(kernel, walk, y, z, active)
+        active &= begun
     if kernel.plan.hide_emitters:
         active &= walk.seen
     value = walk.throughput * (z.importance * dr.rcp(kernel.count_light))
@@ -208,15 +223,49 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     completing = dr.select(emission.beam, 0, emission.pdf_first)
     before = mis.Partial(h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)), walk.partial.d_vc)
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
-    partial = mis.to_area(h, before, dist2, z.cos)
+    partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= worth_a_ray(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
-        active &= ~(asked & rays.occluded(kernel.scene, z.surroundings, asked))
+        active &= ~(asked & _hidden(kernel, z.surroundings, asked))
     return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light", z.position)
+
+
+def _reaching(walk: Walk, y: Vertex):
+    """``walk`` for `Sensor.hit`: in scenes with media its edge ends where ``y`` lies."""
+    if y.landing is None:
+        return walk
+    return replace(walk, pi=_End(y.hit, dr.norm(y.si.p - walk.previous)))
+
+
+@dataclass
+class _End:
+    """Where an edge ends, as `Sensor.hit` asks for it: whether, and the distance from the vertex before."""
+
+    hit: mi.Bool
+    t: mi.Float
+
+    def is_valid(self) -> mi.Bool:
+        return self.hit
+
+
+def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active) -> tuple[mi.Bool, mi.Float]:
+    """Whether the sensor lies on the part of the edge that ``walk`` follows now, and T~ of the edge to it."""
+    begun = dr.norm(walk.o - walk.previous)
+    length = dr.sqrt(z.dist2) - z.near - begun
+    ray = mi.Ray3f(walk.o, walk.d, dr.maximum(length, 0), y.si.time, y.si.wavelengths)
+    crossing = transmittance.between(kernel.space, ray, walk.edge.medium, active, None, mi.UInt32(0))
+    return length > 0, of_depth(walk.edge.depth + crossing.depth)
+
+
+def _hidden(kernel: Kernel, ray: mi.Ray3f, active):
+    """Mask: a surface is in the way of ``ray``."""
+    if kernel.space is None:
+        return rays.occluded(kernel.scene, ray, active)
+    return ~transmittance.between(kernel.space, ray, kernel.sensor_medium, active, None, mi.UInt32(0)).clear
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):

@@ -15,9 +15,10 @@ import mitsuba as mi
 
 from ..emitters.records import Direct
 from ..geometry import rays
+from ..media import flight
 from ..sampling.points import Purpose
 from ..sensors.records import CameraJoin
-from . import bsdf, mis
+from . import bsdf, mis, scattering
 from .inputs import Kernel, Shared
 from .mis import choose
 
@@ -31,7 +32,8 @@ class Walk:
     ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
     measure before that edge; ``eta`` product of relative indices of refraction (1 where nothing
     refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
-    happened; ``broken``: it ended for want of a finite throughput or shading frame.
+    happened; ``broken``: it ended for want of a finite throughput or shading frame; ``edge`` what it carries
+    along an edge in scenes with media, else None.
 
     What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
     """
@@ -47,9 +49,10 @@ class Walk:
     seen: mi.Bool
     broken: mi.Bool
     active: mi.Bool
+    edge: flight.Edge | None = None
 
     @staticmethod
-    def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active) -> Walk:
+    def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
         """A subpath on its first edge."""
         return Walk(
             pi=pi,
@@ -63,11 +66,17 @@ class Walk:
             seen=mi.Bool(False),
             broken=mi.Bool(False),
             active=active,
+            edge=edge,
         )
+
+    @property
+    def event(self) -> mi.UInt32:
+        """What names the random numbers of its next event: with media null events are counted too."""
+        return self.edges if self.edge is None else self.edge.event
 
     def traced(self) -> mi.UInt32:
         """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
-        return dr.maximum(self.edges, 2) - 1
+        return dr.maximum(self.edges if self.edge is None else self.edge.rays, 2) - 1
 
 
 @dataclass
@@ -77,7 +86,8 @@ class Vertex:
     ``partial`` is in the area measure (camera subpaths that left the scene: solid angle). ``cos`` absolute
     geometric cosine of the edge to it; ``anchor`` starts rays; ``hit`` is false in the surroundings;
     ``endpoint`` with which it is to be joined and ``f`` the BSDF towards it (a `bsdf.Evaluation`), where
-    ``endpoint_active``, see `Side`.
+    ``endpoint_active``, see `Side`; ``event`` names its random numbers. In scenes with media ``volume`` tells
+    whether it lies in one, ``landing`` how its edge ended; else they are None.
     """
 
     si: mi.SurfaceInteraction3f
@@ -91,10 +101,40 @@ class Vertex:
     seen: mi.Bool
     hit: mi.Bool
     active: mi.Bool
+    event: mi.UInt32
+    volume: mi.Bool | None = None
+    landing: flight.Landing | None = None
     # Set where there is a `Side.join`, and nowhere else asked for: what it returns, and an `Evaluation`.
     endpoint: Any = None
     endpoint_active: Any = None
     f: Any = None
+
+    @property
+    def edge(self) -> flight.Edge | None:
+        """The edge to it as it arrives, None in scenes without media."""
+        return None if self.landing is None else self.landing.edge
+
+    def cosine(self, d: mi.Vector3f) -> mi.Float:
+        """Absolute geometric cosine of ``d``, 1 in volumes."""
+        return volume_cosine(self.si, d, self.volume)
+
+    def connectible(self) -> mi.Bool:
+        """Mask: its distribution of directions is not a delta distribution alone."""
+        of_surface = bsdf.connectible(self.bsdf)
+        return of_surface if self.volume is None else of_surface | self.volume
+
+    def medium_towards(self, kernel: Kernel, d: mi.Vector3f) -> mi.UInt32 | None:
+        """The number of the medium in which ``d`` leaves it; None in scenes without media."""
+        if self.landing is None:
+            return None
+        beyond = kernel.space.media.number(self.si.target_medium(d))
+        return dr.select(self.si.is_medium_transition(), beyond, self.edge.medium)
+
+
+def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool | None) -> mi.Float:
+    """D of the geometry term: the absolute geometric cosine of ``d`` on surfaces, 1 where ``volume`` holds."""
+    cos = dr.abs(dr.dot(si.n, d))
+    return cos if volume is None else dr.select(volume, 1, cos)
 
 
 @dataclass(frozen=True)
@@ -148,7 +188,7 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
         label=f"{side.name} subpath, {kernel.store_size} stored",
         exclude=[kernel, side, stream, visit],  # what stays the same, see `Walk`
     ):
-        vertex = _vertex(kernel, side, walk)
+        vertex = _vertex(kernel, side, walk, stream)
         step = _interact(kernel, side, walk, vertex, stream)
         kernel.observer.vertex(side, walk, vertex, step)
         state = visit(vertex, state, walk)
@@ -164,15 +204,24 @@ def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32)
     return choose(edges == 1, first, kernel.kappa.inner)
 
 
-def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
+def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     """The vertex at the end of the walk's edge; densities go over to the area measure."""
     h = kernel.heuristic
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
-    si = walk.pi.compute_surface_interaction(ray, mi.RayFlags.All, walk.active)
-    hit = walk.active & si.is_valid()
-    cos = dr.abs(dr.dot(si.n, walk.d))
+    landing = tr = volume = None
+    if kernel.space is None:
+        si = walk.pi.compute_surface_interaction(ray, mi.RayFlags.All, walk.active)
+        hit = walk.active & si.is_valid()
+        throughput = walk.throughput
+    else:
+        landing = _landing(kernel, side, walk, ray, stream)
+        ray.o, volume, throughput = landing.o, landing.collided, landing.throughput
+        si = _landed(landing, ray, walk.active)
+        hit = walk.active & (si.is_valid() | volume)
+        tr = landing.edge.weight_transmittance()
+    cos = volume_cosine(si, walk.d, volume)
     dist2 = dr.squared_norm(si.p - walk.previous)
-    partial, throughput = walk.partial, walk.throughput
+    partial = walk.partial
     if side.complete is not None:
         first = hit & (walk.edges == 1)
         pdf_connect = dr.select(first, side.complete(si, first), 1)
@@ -184,13 +233,19 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         dist2 = dr.select(walk.edges == 1, 1, dist2)
     # A hit at exactly zero cosine has probability zero; its densities would be infinite.
     hit &= cos > 0
-    in_area = mis.to_area(h, partial, dist2, cos)
-    partial = mis.Partial(choose(hit, in_area.d_vcm, partial.d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
+    in_area = mis.to_area(h, partial, dist2, cos, tr)
+    d_vcm = partial.d_vcm
+    if tr is not None:  # the surroundings are a strategy's other end too
+        d_vcm = h.scale(d_vcm, dr.rcp(tr))
+    partial = mis.Partial(choose(hit, in_area.d_vcm, d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
+    anchor = rays.surface_anchor(si, ray, kernel.shape_errors)
+    if volume is not None:
+        anchor = dr.select(volume, rays.free_anchor(si.p), anchor)
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
         cos=cos,
-        anchor=rays.surface_anchor(si, ray, kernel.shape_errors),
+        anchor=anchor,
         throughput=throughput,
         partial=partial,
         edges=walk.edges,
@@ -198,23 +253,44 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         seen=walk.seen,
         hit=hit,
         active=walk.active,
+        event=walk.event,
+        volume=volume,
+        landing=landing,
     )
+
+
+def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream) -> flight.Landing:
+    """Where the walk's edge ends in a scene with media."""
+    start = flight.Landing(walk.o, walk.pi, mi.Float(0), mi.Bool(False), walk.edge, walk.throughput)
+    word = kernel.points.series(stream, Purpose.TRACKING, walk.event)
+    hidden = None
+    if kernel.plan.hide_emitters and not side.adjoint:
+        hidden = walk.edges == 1
+    return flight.advance(kernel.space, ray, start, word, walk.active, hidden)
+
+
+def _landed(landing: flight.Landing, ray, active) -> mi.SurfaceInteraction3f:
+    """The surface at the end of an edge, or a point in the medium as one without normal and shape."""
+    si = landing.pi.compute_surface_interaction(ray, mi.RayFlags.All, active & ~landing.collided)
+    point = dr.zeros(mi.SurfaceInteraction3f)
+    point.p, point.t, point.time, point.wavelengths = ray(landing.t), landing.t, ray.time, ray.wavelengths
+    point.sh_frame, point.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
+    return dr.select(landing.collided, point, si)
 
 
 def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     """Sample the direction of the next edge, and put into ``vertex`` what joins it with an endpoint."""
-    if not kernel.surfaces:  # a virtual call needs somebody to call
+    if not kernel.scatters:  # a virtual call needs somebody to call
         return None
-    points, si = kernel.points, vertex.si
+    points = kernel.points
     target = None
     if side.join is not None:
         vertex.endpoint, target = side.join(vertex)
         vertex.endpoint_active = target.active
-    u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.edges)
-    u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.edges)
-    take = bsdf.sample_adjoint if side.adjoint else bsdf.sample
+    u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.event)
+    u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.event)
     sampled = _is_sampled(side, walk, vertex)
-    step, vertex.f = take(vertex.bsdf, si, u1, u2, sampled, kernel.traits, target)
+    step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
     return step
 
 
@@ -223,7 +299,13 @@ def _goes_on(side: Side, walk: Walk, vertex: Vertex):
 
 
 def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
-    """`path` samples at the last vertex too: alpha is 1 unless that event is null."""
+    """`path` samples at the last vertex too: alpha is 1 unless that event is null.
+
+    In scenes with media null events are no edges, so that subpaths go on after them. `volpath` has alpha 1 where
+    something in a medium may scatter again.
+    """
+    if vertex.volume is not None:
+        return vertex.hit & (~vertex.volume | (walk.edges < side.last_edge))
     return vertex.hit if side.alpha else _goes_on(side, walk, vertex)
 
 
@@ -233,6 +315,10 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
     points, h, si = kernel.points, kernel.heuristic, vertex.si
     active = _goes_on(side, walk, vertex)
+    passes = None
+    if vertex.volume is not None:
+        passes = step.null & _is_sampled(side, walk, vertex)
+        active |= passes
     coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
@@ -244,23 +330,36 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     active &= (brightest > 0) & ~broken
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
-    u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.edges)
-    playing = walk.edges >= kernel.rr_depth
+    u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
+    # In scenes with media as in `volpath`.
+    playing = walk.edges >= kernel.rr_depth if passes is None else walk.edges > kernel.rr_depth
     throughput = dr.select(playing, throughput / survive, throughput)
     active &= ~playing | (u < survive)
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
+    edge, previous, edges = None, mi.Point3f(si.p), walk.edges + 1
+    if passes is not None:  # after a null event the edge goes on as if nothing had been there
+        medium = vertex.medium_towards(kernel, ray.d)
+        u = points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
+        edge = vertex.edge.onwards(passes, vertex.landing.t, medium, u)
+        previous = dr.select(passes, walk.previous, previous)
+        edges = dr.select(passes, walk.edges, edges)
+        partial = mis.Partial(
+            choose(passes, walk.partial.d_vcm, partial.d_vcm), choose(passes, walk.partial.d_vc, partial.d_vc)
+        )
+        ray.maxt = edge.maxt
     return Walk(
         pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
         o=ray.o,
         d=ray.d,
-        previous=mi.Point3f(si.p),
+        previous=previous,
         throughput=throughput,
         partial=partial,
         eta=eta,
-        edges=walk.edges + 1,
+        edges=edges,
         seen=seen,
         broken=broken,
         active=active,
+        edge=edge,
     )

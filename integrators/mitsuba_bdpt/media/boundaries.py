@@ -1,0 +1,29 @@
+"""Which medium a ray is in, found from the boundaries that it meets."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from .media import Space
+
+
+@dr.syntax
+def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+    """The number of the medium before the first boundary that ``ray`` meets, and whether it meets one.
+
+    Surfaces that bound no medium are passed, opaque ones too.
+    """
+    o, number, found = mi.Point3f(ray.o), mi.UInt32(0), mi.Bool(False)
+    going = mi.Bool(active)
+    while dr.hint(going, label="the first boundary", exclude=[space, ray, active]):
+        segment = mi.Ray3f(o, ray.d, ray.time, ray.wavelengths)
+        si = space.scene.ray_intersect(segment, mi.RayFlags.Minimal, coherent=False, active=going)
+        hit = going & si.is_valid()
+        bounds = hit & si.is_medium_transition()
+        number = dr.select(bounds, space.media.number(si.target_medium(-ray.d)), number)
+        found |= bounds
+        o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+        going = hit & ~bounds
+    return number, found

@@ -1,0 +1,201 @@
+"""Free flight along an edge: through segments of media and null surfaces to the next vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from . import tracking
+from .media import Media, Space, coefficients, interaction, of_depth
+
+
+@dataclass
+class Edge:
+    """What a subpath in media carries along an edge; vertices start new ones.
+
+    ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth of T~ so
+    far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event`` counts events,
+    null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In chromatic media
+    ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their mean over channels, of
+    all flights of the subpath (``Spectrum``); else None.
+    """
+
+    medium: mi.UInt32
+    maxt: mi.Float
+    depth: mi.Float | mi.Spectrum
+    rest: mi.Float
+    event: mi.UInt32
+    rays: mi.UInt32
+    channel: mi.UInt32 | None = None
+    ratio: mi.Spectrum | None = None
+
+    @staticmethod
+    def begin(media: Media, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
+        """The first edge of a subpath; ``u`` decides its flight, ``u_channel()`` the channel."""
+        channel = ratio = None
+        if not media.gray:
+            channel, ratio = choose_channel(u_channel()), mi.Spectrum(1)
+        return Edge(
+            medium=mi.UInt32(medium),
+            maxt=mi.Float(maxt),
+            depth=mi.Float(0) if media.gray else mi.Spectrum(0),
+            rest=tracking.exponential(u),
+            event=mi.UInt32(1),
+            rays=mi.UInt32(1),
+            channel=channel,
+            ratio=ratio,
+        )
+
+    def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, u: mi.Float) -> Edge:
+        """The edge after an event at its end, of this ``length`` since the ray began.
+
+        Where the event was ``null`` it goes on, else a new one begins. ``u`` decides its flight.
+        """
+        return replace(
+            self,
+            medium=medium,
+            maxt=dr.select(null, self.maxt - length, dr.inf),
+            depth=dr.select(null, self.depth, 0),
+            rest=dr.select(null, self.rest, tracking.exponential(u)),
+            event=self.event + 1,
+            rays=self.rays + 1,
+        )
+
+    def weight_transmittance(self) -> mi.Float:
+        """T~ of the edge so far."""
+        return of_depth(self.depth)
+
+
+@dataclass
+class Landing:
+    """Where an edge ends: the ``pi`` that the ray from ``o`` finds, or the distance ``t`` of a collision.
+
+    ``collided`` tells which; ``edge`` and ``throughput`` as they arrive.
+    """
+
+    o: mi.Point3f
+    pi: mi.PreliminaryIntersection3f
+    t: mi.Float
+    collided: mi.Bool
+    edge: Edge
+    throughput: mi.Spectrum
+
+
+def choose_channel(u: mi.Float) -> mi.UInt32:
+    """One of the channels of a spectrum, uniformly."""
+    count = len(mi.Spectrum(0))
+    return dr.minimum(mi.UInt32(u * count), count - 1)
+
+
+@dr.syntax
+def advance(space: Space, ray: mi.Ray3f, landing: Landing, word, active: mi.Bool, hidden) -> Landing:
+    """Follow an edge to where it ends; ``landing`` is the ray's first hit, ``hidden`` see `_passes`.
+
+    Random numbers of tracking follow ``word``.
+    """
+    going = mi.Bool(active)
+    while dr.hint(going, label="segments of an edge", exclude=[space, ray, hidden, active]):
+        si, landing, word = _segment(space.media, ray, landing, word, going)
+        going &= ~landing.collided & _passes(space.media, si, hidden)
+        landing = _onwards(space, ray, si, landing, going)
+    return landing
+
+
+def _segment(media: Media, ray, landing: Landing, word, active):
+    """Fly along one segment; returns the surface at its end, what arrives, and the next random word."""
+    edge, pi = landing.edge, landing.pi
+    segment = mi.Ray3f(landing.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
+    si = pi.compute_surface_interaction(segment, mi.RayFlags.Minimal, active)
+    end = dr.minimum(dr.select(pi.is_valid(), pi.t, dr.inf), edge.maxt)
+    t, depth, rest = _through_homogeneous(media, segment, edge, end, active)
+    throughput = landing.throughput
+    if media.grids:
+        grid = active & (edge.medium != 0) & ~media.is_homogeneous(edge.medium)
+        found = tracking.delta(media, edge.medium, segment, end, edge.rest, throughput, word, grid)
+        t = dr.select(grid, found.t, t)
+        depth, rest = dr.select(grid, found.depth, depth), dr.select(grid, found.rest, rest)
+        throughput, word = found.throughput, found.word
+    collided = active & (t < end)
+    edge = replace(edge, depth=edge.depth + depth, rest=rest)
+    throughput, edge = _weighted(media, segment, t, collided, throughput, edge, depth, active)
+    return si, replace(landing, t=dr.minimum(t, end), collided=collided, edge=edge, throughput=throughput), word
+
+
+def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
+    """Distance of the collision (infinite if there is none), optical depths travelled and left."""
+    sigma = media.extinction(edge.medium, ray.d, ray, active)
+    own = sigma if media.gray else at(sigma, edge.channel)
+    t = edge.rest / own
+    collides = t < end  # of nothing at all it is NaN or infinite
+    travelled = dr.select(collides, t, end)
+    # In vacuum the end may be infinitely far.
+    depth = dr.select(sigma > 0, sigma * travelled, 0)
+    rest = dr.select(own > 0, edge.rest - own * travelled, edge.rest)
+    return dr.select(collides, t, dr.inf), depth, rest
+
+
+def at(spectrum: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
+    """The entry ``channel`` of a spectrum."""
+    value = spectrum[0]
+    for i in range(1, len(spectrum)):
+        value = dr.select(channel == i, spectrum[i], value)
+    return value
+
+
+def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, active):
+    """Throughput after a segment with a collision at ``t`` or none, and the edge with its channels' densities.
+
+    In gray media what is sampled cancels but for the albedo. In chromatic ones the densities of all channels
+    count: the balance heuristic over the channel that is sampled (A. Wilkie et al. 2014).
+    """
+    if media.gray and not media.scatters:
+        return dr.select(collided, 0, throughput), edge
+    mei = interaction(ray(dr.select(collided, t, 0)), ray.d, ray)
+    sigma_s, sigma_t = media.ask(edge.medium, coefficients, mei, collided)
+    gray = sigma_s / dr.mean(sigma_t)
+    if media.gray:
+        return dr.select(collided, throughput * gray, throughput), edge
+    homogeneous = media.is_homogeneous(edge.medium) & active
+    transmittance = dr.exp(-depth)
+    densities = dr.select(collided, sigma_t, 1) * transmittance
+    mean = dr.mean(edge.ratio * densities)
+    estimate = dr.select(collided, sigma_s, 1) * transmittance / mean
+    estimate = dr.select(homogeneous, estimate, dr.select(collided, gray, 1))
+    ratio = dr.select(homogeneous, edge.ratio * densities / mean, edge.ratio)
+    return throughput * estimate, replace(edge, ratio=ratio)
+
+
+def _passes(media: Media, si, hidden) -> mi.Bool:
+    """Mask: an edge goes through this surface, which nobody looks at.
+
+    Of plugin ``null``, without emitter and sensor; ``hidden`` (a mask or None): emitters are passed, as by ``path``
+    under ``hide_emitters``.
+    """
+    emits = si.shape.emitter() != dr.zeros(mi.EmitterPtr)
+    passes = mi.Bool(False)
+    if media.see_through:
+        passes = si.is_valid() & media.is_null(si) & ~emits & ~si.is_sensor()
+    if hidden is not None:
+        passes |= si.is_valid() & emits & hidden
+    return passes
+
+
+def _onwards(space: Space, ray, si, landing: Landing, going) -> Landing:
+    """Where ``going``, on the other side of the surface ``si``."""
+    edge, media = landing.edge, space.media
+    segment = mi.Ray3f(landing.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
+    o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+    beyond = media.number(si.target_medium(ray.d))
+    crossed = replace(
+        edge,
+        medium=dr.select(si.is_medium_transition(), beyond, edge.medium),
+        maxt=edge.maxt - landing.t,
+        rays=edge.rays + 1,
+    )
+    onward = mi.Ray3f(o, ray.d, crossed.maxt, ray.time, ray.wavelengths)
+    pi = space.scene.ray_intersect_preliminary(onward, coherent=False, active=going)
+    passed = replace(landing, o=o, pi=pi, edge=crossed)
+    return dr.select(going, passed, landing)

@@ -1,0 +1,248 @@
+"""The media of a scene as tables and calls that a kernel can index."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..errors import UnsupportedError
+from ..geometry.rounding import ShapeErrors
+from ..host.introspection import all_shapes, children, is_instance, named
+
+# Optical depth beyond which T~ is that of this depth: ratios of densities stay within single precision.
+# (Whatever T~ is there, joins across such edges add next to nothing.)
+DEEPEST = 32.0
+
+_LEAST = math.exp(-DEEPEST)
+
+# Points and directions at which a medium is looked at to find what it depends on, and its mean extinction.
+_PROBES = 4096
+
+
+class Media:
+    """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
+
+    ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for branches
+    while a kernel is recorded: ``homogeneous`` media and ``grids``; ``scatters``: some albedo is not 0; ``gray``:
+    no extinction of homogeneous media depends on the wavelength, so that optical depths are ``Float``, else
+    ``Spectrum``; ``directional``: extinction depends on the direction (microflakes); ``see_through``: surfaces of
+    plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays have to look at surfaces.
+
+    Raises ``UnsupportedError`` for media whose own calls contradict each other.
+    """
+
+    def __init__(self, objects: list[mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
+        self.objects = objects
+        for medium in objects:
+            _check(medium)
+        homogeneous = [m.is_homogeneous() for m in objects]
+        self.homogeneous, self.grids = any(homogeneous), not all(homogeneous)
+        self.sensor = 1 + objects.index(sensor) if sensor is not None else 0
+        self._ids = [_registry_id(m) for m in objects]
+        self._numbers = _numbers(self._ids)
+        looks = [_Look(m) for m in objects]
+        self.scatters = any(look.scatters for look in looks)
+        self.gray = all(look.gray for look in looks)
+        self.directional = any(look.directional for look in looks)
+        self._spectral_table = self.gray or not mi.is_spectral
+        # With an entry for vacuum.
+        self._extinction = self._table([look.majorant for look in looks])
+        self._mean = mi.Float([0.0, *(look.mean for look in looks)])
+        self._homogeneous = mi.UInt32([0, *map(int, homogeneous)])
+        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous)
+        bsdfs = list(bsdfs)
+        null = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
+        self.null_lobes = bool(null)
+        only = [b for b in null if not b.flags() & _OTHER_LOBES]
+        self.see_through = bool(only) and all(b.class_name() == "Null" for b in only)
+
+    @staticmethod
+    def of(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Iterable[mi.BSDF]) -> Media | None:
+        """Those of a scene seen by a sensor, whose shapes have these BSDFs; None if there are none."""
+        declared = sensor.get_medium()
+        found: dict[int, mi.Medium] = {}
+        for medium in [declared, *(m for shape in all_shapes(scene) for m in _sides(shape))]:
+            if medium is not None:
+                found.setdefault(_registry_id(medium), medium)
+        if not found:
+            return None
+        objects = list(found.values())
+        sensor_medium = None if declared is None else found[_registry_id(declared)]
+        return Media(objects, sensor_medium, bsdfs)
+
+    def _table(self, majorants):
+        """Extinction by number, ``Float`` or ``Spectrum``; None if it depends on more than the number."""
+        if not self._spectral_table:
+            return None
+        entries = np.array([np.zeros(len(majorants[0])), *majorants])
+        return mi.Float(entries[:, 0]) if self.gray else mi.Spectrum(entries.T)
+
+    def number_of(self, medium: mi.Medium | None) -> int:
+        """The number of a medium of the scene, 0 for none."""
+        return 0 if medium is None else self._ids.index(_registry_id(medium)) + 1
+
+    def number(self, medium: mi.MediumPtr) -> mi.UInt32:
+        """The number of a medium that the scene's shapes point to."""
+        return dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, medium))
+
+    def is_homogeneous(self, number: mi.UInt32) -> mi.Bool:
+        """Mask: the medium of this number is homogeneous."""
+        return dr.gather(mi.UInt32, self._homogeneous, number) == 1
+
+    def is_null(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Mask: the BSDF of the surface ``si`` lets everything pass straight on."""
+        return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(mi.BSDFFlags.Null)
+
+    def mean(self, number: mi.UInt32) -> mi.Float:
+        """Mean extinction of the medium (1 / scene unit), of a grid within its box; 0 in vacuum."""
+        return dr.gather(mi.Float, self._mean, number)
+
+    def extinction(self, number: mi.UInt32, d: mi.Vector3f, shared, active: mi.Bool):
+        """Extinction of homogeneous media along ``d``, majorant of grids (1 / scene unit); 0 in vacuum.
+
+        ``Float`` if `gray`, else ``Spectrum``; ``shared`` carries time and wavelengths.
+        """
+        if self._extinction is not None and not self.directional:
+            return dr.gather(type(self._extinction), self._extinction, number)
+        answer = self.ask(number, self._majorant, interaction(mi.Point3f(0), d, shared), active)
+        return dr.select(active & (number != 0), answer, 0)
+
+    def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+        """Majorant of a grid, one number for all channels (1 / scene unit)."""
+        extinction = self.extinction(number, ray.d, ray, active)
+        return extinction if self.gray else extinction[0]
+
+    def _majorant(self, medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
+        majorant = mi.Spectrum(medium.get_majorant(mei, active))
+        return majorant[0] if self.gray else majorant
+
+    def ask(self, number: mi.UInt32, question, *args):
+        """Answers of ``question(medium, *args)``, without meaning in vacuum; the last of ``args`` is a mask."""
+        *others, active = args
+        active = active & (number != 0)
+        if len(self.objects) == 1:
+            return question(self.objects[0], *others, active)
+        questions = [partial(question, medium) for medium in self.objects]
+        return dr.switch(dr.select(active, number - 1, 0), questions, *others, active)
+
+
+@dataclass(frozen=True)
+class Space:
+    """What lies between vertices: the ``scene``, its ``media`` and the rounding errors of its shapes.
+
+    ``null_transmission(si, active)``: transmission of a surface straight on (``Spectrum``).
+    """
+
+    scene: mi.Scene
+    media: Media
+    shape_errors: ShapeErrors
+    null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Spectrum]
+
+
+# Lobes other than passing straight on.
+_OTHER_LOBES = int(
+    mi.BSDFFlags.Smooth
+    | mi.BSDFFlags.DeltaReflection
+    | mi.BSDFFlags.DeltaTransmission
+    | mi.BSDFFlags.Delta1D
+)
+
+
+def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f:
+    """A point ``p`` in a medium, reached along unit ``d``, for Mitsuba's calls."""
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.p, mei.wi, mei.sh_frame = p, -d, mi.Frame3f(-d)
+    mei.time, mei.wavelengths = shared.time, shared.wavelengths
+    return mei
+
+
+def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
+    """sigma_s and sigma_t of a medium (1 / scene unit), for `Media.ask`."""
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei, active)
+    return mi.Spectrum(sigma_s), mi.Spectrum(sigma_t)
+
+
+def of_depth(depth: mi.Float | mi.Spectrum) -> mi.Float:
+    """T~ of an optical depth: the mean over the channels of exp(-depth), not below that of `DEEPEST`."""
+    transmittance = dr.exp(-depth)
+    if isinstance(depth, mi.Spectrum):
+        transmittance = dr.mean(transmittance)
+    return dr.maximum(transmittance, _LEAST)
+
+
+def _sides(shape: mi.Shape) -> tuple:
+    """The media on both sides of a shape, None for none; instances have those of their groups' shapes."""
+    if is_instance(shape) or not shape.is_medium_transition():
+        return ()
+    return shape.interior_medium(), shape.exterior_medium()
+
+
+def _registry_id(medium: mi.Medium) -> int:
+    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
+
+
+def _numbers(ids: list[int]) -> mi.UInt32:
+    """Numbers of media by their place in Mitsuba's registry, which is ``ids``."""
+    numbers = [0] * (max(ids) + 1)
+    for number, index in enumerate(ids, 1):
+        numbers[index] = number
+    return mi.UInt32(numbers)
+
+
+def _check(medium: mi.Medium):
+    """Raise ``UnsupportedError`` if the extinction of a homogeneous medium is that of a grid."""
+    extinction = children(medium).get("sigma_t")
+    if not medium.is_homogeneous() or extinction is None:
+        return
+    if extinction.class_name() != "ConstVolume":
+        raise UnsupportedError(
+            f"medium {named(medium)} of type homogeneous has a sigma_t of class {extinction.class_name()}, "
+            "of which Mitsuba takes the value at the origin for flights; use a constant, or a medium of type "
+            "heterogeneous"
+        )
+
+
+class _Look:
+    """What a medium is like, from its own answers at random points and directions.
+
+    ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`; ``mean``
+    extinction.
+    """
+
+    def __init__(self, medium: mi.Medium):
+        rng = np.random.default_rng(0)
+        mei = dr.zeros(mi.MediumInteraction3f, _PROBES)
+        z = rng.uniform(-1, 1, _PROBES)
+        phi = rng.uniform(0, 2 * np.pi, _PROBES)
+        r = np.sqrt(1 - z * z)
+        wi = mi.Vector3f(r * np.cos(phi), r * np.sin(phi), z)
+        mei.wi, mei.sh_frame = wi, mi.Frame3f(wi)
+        if mi.is_spectral:
+            low, high = mi.MI_CIE_MIN, mi.MI_CIE_MAX
+            mei.wavelengths = mi.Spectrum(rng.uniform(low, high, (len(mi.Spectrum(0)), _PROBES)))
+        homogeneous = medium.is_homogeneous()
+        extinction = children(medium).get("sigma_t")
+        if not homogeneous and isinstance(extinction, mi.Volume):
+            mei.p = _points_within(extinction.bbox(), rng)
+        majorant = np.array(mi.Spectrum(medium.get_majorant(mei)) + dr.zeros(mi.Spectrum, _PROBES))
+        sigma_s, _, sigma_t = (np.array(mi.Spectrum(s)) for s in medium.get_scattering_coefficients(mei))
+        self.majorant = majorant.max(1)
+        # A grid's flights are sampled with one number for all channels.
+        self.gray = not homogeneous or bool((majorant == majorant[:1]).all())
+        same = majorant == majorant[:, :1]
+        self.directional = homogeneous and not same.all() and (self.gray or not mi.is_spectral)
+        self.scatters = bool((sigma_s > 0).any()) or not homogeneous
+        self.mean = float((majorant if homogeneous else sigma_t).mean())
+
+
+def _points_within(box: mi.BoundingBox3f, rng) -> mi.Point3f:
+    """Points spread over a box."""
+    low, high = np.array(box.min), np.array(box.max)
+    u = rng.random((3, _PROBES))
+    return mi.Point3f(low[:, None] + u * (high - low)[:, None])

@@ -1,0 +1,98 @@
+"""Grids, whose transmittance is known in expectation only: delta tracking of flights, ratio tracking of joins.
+
+E. R. Woodcock et al. 1965; J. Novák, A. Selle, W. Jarosz 2014, "Residual Ratio Tracking for Estimating Attenuation in
+Participating Media". Both fly through a homogeneous medium of the grid's majorant and meet tentative collisions.
+T~ of a grid is that of its mean extinction within its box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..sampling.points import sequential
+from .media import Media, coefficients, interaction
+
+
+@dataclass
+class Tracked:
+    """What delta tracking finds: the distance ``t`` of a real collision (infinite if there is none).
+
+    ``depth`` optical depth of T~ up to it, ``rest`` what is left until the next tentative collision, ``throughput``
+    times the ratios of null collisions, the next random ``word``.
+    """
+
+    t: mi.Float
+    depth: mi.Float
+    rest: mi.Float
+    throughput: mi.Spectrum
+    word: mi.UInt32
+
+
+def exponential(u: mi.Float) -> mi.Float:
+    """Optical depth with density exp(-depth) from ``u`` in [0, 1); never 0, where vertices would coincide."""
+    return dr.select(u > 0, -dr.log(1 - u), 2.0**-25)
+
+
+def _within(media: Media, number, ray, end, active):
+    """Where ``ray`` is within the grid's box, up to ``end``: from, to, and whether at all."""
+
+    def box(medium: mi.Medium, ray, active):
+        return medium.intersect_aabb(ray)
+
+    meets, low, high = media.ask(number, box, ray, active)
+    low, high = dr.maximum(low, 0), dr.minimum(high, end)
+    return low, high, active & meets & (low < high)
+
+
+@dr.syntax
+def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tracked:
+    """Delta tracking along ``ray`` up to ``end``; the first tentative collision is after optical depth ``rest``."""
+    low, high, inside = _within(media, number, ray, end, active)
+    majorant = media.majorant(number, ray, active)
+    t, met = mi.Float(low), mi.Float(dr.inf)
+    rest, throughput, word = mi.Float(rest), mi.Spectrum(throughput), mi.UInt32(word)
+    going = inside & (majorant > 0)
+    while dr.hint(
+        going, label="delta tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
+    ):
+        left = (high - t) * majorant
+        tentative = going & (rest <= left)
+        rest = dr.select(going & ~tentative, rest - left, rest)
+        t = dr.select(tentative, t + rest / majorant, t)
+        mei = interaction(ray(t), ray.d, ray)
+        _, sigma_t = media.ask(number, coefficients, mei, tentative)
+        null = dr.mean(majorant - sigma_t)
+        u, word = sequential(word)
+        # The probability of a real collision is the mean over channels, whose ratios are left.
+        passed = tentative & (u * majorant < null)
+        throughput = dr.select(passed, throughput * ((majorant - sigma_t) / null), throughput)
+        met = dr.select(tentative & ~passed, t, met)
+        u, word = sequential(word)
+        rest = dr.select(passed, exponential(u), rest)
+        going = mi.Bool(passed)
+    travelled = dr.maximum(dr.minimum(met, high) - low, 0)
+    depth = dr.select(inside, media.mean(number) * travelled, 0)
+    return Tracked(met, depth, rest, throughput, word)
+
+
+@dr.syntax
+def ratio(media: Media, number, ray, end, word, active):
+    """Ratio tracking along ``ray`` up to ``end``: transmittance (``Spectrum``), depth of T~, next word."""
+    low, high, inside = _within(media, number, ray, end, active)
+    majorant = media.majorant(number, ray, active)
+    t, transmittance, word = mi.Float(low), mi.Spectrum(1), mi.UInt32(word)
+    going = inside & (majorant > 0)
+    while dr.hint(
+        going, label="ratio tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
+    ):
+        u, word = sequential(word)
+        t += exponential(u) / majorant
+        going &= t < high
+        mei = interaction(ray(dr.select(going, t, 0)), ray.d, ray)
+        _, sigma_t = media.ask(number, coefficients, mei, going)
+        transmittance = dr.select(going, transmittance * (1 - sigma_t / majorant), transmittance)
+        going &= ~dr.all(transmittance == 0)
+    return transmittance, dr.select(inside, media.mean(number) * (high - low), 0), word

@@ -1,0 +1,105 @@
+"""Transmittance between two points: through media and surfaces that let light pass straight on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from ..geometry.rounding import met
+from . import tracking
+from .media import Media, Space, of_depth
+
+
+@dataclass
+class Crossing:
+    """``transmittance`` of an edge, an unbiased estimate (``Spectrum``), and the optical ``depth`` of its T~.
+
+    ``clear``: no surface is in the way.
+    """
+
+    transmittance: mi.Spectrum
+    depth: mi.Float | mi.Spectrum
+    clear: mi.Bool
+
+    @property
+    def tr(self) -> mi.Float:
+        """T~ of the edge, which the weights have."""
+        return of_depth(self.depth)
+
+    @property
+    def visible(self) -> mi.Bool:
+        """Mask: something passes. (NaN does, so that it is counted.)"""
+        return ~dr.all(self.transmittance == 0)
+
+
+def between(
+    space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool, own, word: mi.UInt32, hidden: bool = False
+) -> Crossing:
+    """What passes along ``ray``, which starts in ``medium``, up to its end; 0 where not ``active``.
+
+    ``own`` is as of `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are passed.
+    """
+    media = space.media
+    if not media.null_lobes and not hidden:
+        visible = active & ~rays.occluded(space.scene, ray, active, own)
+        transmittance, depth, _ = _along(media, medium, ray, ray.maxt, word, visible)
+        return Crossing(dr.select(visible, transmittance, 0), depth, visible)
+    return _through_surfaces(space, ray, medium, active, own, word, hidden)
+
+
+def _along(media: Media, medium, ray, length, word, active):
+    """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word."""
+    sigma = media.extinction(medium, ray.d, ray, active)
+    depth = dr.select(sigma > 0, sigma * length, 0)
+    transmittance = mi.Spectrum(dr.exp(-depth))
+    if media.grids:
+        grid = active & (medium != 0) & ~media.is_homogeneous(medium)
+        estimate, of_mean, word = tracking.ratio(media, medium, ray, length, word, grid)
+        transmittance, depth = dr.select(grid, estimate, transmittance), dr.select(grid, of_mean, depth)
+    return transmittance, depth, word
+
+
+@dr.syntax
+def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> Crossing:
+    """`between` where there are surfaces to pass."""
+    media, scene = space.media, space.scene
+    o, left, medium = mi.Point3f(ray.o), mi.Float(ray.maxt), mi.UInt32(medium)
+    transmittance, word, going = mi.Spectrum(1), mi.UInt32(word), mi.Bool(active)
+    clear = mi.Bool(active)
+    depth = mi.Float(0) if media.gray else mi.Spectrum(0)
+    while dr.hint(
+        going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]
+    ):
+        segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
+        si = scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
+        hit = going & si.is_valid() & ~_is_end(si, own, ray.maxt - left + si.t)
+        length = dr.select(hit, si.t, left)
+        passed, of_segment, word = _along(media, medium, segment, length, word, going)
+        depth = dr.select(going, depth + of_segment, depth)
+        onward = dr.select(hit, _onward(space, si, hit, hidden), 1)
+        clear &= ~going | ~dr.all(onward == 0)
+        transmittance = dr.select(going, transmittance * passed * onward, transmittance)
+        crossed = hit & si.is_medium_transition()
+        medium = dr.select(crossed, media.number(si.target_medium(ray.d)), medium)
+        o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+        left -= length
+        going = hit & clear & (left > 0)
+    return Crossing(dr.select(active, transmittance, 0), depth, clear)
+
+
+def _is_end(si, own, t) -> mi.Bool:
+    """Mask: the surface ``si`` at distance ``t`` from where the ray starts is what the ray ends at."""
+    if own is None:
+        return mi.Bool(False)
+    return (met(si.shape, si.instance) == own.number) & (t >= own.t)
+
+
+def _onward(space: Space, si, active, hidden: bool) -> mi.Spectrum:
+    """What the surface ``si`` lets pass."""
+    passed = space.null_transmission(si, active)
+    if not hidden:
+        return passed
+    return dr.select(si.shape.emitter() != dr.zeros(mi.EmitterPtr), 1, passed)

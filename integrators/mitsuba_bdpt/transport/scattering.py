@@ -1,0 +1,64 @@
+"""What happens at a vertex: a BSDF on surfaces, a phase function in a medium."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from . import bsdf, phase
+from .bsdf import Evaluation, Step, Target
+
+
+def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):
+    """Continue a subpath at ``vertex``: the `Step`, and the `Evaluation` of the ``target`` (None without)."""
+    take = bsdf.sample_adjoint if adjoint else bsdf.sample
+    if vertex.volume is None:
+        return take(vertex.bsdf, vertex.si, u1, u2, active, kernel.traits, target)
+    media = kernel.space.media
+    on_surface = _of(target, ~vertex.volume)
+    step, f = None, None
+    if kernel.surfaces:
+        step, f = take(
+            vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface
+        )
+    if not media.scatters:
+        return step, f
+    medium, active = vertex.edge.medium, active & vertex.volume
+    in_volume = phase.sample(media, medium, vertex.si, u1, u2, active, _of(target, vertex.volume))
+    return in_volume if step is None else dr.select(vertex.volume, in_volume, (step, f))
+
+
+def _of(target: Target | None, mask: mi.Bool) -> Target | None:
+    """``target`` where ``mask`` holds."""
+    return target and Target(target.wo, target.active & mask, target.cos_ratio)
+
+
+def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
+    """A camera vertex towards the local direction ``wo``, and both densities."""
+    if vertex.volume is None:
+        return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active, kernel.traits)
+    return _chosen(
+        kernel, vertex, vertex.edge.medium, wo, active,
+        lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, kernel.traits),
+    )
+
+
+def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio) -> Evaluation:
+    """A light vertex towards the local direction ``wo``; ``cos_ratio`` as of `bsdf.evaluate_adjoint`."""
+    if vertex.volume is None:
+        return bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, active, kernel.traits, cos_ratio)
+    return _chosen(
+        kernel, vertex, vertex.medium, wo, active,
+        lambda mask: bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, mask, kernel.traits, cos_ratio),
+    )
+
+
+def _chosen(kernel, vertex, medium, wo, active, surface) -> Evaluation:
+    """The ``surface``'s evaluation (a function of a mask) or the medium's, whichever ``vertex`` is in."""
+    media = kernel.space.media
+    if not media.scatters:
+        return surface(active & ~vertex.volume)
+    in_volume = phase.evaluate(media, medium, vertex.si, wo, active & vertex.volume)
+    if not kernel.surfaces:
+        return in_volume
+    return dr.select(vertex.volume, in_volume, surface(active & ~vertex.volume))
