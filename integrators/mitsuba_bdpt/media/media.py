@@ -157,9 +157,22 @@ _OTHER_LOBES = int(
 def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f:
     """A point ``p`` in a medium, reached along unit ``d``, for Mitsuba's calls."""
     mei = dr.zeros(mi.MediumInteraction3f)
-    mei.p, mei.wi, mei.sh_frame = p, -d, mi.Frame3f(-d)
+    mei.p, mei.wi, mei.sh_frame = p, -d, symmetric_frame(-d)
     mei.time, mei.wavelengths = shared.time, shared.wavelengths
     return mei
+
+
+def symmetric_frame(n: mi.Vector3f) -> mi.Frame3f:
+    """A frame about unit ``n`` whose matrix is its own transpose: half a turn, or a reflection of the z axis.
+
+    Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix: another distribution than its density.
+    """
+    sign = dr.select(n.z >= 0, mi.Float(1), mi.Float(-1))
+    h = dr.normalize(n + mi.Vector3f(0, 0, sign))
+    s, t = h * (2 * h.x) - mi.Vector3f(1, 0, 0), h * (2 * h.y) - mi.Vector3f(0, 1, 0)
+    frame = dr.zeros(mi.Frame3f)
+    frame.s, frame.t, frame.n = s * sign, t * sign, mi.Vector3f(n)
+    return frame
 
 
 def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):

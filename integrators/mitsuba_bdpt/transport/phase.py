@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..host.introspection import children
-from ..media.media import Media, interaction
+from ..media.media import Media, interaction, symmetric_frame
 from .bsdf import Evaluation, Step, Target
 
 # Plugins whose density of the reverse is the same number.
@@ -35,7 +35,7 @@ def _evaluated(medium: mi.Medium, mei, wo, active):
     if _is_symmetric(phase):
         return mi.Spectrum(value), pdf, mi.Float(pdf)
     back = mi.MediumInteraction3f(mei)
-    back.wi, back.sh_frame = mi.Vector3f(wo), mi.Frame3f(wo)
+    back.wi, back.sh_frame = mi.Vector3f(wo), symmetric_frame(wo)
     _, pdf_rev = phase.eval_pdf(ctx, back, mei.wi, active)
     return mi.Spectrum(value), pdf, pdf_rev
 
@@ -51,17 +51,20 @@ def sample(
 ) -> tuple[Step, Evaluation | None]:
     """Continue a subpath from a volume vertex; with a ``target`` also its `Evaluation`, as `bsdf.sample`."""
 
-    def questions(medium: mi.Medium, mei, u1, u2, wo, evaluated, active):
+    def questions(medium: mi.Medium, mei, u1, u2, sampled, wo, evaluated, _):
         phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
-        d, weight, pdf = phase.sample(ctx, mei, u1, u2, active)
-        _, _, pdf_rev = _evaluated(medium, mei, d, active)
-        joined = _evaluated(medium, mei, wo, evaluated & active) if target else None
+        d, weight, pdf = phase.sample(ctx, mei, u1, u2, sampled)
+        _, _, pdf_rev = _evaluated(medium, mei, d, sampled)
+        joined = _evaluated(medium, mei, wo, evaluated) if target else None
         return d, mi.Spectrum(weight), pdf, pdf_rev, joined
 
     mei = interaction(si.p, -si.to_world(si.wi), si)
     wo = si.to_world(target.wo) if target else mi.Vector3f(0, 0, 1)
     evaluated = target.active if target else mi.Bool(False)
-    d, weight, pdf, pdf_rev, joined = media.ask(medium, questions, mei, u1, u2, wo, evaluated, active)
+    # Subpaths that end here are joined all the same.
+    asked = active | evaluated
+
+    d, weight, pdf, pdf_rev, joined = media.ask(medium, questions, mei, u1, u2, active, wo, evaluated, asked)
     step = Step(
         wo=si.to_local(d),
         weight=dr.select(pdf > 0, weight, 0),
