@@ -109,10 +109,10 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    c = Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", sides=sides)
-    c = replace(c, counted=Counters(shadow_s1=one(active)))
-    sight = Sight(ray, own, z.medium_towards(kernel, e.d))
-    return seen(kernel, c, sight.numbered(kernel, stream, z.event))
+    counted = Counters(shadow_s1=one(active))
+    sight = Sight(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
+    ends = mi.UInt32(1), k
+    return seen(kernel, Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides), sight)
 
 
 def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:

@@ -238,14 +238,11 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     if tr is not None:  # the surroundings are a strategy's other end too
         d_vcm = h.scale(d_vcm, dr.rcp(tr))
     partial = mis.Partial(choose(hit, in_area.d_vcm, d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
-    anchor = rays.surface_anchor(si, ray, kernel.shape_errors)
-    if volume is not None:
-        anchor = dr.select(volume, rays.free_anchor(si.p), anchor)
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
         cos=cos,
-        anchor=anchor,
+        anchor=_anchor(kernel, si, ray, volume),
         throughput=throughput,
         partial=partial,
         edges=walk.edges,
@@ -257,6 +254,11 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         volume=volume,
         landing=landing,
     )
+
+
+def _anchor(kernel: Kernel, si, ray, volume: mi.Bool | None) -> rays.Anchor:
+    anchor = rays.surface_anchor(si, ray, kernel.shape_errors)
+    return anchor if volume is None else dr.select(volume, rays.free_anchor(si.p), anchor)
 
 
 def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream) -> flight.Landing:
@@ -338,28 +340,44 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
-    edge, previous, edges = None, mi.Point3f(si.p), walk.edges + 1
-    if passes is not None:  # after a null event the edge goes on as if nothing had been there
-        medium = vertex.medium_towards(kernel, ray.d)
-        u = points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
-        edge = vertex.edge.onwards(passes, vertex.landing.t, medium, u)
-        previous = dr.select(passes, walk.previous, previous)
-        edges = dr.select(passes, walk.edges, edges)
-        partial = mis.Partial(
-            choose(passes, walk.partial.d_vcm, partial.d_vcm), choose(passes, walk.partial.d_vc, partial.d_vc)
-        )
-        ray.maxt = edge.maxt
-    return Walk(
-        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
+    after = Walk(
+        pi=walk.pi,
         o=ray.o,
         d=ray.d,
-        previous=previous,
+        previous=si.p,
         throughput=throughput,
         partial=partial,
         eta=eta,
-        edges=edges,
+        edges=walk.edges,
         seen=seen,
         broken=broken,
         active=active,
-        edge=edge,
     )
+    if passes is not None:
+        after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
+    return _traced(kernel, after, ray, passes)
+
+
+def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:
+    """``walk`` on its next edge, along ``ray``; after null events (``passes``, or None) edges are not counted."""
+    return replace(
+        walk,
+        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=walk.active),
+        previous=mi.Point3f(walk.previous),
+        edges=walk.edges + (1 if passes is None else dr.select(passes, mi.UInt32(0), 1)),
+    )
+
+
+def _past_null(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, after: Walk, passes, stream):
+    """``after`` in a scene with media, and its ray: where it ``passes``, its edge goes on as if nothing had been there."""
+    medium = vertex.medium_towards(kernel, after.d)
+    u = kernel.points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
+    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, u)
+    partial = mis.Partial(
+        choose(passes, walk.partial.d_vcm, after.partial.d_vcm),
+        choose(passes, walk.partial.d_vc, after.partial.d_vc),
+    )
+    previous = dr.select(passes, walk.previous, after.previous)
+    shared = side.shared
+    ray = mi.Ray3f(after.o, after.d, edge.maxt, shared.time, shared.wavelengths)
+    return replace(after, previous=previous, partial=partial, edge=edge), ray
