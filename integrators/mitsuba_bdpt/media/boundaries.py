@@ -27,3 +27,26 @@ def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, 
         o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
         going = hit & ~bounds
     return number, found
+
+
+@dr.syntax
+def disagreements(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
+    """Crossings of boundaries along ``ray``, which starts in ``medium``, and how many of them disagree.
+
+    Of two boundaries that follow each other, the far side of the first has to be the near side of the second.
+    """
+    o, current = mi.Point3f(ray.o), mi.UInt32(medium) + dr.zeros(mi.UInt32, dr.width(ray.o))
+    crossings, wrong = dr.zeros(mi.UInt32, dr.width(ray.o)), dr.zeros(mi.UInt32, dr.width(ray.o))
+    going = mi.Bool(True)
+    while dr.hint(going, label="boundaries along a line", exclude=[space, ray]):
+        segment = mi.Ray3f(o, ray.d, ray.time, ray.wavelengths)
+        si = space.scene.ray_intersect(segment, mi.RayFlags.Minimal, coherent=False, active=going)
+        hit = going & si.is_valid()
+        bounds = hit & si.is_medium_transition()
+        near = space.media.number(si.target_medium(-ray.d))
+        crossings += dr.select(bounds, mi.UInt32(1), 0)
+        wrong += dr.select(bounds & (near != current), mi.UInt32(1), 0)
+        current = dr.select(bounds, space.media.number(si.target_medium(ray.d)), current)
+        o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+        going = mi.Bool(hit)
+    return crossings, wrong

@@ -62,8 +62,9 @@ def explain(
     ]
     lines += [f"used: {name}" for name in used]
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
-    if (p.splat or p.arrival or p.connections != "none") and settings.stored_vertices < settings.max_depth:
-        lines.append(f"limited: paths of more than {settings.stored_vertices} edges use s=0 and s=1 only")
+    longest = prepared.stored_vertices(settings)
+    if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
+        lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
     lines += [f"lost: {words(lost)}" for lost in unreachable_paths(prepared, p, settings)]
     if prepared.emitters.evaluated:
         lines.append(

@@ -51,6 +51,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
             "by hand",
             f"stored_vertices={settings.stored_vertices}: such paths use s=0 and s=1",
         )
+    contradiction = prepared.light_media.contradiction if prepared.light_media else ""
+    if contradiction and (splat or endpoints or arrival or inner):
+        splat = endpoints = arrival = inner = skip("t=0, t=1, (1,1), inner", "impossible", contradiction)
     return Plan(
         hit=hit,
         direct=direct,
@@ -84,11 +87,13 @@ _UNTRACED = "no light subpath can start from the emitters"
 
 
 def _why_not(prepared: PreparedScene, depth: int, needed: int) -> str:
-    """Why no path of ``needed`` edges can be made by joining surfaces; empty if nothing forbids it."""
+    """Why no path of ``needed`` edges can be made by joining vertices; empty if nothing forbids it."""
     if depth < needed:
         return f"max_depth={depth} allows no such path"
     if prepared.emitters.count == 0:
         return "the scene has no emitter"
+    if prepared.space is not None and prepared.space.media.scatters:
+        return ""
     if not prepared.surfaces:
         return "the scene has no surface"
     return "" if prepared.smooth else "no surface has a lobe that is not delta"
@@ -177,6 +182,7 @@ def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> t
             lost.append(UnreachablePaths((Start.DELTA_EMITTER,), Rest.SURFACE_BETWEEN_DELTA))
         if not camera.delta and starts:
             lost.append(UnreachablePaths(starts, Rest.SENSOR, "t=0"))
-    if starts and p.light and settings.stored_vertices < settings.max_depth:
-        lost.append(UnreachablePaths(starts, Rest.LONG, longest=settings.stored_vertices))
+    longest = prepared.stored_vertices(settings)
+    if starts and p.light and longest < settings.max_depth:
+        lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))
     return tuple(lost)

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..emitters.emitters import Emitters
+from ..host.introspection import named
 from ..media import boundaries
 from ..media.media import Space
 from ..transport.inputs import Shared
@@ -18,16 +19,24 @@ from ..transport.inputs import Shared
 # Rays by which an emitter, or a sensor, is asked for its medium.
 _PROBES = 64
 
+# Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding; edges).
+_LINES = 4096
+_TOLERATED = 0.01
+
 
 class LightMedia:
     """The medium of every emitter; made anew for each render.
 
-    ``outside`` is the number of the medium that surrounds the scene: the sensor's, unless it is bounded.
+    ``outside`` is the number of the medium that surrounds the scene: the sensor's, unless it is bounded;
+    ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do.
     """
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor):
         self._space, self._emitters = space, emitters
-        self.outside = space.media.sensor if _is_unbounded(space, sensor) else 0
+        # The sensor's medium has no end if some ray from it meets no boundary.
+        bounded = _around(space, sensor)[1].all()
+        self.outside = 0 if bounded else space.media.sensor
+        self.contradiction = _contradiction(space, sensor, self.outside)
         self._outside = dr.opaque(mi.UInt32, self.outside)
         front, back = _declared(space, emitters)
         probed, mixed = self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
@@ -89,13 +98,38 @@ def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
     return front, back
 
 
-def _is_unbounded(space: Space, sensor: mi.Sensor) -> bool:
-    """Whether some ray from the sensor, which declares a medium, meets no boundary."""
-    if not space.media.sensor:
-        return False
-    rng = np.random.default_rng(0)
-    u = rng.random((2, _PROBES))
+def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the media before the first boundaries around the sensor, and whether there are any."""
+    u = np.random.default_rng(0).random((2, _PROBES))
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
     origin = sensor.world_transform() @ mi.Point3f(0)
-    _, found = boundaries.near_side(space, mi.Ray3f(origin, d), mi.Bool(True))
-    return not bool(dr.all(found)[0]) if dr.width(found) > 1 else not bool(found[0])
+    number, found = boundaries.near_side(space, mi.Ray3f(origin + dr.zeros(mi.Point3f, _PROBES), d), mi.Bool(True))
+    return np.array(number), np.array(found)
+
+
+def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
+    """Why light and camera subpaths would not agree on the media; empty if they would."""
+    number, found = _around(space, sensor)
+    declared = space.media.sensor
+    if found.any() and (number[found] != declared).mean() > _TOLERATED:
+        says = f"declares the medium {named(space.media.objects[declared - 1])}" if declared else "declares no medium"
+        return f"sensor {named(sensor)} {says}, but the boundaries around it say otherwise"
+    crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
+    crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
+    if wrong > _TOLERATED * crossings:
+        return (
+            f"the shapes disagree about the medium between them at {100 * wrong / crossings:.0f} % of the boundaries "
+            "that random lines cross: give each the interior and exterior medium that is there"
+        )
+    return ""
+
+
+def _lines(space: Space, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
+    """Random lines through the scene, from outside, and the medium that they start in."""
+    box = space.scene.bbox()
+    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
+    u = np.random.default_rng(1).random((5, _LINES))
+    d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
+    through = low[:, None] + u[2:] * (high - low)[:, None]
+    away = float(np.linalg.norm(high - low)) * 1.1
+    return mi.Ray3f(mi.Point3f(through) - d * away, d), dr.opaque(mi.UInt32, outside)

@@ -8,6 +8,7 @@ import mitsuba as mi
 from ..emitters.emitters import Emitters
 from ..host.introspection import all_shapes, children, is_instance
 from ..media.media import Media, Space
+from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..sensors.kinds import prepare
 from ..transport import bsdf
 from .light_media import LightMedia
@@ -36,6 +37,11 @@ class PreparedScene:
         if media := Media.of(scene, sensor, found):
             self.space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
             self.light_media = LightMedia(self.space, self.emitters, sensor)
+
+    def stored_vertices(self, settings: Settings) -> int:
+        """The longest path that uses all strategies: with media, whose subpaths are long, another default."""
+        given = settings.stored_vertices
+        return MAX_STORED if self.space is not None and given == DEFAULT_STORED else given
 
 
 def _prepare_bitmaps(found):

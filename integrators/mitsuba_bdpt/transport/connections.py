@@ -196,7 +196,10 @@ def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to try at ``z``.
 
-    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges.
+    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with media,
+    where null events are no edges, several vertices may have the same number.)
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
+    if kernel.space is not None:
+        return dr.select(possible, path.count, 0)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

@@ -17,6 +17,9 @@ from .plan import Plan
 # Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
 STORE_SIZES = (64, MAX_STORED)
 
+# In scenes with media, so many vertices of a light subpath are kept at most; see `stored_vertices.Thinning`.
+KEPT = 64
+
 
 @dataclass
 class Coefficients:
@@ -65,8 +68,9 @@ class Kernel:
         self.sensor_medium = None if self.space is None else u32(self.space.media.sensor)
         self.scatters = self.surfaces or (self.space is not None and self.space.media.scatters)
         depth = settings.max_depth
-        reach = min(depth, settings.stored_vertices)
-        self.store_size = next(size for size in STORE_SIZES if size >= reach - 2)
+        reach = min(depth, prepared.stored_vertices(settings))
+        kept = min(reach - 2, KEPT) if self.space is not None else reach - 2
+        self.store_size = next(size for size in STORE_SIZES if size >= kept)
         self.strategy_images = settings.strategy_images
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
         self._reach = u32(reach)

@@ -211,6 +211,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_v
             stored_vertices.store_light_vertex(kernel, vertex, path)
         return path, counters
 
+    if kernel.space is not None:  # the other number of this purpose, at vertex 0, is another one
+        u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
+        path = replace(path, thinning=stored_vertices.Thinning.begin(u))
     walk = _light_walk(kernel, e, stream, shared)
     active, side = walk.active, _light_side(kernel, e, stream, shared, walk)
     state = path, counted_by_light(plan)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
 from . import mis
-from .inputs import Kernel
+from .inputs import KEPT, Kernel
 from .walk import Vertex, volume_cosine
 
 
@@ -56,6 +57,42 @@ class StoredVertex:
 
 
 @dataclass
+class Thinning:
+    """Which vertices of a long light subpath in media are kept, for the others too.
+
+    The first half of `KEPT` all, of later ones the i-th with probability (`KEPT` / 2)^2 / (i (i - 1)), by
+    systematic sampling: with C(i) the sum of the probabilities of the first i and u in [0, 1), the i-th is kept if
+    an integer lies in (C(i - 1) + u, C(i) + u]. C(i) = `KEPT` - (`KEPT` / 2)^2 / i stays below `KEPT`, and so do
+    their number and their places in memory. In integers, of which `_UNIT` are 1: rounding is in the probability too.
+
+    ``tried`` vertices so far; ``offset`` u.
+    """
+
+    tried: mi.UInt32
+    offset: mi.UInt32
+
+    _UNIT: ClassVar = 2**22
+
+    @staticmethod
+    def begin(u: mi.Float) -> Thinning:
+        """Of a new subpath; ``u`` in [0, 1)."""
+        return Thinning(mi.UInt32(0), mi.UInt32(u * Thinning._UNIT))
+
+    def place(self, tried: mi.UInt32) -> tuple[mi.UInt32, mi.Bool, mi.Float]:
+        """Place in memory of the vertex after ``tried``, whether it is kept, and with which probability."""
+        before, after = self._sum(tried), self._sum(tried + 1)
+        place = (before + self.offset) // self._UNIT
+        kept = (after + self.offset) // self._UNIT > place
+        return place, kept, mi.Float(after - before) / self._UNIT
+
+    def _sum(self, i: mi.UInt32) -> mi.UInt32:
+        """C(i) in units of 1 / `_UNIT`."""
+        half = KEPT // 2
+        late = KEPT * self._UNIT - (half * half * self._UNIT - 1) // dr.maximum(i, 1)
+        return dr.select(i <= half, i * self._UNIT, late)
+
+
+@dataclass
 class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory, ``count`` of them.
 
@@ -72,6 +109,7 @@ class LightPath:
     s: dr.Local[mi.UInt32]
     count: mi.UInt32
     medium: dr.Local[mi.UInt32] | None = None
+    thinning: Thinning | None = None
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
@@ -94,6 +132,8 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     """Keep a light vertex that inner connections can use."""
     keep = vertex.hit & (vertex.edges <= kernel.last_stored) & vertex.connectible()
     y, slot = StoredVertex.of(vertex), path.count
+    if path.thinning is not None:
+        y, slot, keep = _thinned(path, y, keep)
     path.si.write(y.si, slot, keep)
     path.throughput_over_cos.write(y.throughput_over_cos, slot, keep)
     path.d_vcm.write(y.partial.d_vcm, slot, keep)
@@ -103,6 +143,14 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     if path.medium is not None:
         path.medium.write(y.medium, slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
+
+
+def _thinned(path: LightPath, y: StoredVertex, keep):
+    """``y`` for all vertices that it stands for, its place, and whether it is kept; counts it as tried."""
+    thinning = path.thinning
+    place, kept, probability = thinning.place(thinning.tried)
+    path.thinning = replace(thinning, tried=thinning.tried + dr.select(keep, mi.UInt32(1), 0))
+    return replace(y, throughput_over_cos=y.throughput_over_cos / probability), place, keep & kept
 
 
 def read_light_vertex(kernel: Kernel, path: LightPath, slot: mi.UInt32) -> StoredVertex:
