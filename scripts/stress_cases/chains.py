@@ -107,6 +107,7 @@ class Columns:
     infinite: object
     unhittable: object
     ratio: object
+    transmittance: list
 
     @staticmethod
     def of(paths: Paths) -> Columns:
@@ -135,6 +136,9 @@ class Columns:
             infinite=mi.Bool(paths.infinite),
             unhittable=mi.Bool(paths.delta_emitter),
             ratio=number(ratio),
+            transmittance=[None] * paths.k
+            if paths.transmittance is None
+            else [number(x) for x in paths.transmittance.T],
         )
 
 
@@ -177,7 +181,8 @@ class Recursion:
         for e in range(1, x.k):
             if e == 1:
                 partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
-            partial = mis.to_area(h, partial, 1 if e == 1 else x.dist2[e - 1], x.cos_camera[e - 1])
+            dist2 = 1 if e == 1 else x.dist2[e - 1]
+            partial = mis.to_area(h, partial, dist2, x.cos_camera[e - 1], x.transmittance[e - 1])
             found.append(partial)
             densities = x.to_camera[e], x.to_light[e]
             partial = self._fold(partial, self._of_light(e), *densities, x.cos_light[e], x.delta[e])
@@ -191,7 +196,9 @@ class Recursion:
         found = [None]
         for e in range(1, k + 1):
             i = k - e
-            arrived = mis.to_area(h, partial, x.dist2[i], x.cos_light[i])
+            arrived = mis.to_area(h, partial, x.dist2[i], x.cos_light[i], x.transmittance[i])
+            if x.transmittance[i] is not None:
+                partial = mis.Partial(h.scale(partial.d_vcm, dr.rcp(x.transmittance[i])), partial.d_vc)
             partial = dr.select(x.infinite, partial, arrived) if e == k else arrived
             found.append(partial)
             if e < k:
@@ -214,7 +221,7 @@ class Recursion:
             return mi.Float(0)
         if k == 1:
             before = mis.Partial(h.scale(before.d_vcm, x.first), before.d_vc)
-        arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1])
+        arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1], x.transmittance[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
         return h.weight(kappa.arrival, light_side, mi.Float(0))
@@ -227,6 +234,10 @@ class Recursion:
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
         return h.weight(1, mi.Float(0), camera_side)
 
+    def _joined(self, kappa, light_side, camera_side, edge):
+        """The weight of a strategy that joins this edge (visibility.seen)."""
+        return self.h.weigh(kappa, light_side, camera_side, self.path.transmittance[edge])[0]
+
     def endpoints(self):
         """(1,1) (techniques.join_endpoints)."""
         x, h, kappa = self.path, self.h, self.kappa
@@ -235,7 +246,7 @@ class Recursion:
         geometry = dr.select(x.infinite, 1, x.cos_light[0] / x.dist2[0])
         light_side = h.start(dr.select(x.unhittable, 0, x.sensor_pdf * geometry / x.first))
         camera_side = h.start(x.second * x.cos_camera[0] / (x.dist2[0] * x.lens_pdf))
-        return h.weight(kappa.endpoints, light_side, h.scale(camera_side, self.arrival))
+        return self._joined(kappa.endpoints, light_side, h.scale(camera_side, self.arrival), 0)
 
     def next_event(self):
         """s = 1 (techniques.next_event)."""
@@ -244,7 +255,7 @@ class Recursion:
         density = x.ratio * x.cos_camera[0]
         of_camera = self._of_camera(k - 1)
         camera_side = mis.alternatives(h, self.camera[k - 1], of_camera, x.to_camera[1], density)
-        return h.weight(1, light_side, camera_side)
+        return self._joined(1, light_side, camera_side, 0)
 
     def inner(self, s):
         """s and t >= 2 (connections.inner)."""
@@ -259,7 +270,7 @@ class Recursion:
         camera_side = mis.alternatives(
             h, self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
         )
-        return h.weight(kappa.inner, light_side, camera_side)
+        return self._joined(kappa.inner, light_side, camera_side, s - 1)
 
     def splat(self):
         """t = 1 (techniques.splat)."""
@@ -272,7 +283,7 @@ class Recursion:
         )
         to_sensor = x.to_camera[k - 1] * x.cos_camera[k - 1] / (x.dist2[k - 1] * x.lens_pdf)
         camera_side = h.scale(h.start(to_sensor), self.arrival)
-        return h.weight(kappa.splat, light_side, camera_side)
+        return self._joined(kappa.splat, light_side, camera_side, k - 1)
 
 
 def columns(values, n) -> np.ndarray:

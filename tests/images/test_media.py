@@ -6,13 +6,13 @@ transmittances, albedos, phase functions and weights together. Unweighted images
 integral in k + 1 ways.
 
 Joins of two volume vertices have 1 / d^2 and no bound: a single inner strategy has infinite variance, and its
-mean over a render is as a rule a few percent low. So images of s = 0, s = 1 and t = 1 alone are compared
-tile by tile, those of inner strategies by the image's mean with a tolerance, and inner strategies also in pairs
+mean over a render is as a rule a few percent low. So images of s = 0, s = 1 and t = 1 alone are compared tile
+by tile, those of inner strategies by the image's mean with a tolerance, and inner strategies also in pairs
 with s = 0, weighted between these two only: then whatever is wrong with their values is no longer hidden
 behind the other classes' small weights.
 
-Statistics: Welch's t per tile with Sidak's correction and uniformity of p-values, as in ``test_strategies.py``,
-both at 1e-3; seeds are fixed, and differ between the two sides. Roulette is off.
+Statistics: Welch's t per tile with Sidak's correction and uniformity of p-values, as in
+``test_strategies.py``, both at 1e-3; seeds are fixed, and differ between the two sides. Roulette is off.
 """
 
 from __future__ import annotations
@@ -167,10 +167,10 @@ def test_unweighted_strategies_agree(name):
     """Rationale: see the module. Lamps in milk say nothing about it, microflakes have a density that is not
     symmetric.
 
-    Expected: for k = 2, 3, 4 the images of s = 0, s = 1 and t = 1, each alone, and the weighted sum have the same
-    mean: each is compared with the next one, of other seeds. So has each inner strategy for the whole image,
-    within 12 %: the largest difference seen is 7 %, too dark, in milk. Statistic: Welch per tile, Sidak;
-    Kolmogorov-Smirnov.
+    Expected: for k = 2, 3, 4 the images of s = 0, s = 1 and t = 1, each alone, and the weighted sum have the
+    same mean: each is compared with the next one, of other seeds. So has each inner strategy for the whole
+    image, within 12 %: the largest difference seen is 7 %, too dark, in milk. Statistic: Welch per tile,
+    Sidak; Kolmogorov-Smirnov.
     """
     a, b = techniques(name, 0), techniques(name, 1)
     family, hittable = [], "emitter" in SCENES[name]()["lamp"]
@@ -256,10 +256,11 @@ def test_colours_agree_with_volpathmis(variant):
 
 def test_our_frames_make_microflakes_sample_their_density():
     """Rationale: Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix, which is another
-    distribution than its density unless the frame is its own transpose. Expected: for 24 directions of arrival the
-    directions sampled have the means of eight functions under the density, in `media.interaction`'s frame, and
-    in Mitsuba's own frame they have not (else the frame is needed no more). Statistic: z of each mean (65,536 samples
-    and as many uniform directions for the density), chi-squared of all of them, level 1e-3.
+    distribution than its density unless the frame is its own transpose. Expected: for 24 directions of
+    arrival the directions sampled have the means of eight functions under the density, in
+    `media.interaction`'s frame, and in Mitsuba's own frame they have not (else the frame is needed no more).
+    Statistic: z of each mean (65,536 samples and as many uniform directions for the density), chi-squared of
+    all of them, level 1e-3.
     """
     phase, ctx, n = mi.load_dict(microflakes()), mi.PhaseFunctionContext(None), 65536
     rng = mi.PCG32(n)

@@ -1,15 +1,18 @@
 """A slow, obvious oracle for the weights: every density of every strategy, written out.
 
-E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation" (1997), section 10.2: a path
-x_0 ... x_k of k edges, x_0 on an emitter and x_k on the sensor, can be made by the strategies
-(s, t) with t = k + 1 - s. Each makes the first s vertices from the light and the others from the
-camera, so its density is
+E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation" (1997), section 10.2: a path x_0 ... x_k
+of k edges, x_0 on an emitter and x_k on the sensor, can be made by the strategies (s, t) with t = k + 1 - s.
+Each makes the first s vertices from the light and the others from the camera, so its density is
 
-    p_s = light[0] ... light[s-1] * camera[s] ... camera[k]
+p_s = light[0] ... light[s-1] * camera[s] ... camera[k]
 
-with the arrays ``light`` and ``camera`` below: densities of each vertex from either side. Nothing
-is recursive here and nothing is shared with the code under test. Arithmetic is in float64 and in
-logarithms (products of twenty densities over 60 orders of magnitude leave the range of float64).
+with the arrays ``light`` and ``camera`` below: densities of each vertex from either side. Nothing is
+recursive here and nothing is shared with the code under test. Arithmetic is in float64 and in logarithms
+(products of twenty densities over 60 orders of magnitude leave the range of float64).
+
+In media every vertex that is sampled has the density T c besides: T the transmittance of the edge that it is
+sampled along, c the extinction at a vertex in a medium (1 on surfaces, at emitters and sensors). A joined
+edge is not sampled. Cosines of vertices in media are 1 (M. Raab, D. Seibert, A. Keller 2008).
 
 Edge i joins x_i and x_{i+1}. All arrays have one row per path.
 """
@@ -37,6 +40,8 @@ class Paths:
     ``direct``: density of x_0 by next-event estimation from x_1, solid angle at x_1 (probability
     for delta emitters). ``lens``: whether the sensor has area; ``lens_pdf`` area density of x_k on
     it (1 without); ``sensor_pdf``: solid-angle density of the direction to x_{k-1}.
+
+    In media (else None) ``transmittance`` (n, k) of the edges, ``extinction`` (n, k + 1): c of the vertices.
     """
 
     dist2: np.ndarray
@@ -52,6 +57,8 @@ class Paths:
     lens: np.ndarray
     lens_pdf: np.ndarray
     sensor_pdf: np.ndarray
+    transmittance: np.ndarray | None = None
+    extinction: np.ndarray | None = None
 
     @property
     def k(self) -> int:
@@ -60,12 +67,14 @@ class Paths:
 
     def of(self, chosen) -> Paths:
         """Those that an index or a mask has ``chosen``."""
-        return Paths(*(getattr(self, f.name)[chosen] for f in fields(self)))
+        columns = (getattr(self, f.name) for f in fields(self))
+        return Paths(*(None if x is None else x[chosen] for x in columns))
 
     @staticmethod
     def joined(several) -> Paths:
         """All of ``several``, of the same number of edges."""
-        return Paths(*(np.concatenate([getattr(p, f.name) for p in several]) for f in fields(Paths)))
+        columns = ([getattr(p, f.name) for p in several] for f in fields(Paths))
+        return Paths(*(None if x[0] is None else np.concatenate(x) for x in columns))
 
     @property
     def infinite(self):
@@ -136,6 +145,11 @@ def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if i == 0:  # a direction keeps its solid angle; a delta emitter is never hit
             to_area = np.where(is_area, to_area, 0)
         camera[:, i] = pdf + to_area
+
+    if paths.transmittance is not None:
+        tr, c = np.log(paths.transmittance), np.log(paths.extinction)
+        light[:, 1:] += tr + c[:, 1:]
+        camera[:, :-1] += tr + c[:, :-1]
 
     # Next-event estimation makes x_0 with a density of its own.
     direct = log["direct"] + np.where(is_area, log["cos_light"][:, 0] - log["dist2"][:, 0], 0)

@@ -121,7 +121,11 @@ def _segment(media: Media, ray, landing: Landing, word, active):
     collided = active & (t < end)
     edge = replace(edge, depth=edge.depth + depth, rest=rest)
     throughput, edge = _weighted(media, segment, t, collided, throughput, edge, depth, active)
-    return si, replace(landing, t=dr.minimum(t, end), collided=collided, edge=edge, throughput=throughput), word
+    return (
+        si,
+        replace(landing, t=dr.minimum(t, end), collided=collided, edge=edge, throughput=throughput),
+        word,
+    )
 
 
 def _through_homogeneous(media: Media, ray, edge: Edge, end, active):

@@ -97,7 +97,9 @@ class Media:
 
     def is_null(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Mask: the BSDF of the surface ``si`` lets everything pass straight on."""
-        return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(mi.BSDFFlags.Null)
+        return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(
+            mi.BSDFFlags.Null
+        )
 
     def mean(self, number: mi.UInt32) -> mi.Float:
         """Mean extinction of the medium (1 / scene unit), of a grid within its box; 0 in vacuum."""
@@ -147,10 +149,7 @@ class Space:
 
 # Lobes other than passing straight on.
 _OTHER_LOBES = int(
-    mi.BSDFFlags.Smooth
-    | mi.BSDFFlags.DeltaReflection
-    | mi.BSDFFlags.DeltaTransmission
-    | mi.BSDFFlags.Delta1D
+    mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Delta1D
 )
 
 

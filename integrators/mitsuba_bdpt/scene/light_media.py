@@ -39,7 +39,9 @@ class LightMedia:
         self.contradiction = _contradiction(space, sensor, self.outside)
         self._outside = dr.opaque(mi.UInt32, self.outside)
         front, back = _declared(space, emitters)
-        probed, mixed = self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
+        probed, mixed = (
+            self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
+        )
         self._front = mi.UInt32([p if f is None else f for f, p in zip(front, probed, strict=True)] or [0])
         self._back = mi.UInt32([p if b is None else b for b, p in zip(back, probed, strict=True)] or [0])
         # Of emitters that stand partly in a medium, each ray is asked.
@@ -103,7 +105,9 @@ def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     u = np.random.default_rng(0).random((2, _PROBES))
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
     origin = sensor.world_transform() @ mi.Point3f(0)
-    number, found = boundaries.near_side(space, mi.Ray3f(origin + dr.zeros(mi.Point3f, _PROBES), d), mi.Bool(True))
+    number, found = boundaries.near_side(
+        space, mi.Ray3f(origin + dr.zeros(mi.Point3f, _PROBES), d), mi.Bool(True)
+    )
     return np.array(number), np.array(found)
 
 
@@ -112,7 +116,11 @@ def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
     number, found = _around(space, sensor)
     declared = space.media.sensor
     if found.any() and (number[found] != declared).mean() > _TOLERATED:
-        says = f"declares the medium {named(space.media.objects[declared - 1])}" if declared else "declares no medium"
+        says = (
+            f"declares the medium {named(space.media.objects[declared - 1])}"
+            if declared
+            else "declares no medium"
+        )
         return f"sensor {named(sensor)} {says}, but the boundaries around it say otherwise"
     crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
     crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())

@@ -68,7 +68,9 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]):
+    while dr.hint(
+        slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
+    ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)

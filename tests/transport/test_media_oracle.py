@@ -1,0 +1,187 @@
+"""The weights in media against explicit densities, with transmittances and extinctions written out.
+
+The oracle (`measure.oracle`) has T of every edge and c = sigma_t of every volume vertex in each density; the
+recursion has T~ of the joining edge alone. As in ``test_oracle.py``: first arithmetic, then the unchanged
+kernel in a real scene, vertex by vertex.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import drjit as dr
+import media_parts as parts
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import settings
+from mitsuba_bdpt.measure import endpoints, oracle, recording
+from mitsuba_bdpt.measure.oracle import AREA, POSITION
+from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.sampling.points import Points
+from mitsuba_bdpt.transport import kernel
+from mitsuba_bdpt.transport.batch import Batch
+from stress_cases.chains import COEFFICIENTS, random_paths, recursion
+
+
+def in_media(rng, paths, decades):
+    """``paths`` with random transmittances and extinctions; half of the inner vertices lie in a volume."""
+    n, k = paths.dist2.shape
+    paths.transmittance = (10 ** -rng.uniform(0, decades, (n, k))).astype(np.float32)
+    volume = rng.random((n, k + 1)) < 0.5
+    volume[:, [0, k]] = False
+    paths.extinction = np.where(volume, 10 ** rng.uniform(-3, 3, (n, k + 1)), 1)
+    paths.delta &= ~volume
+    paths.cos_light[volume[:, :-1]] = 1
+    paths.cos_camera[volume[:, 1:]] = 1
+    return paths
+
+
+@pytest.mark.parametrize("name", settings.HEURISTICS)
+@pytest.mark.parametrize("classes", ["n1c1", "odd", "n1c0-half", "n0c0"])
+def test_recursion_with_transmittances(name, classes):
+    """Rationale: all extinctions cancel, and all transmittances but that of the joining edge.
+
+    500 random paths each of k = 1 ... 7 edges, transmittances of 1e-4 to 1, extinctions of 1e-3 to 1e3,
+    otherwise as `test_oracle.test_recursion_agrees_with_explicit_densities`. Expected: every weight is the
+    oracle's to 1e-4 of its own size, and the weights of a path sum to 1 within 1e-4. For ``maximum``, paths
+    whose two best strategies tie are left out.
+    """
+    rng = np.random.default_rng(1)
+    for k in range(1, 8):
+        paths = in_media(rng, random_paths(rng, 500, k), 4)
+        explicit = oracle.Explicit(paths, COEFFICIENTS[classes])
+        weights = np.where(explicit.used, recursion(paths, COEFFICIENTS[classes], name), 0)
+        keep = ~explicit.tied if name == "maximum" else np.ones(500, dtype=bool)
+        expected = explicit.weights(name)
+        np.testing.assert_allclose(weights[keep], expected[keep], rtol=1e-4, atol=1e-30, err_msg=f"k={k}")
+        possible = explicit.used.any(1) & keep
+        np.testing.assert_allclose(weights[possible].sum(1), 1, atol=1e-4)
+
+
+def test_any_transmittance_is_a_partition():
+    """Rationale: T~ of a grid is not its T; weights add up to 1 whatever T~ is, as long as all strategies
+    have the same one. Expected: with T~ unrelated to T the recursion's weights sum to 1 within 1e-4, and
+    without T~ in one class they do not.
+    """
+    rng = np.random.default_rng(2)
+    paths = in_media(rng, random_paths(rng, 500, 4), 2)
+    kappa = COEFFICIENTS["n1c1"]
+    weights = recursion(paths, kappa, "balance")
+    used = oracle.Explicit(paths, kappa).used
+    np.testing.assert_allclose(np.where(used, weights, 0).sum(1), 1, atol=1e-4)
+    paths.transmittance = np.ones_like(paths.transmittance)
+    without = recursion(paths, kappa, "balance")
+    mixed = np.where(used, np.where(np.arange(6) == 2, without, weights), 0)
+    assert np.abs(mixed.sum(1) - 1).mean() > 0.05
+
+
+# -- the kernel ---------------------------------------------------------------------------------------
+
+SIGMA, G = 0.8, 0.4
+LANES, DEPTH = 192, 4
+
+
+def hg(cos):
+    """Density of directions at the angle of this cosine to the one that light travels in."""
+    return (1 - G * G) / (4 * np.pi * (1 + G * G - 2 * G * cos) ** 1.5)
+
+
+def recorded(scene, integrator):
+    """All paths that one run of the kernel makes."""
+    render = rendering.Render(scene, scene.sensors()[0], integrator.settings, 5, 1)
+    pixels = int(np.prod(render.kernel.camera.region.size))
+    samples = -(-LANES * render.plan.camera_paths_per_light_path // pixels)
+    batch, points = Batch(0, pixels, 0, samples), Points("independent", dr.opaque(mi.UInt32, 5))
+    recorder = recording.Recorder(LANES)
+    slots = dr.arange(mi.UInt32, LANES)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False), recording.stepwise():
+        dr.eval(kernel.retrace(render.kernel, recorder, batch, points, samples, slots, recorder))
+    return [path for lane in range(LANES) for path in recorder.paths(lane)], render.kernel.kappa
+
+
+def normals(p, shape, light):
+    """Of wall and lamp (balls both), and where a vertex lies in the fog."""
+    volume = shape == 0
+    on_lamp = (
+        np.abs(np.linalg.norm(p - light.center, axis=-1) - light.radius) < 1e-3 if light.radius else volume
+    )
+    n = np.where(on_lamp[..., None], (p - light.center) / light.radius if light.radius else p, p)
+    return n / np.linalg.norm(n, axis=-1, keepdims=True), volume
+
+
+def explicit_paths(made, scene):
+    """The densities of these paths of one length, vertices from the emitter on."""
+    light, camera = endpoints.lamps_of(scene)[0], endpoints.Camera.of(scene.sensors()[0])
+    if light.kind == POSITION:
+        light.center = np.zeros(3)
+    p = np.array([path.p[::-1] for path in made])
+    n, k = len(p), p.shape[1] - 1
+    shape = np.array([path.shapes[::-1] for path in made])
+    normal, volume = normals(p, shape, light)
+    volume[:, [0, k]] = False
+    step = p[:, 1:] - p[:, :-1]
+    dist2 = (step**2).sum(2)
+    d = step / np.sqrt(dist2)[..., None]
+    cos_light = np.where(volume[:, :-1], 1, np.abs((normal[:, :-1] * d).sum(2)))
+    cos_camera = np.where(volume[:, 1:], 1, np.abs((normal[:, 1:] * d).sum(2)))
+    cos_camera[:, -1] = np.where(camera.radius > 0, np.abs(d[:, -1] @ camera.axis), 1)
+    if light.kind == POSITION:
+        cos_light[:, 0] = 1
+    to_camera, to_light = np.ones((n, k + 1)), np.ones((n, k + 1))
+    for i in range(1, k):
+        phase = hg((d[:, i - 1] * d[:, i]).sum(1))
+        to_camera[:, i] = np.where(volume[:, i], phase, cos_light[:, i] / np.pi)
+        to_light[:, i] = np.where(volume[:, i], phase, cos_camera[:, i - 1] / np.pi)
+    return oracle.Paths(
+        dist2=dist2,
+        cos_light=cos_light,
+        cos_camera=cos_camera,
+        to_camera=to_camera,
+        to_light=to_light,
+        delta=np.zeros((n, k + 1), dtype=bool),
+        kind=np.full(n, light.kind),
+        first=light.first(d[:, 0]),
+        second=light.second(cos_light[:, 0], p[:, 1], d[:, 0], None),
+        direct=light.direct(cos_light[:, 0], dist2[:, 0], p[:, 1], d[:, 0]),
+        lens=np.full(n, camera.radius > 0),
+        lens_pdf=np.full(n, camera.lens_density()),
+        sensor_pdf=camera.density(d[:, -1]),
+        transmittance=np.exp(-SIGMA * np.sqrt(dist2)),
+        extinction=np.where(volume, SIGMA, 1.0),
+    )
+
+
+@pytest.mark.parametrize("heuristic", ["balance", "power"])
+@pytest.mark.parametrize("kind", ["lamp", "point", "lens"])
+def test_kernel_in_fog_agrees_with_explicit_densities(kind, heuristic):
+    """Rationale: right arithmetic with the wrong T~, cosine or medium is still wrong.
+
+    A room of gray fog (sensor and lamp in it, hg), all strategies, each lane's paths of up to 4 edges as the
+    unchanged kernel makes them; their densities are written out from the positions of their vertices.
+    Expected: every weight is the oracle's to 2e-3 of its own size plus 1e-4, but for 1 % of the paths:
+    positions are float32, near walls cosines are few digits of them, and at a lamp's rim rounding decides
+    which density it has. Hundreds of paths of each strategy, those with vertices in the fog among them.
+    """
+    camera = parts.thinlens if kind == "lens" else parts.sensor
+    light = parts.point() if kind == "point" else parts.lamp()
+    scene = mi.load_dict(parts.foggy(parts.fog(SIGMA, 0.9, G), camera, light=light))
+    method = parts.integrator(skip="none", max_depth=DEPTH, heuristic=heuristic)
+    made, _ = recorded(scene, method)
+    by_length, seen = defaultdict(list), defaultdict(int)
+    for path in made:
+        by_length[len(path.p) - 1].append(path)
+    for k, of_length in by_length.items():
+        paths = explicit_paths(of_length, scene)
+        expected = oracle.Explicit(paths, oracle.Coefficients()).weights(heuristic)
+        np.testing.assert_allclose(expected.sum(1), 1, atol=1e-9)
+        own = np.array([path.weight for path in of_length])
+        s = np.array([path.s for path in of_length])
+        wanted = expected[np.arange(len(s)), s]
+        off = np.abs(own - wanted) > 2e-3 * wanted + 1e-4
+        assert off.mean() < 0.01, (k, s[off][:9], own[off][:9], wanted[off][:9])
+        for i in range(len(s)):
+            seen[min(s[i], 2), min(k + 1 - s[i], 2), bool((paths.extinction[i] != 1).any())] += 1
+    for strategy in ((1, 2), (2, 1), (2, 2), *(((0, 2),) if kind != "point" else ())):
+        assert seen[*strategy, True] > 50, (strategy, dict(seen))
+    assert (paths.kind == (POSITION if kind == "point" else AREA)).all()
