@@ -152,6 +152,7 @@ class BDPTIntegrator:
             check_resumable(start, self.settings)
             render.resume(start)
         messages.warn_of_parameters(scene, sensor)
+        messages.warn_of_media(render.prepared, sensor)
         try:
             self._cancelled = False
             render.run(self.on_pass, lambda: self._cancelled)

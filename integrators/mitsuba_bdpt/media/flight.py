@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..geometry import rays
 from . import tracking
-from .media import Media, Space, coefficients, interaction, of_depth
+from .media import Media, Space, coefficients, depth_of, interaction, of_depth
 
 
 @dataclass
@@ -131,8 +131,7 @@ def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
     t = edge.rest / own
     collides = t < end  # of nothing at all it is NaN or infinite
     travelled = dr.select(collides, t, end)
-    # In vacuum the end may be infinitely far.
-    depth = dr.select(sigma > 0, sigma * travelled, 0)
+    depth = depth_of(sigma, travelled)
     rest = dr.select(own > 0, edge.rest - own * travelled, edge.rest)
     return dr.select(collides, t, dr.inf), depth, rest
 

@@ -181,6 +181,12 @@ def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool
     return mi.Spectrum(sigma_s), mi.Spectrum(sigma_t)
 
 
+def depth_of(sigma: mi.Float | mi.Spectrum, length: mi.Float) -> mi.Float | mi.Spectrum:
+    """Optical depth of a ``length``, which may be infinite, in a medium of extinction ``sigma``."""
+    # (In spectral variants the choice by entries is no `Spectrum`.)
+    return type(sigma)(dr.select(sigma > 0, sigma * length, 0))
+
+
 def of_depth(depth: mi.Float | mi.Spectrum) -> mi.Float:
     """T~ of an optical depth: the mean over the channels of exp(-depth), not below that of `DEEPEST`."""
     transmittance = dr.exp(-depth)

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..geometry import rays
 from ..geometry.rounding import met
 from . import tracking
-from .media import Media, Space, of_depth
+from .media import Media, Space, depth_of, of_depth
 
 
 @dataclass
@@ -53,7 +53,7 @@ def between(
 def _along(media: Media, medium, ray, length, word, active):
     """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word."""
     sigma = media.extinction(medium, ray.d, ray, active)
-    depth = dr.select(sigma > 0, sigma * length, 0)
+    depth = depth_of(sigma, length)
     transmittance = mi.Spectrum(dr.exp(-depth))
     if media.grids:
         grid = active & (medium != 0) & ~media.is_homogeneous(medium)

@@ -28,7 +28,8 @@ class LightMedia:
     """The medium of every emitter; made anew for each render.
 
     ``outside`` is the number of the medium that surrounds the scene: the sensor's, unless it is bounded;
-    ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do.
+    ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do;
+    ``hides_infinity``: light from infinity does not arrive.
     """
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor):
@@ -38,6 +39,9 @@ class LightMedia:
         self.outside = 0 if bounded else space.media.sensor
         self.contradiction = _contradiction(space, sensor, self.outside)
         self._outside = dr.opaque(mi.UInt32, self.outside)
+        # Nothing arrives from infinity through a homogeneous medium without end.
+        endless = space.media.objects[self.outside - 1] if self.outside else None
+        self.hides_infinity = endless is not None and endless.is_homogeneous()
         front, back = _declared(space, emitters)
         probed, mixed = self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
         self._front = mi.UInt32([p if f is None else f for f, p in zip(front, probed, strict=True)] or [0])
@@ -114,6 +118,8 @@ def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
     if found.any() and (number[found] != declared).mean() > _TOLERATED:
         says = f"declares the medium {named(space.media.objects[declared - 1])}" if declared else "declares no medium"
         return f"sensor {named(sensor)} {says}, but the boundaries around it say otherwise"
+    if not space.scene.shapes():
+        return ""
     crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
     crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
     if wrong > _TOLERATED * crossings:
