@@ -16,11 +16,11 @@ from .media import Media, Space, coefficients, depth_of, interaction, of_depth
 class Edge:
     """What a subpath in media carries along an edge; vertices start new ones.
 
-    ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth of T~ so
-    far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event`` counts events,
-    null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In chromatic media
-    ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their mean over channels, of
-    all flights of the subpath (``Spectrum``); else None.
+    ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth
+    of T~ so far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event``
+    counts events, null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In
+    chromatic media ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their
+    mean over channels, of all flights of the subpath (``Spectrum``); else None.
     """
 
     medium: mi.UInt32
@@ -121,7 +121,11 @@ def _segment(media: Media, ray, landing: Landing, word, active):
     collided = active & (t < end)
     edge = replace(edge, depth=edge.depth + depth, rest=rest)
     throughput, edge = _weighted(media, segment, t, collided, throughput, edge, depth, active)
-    return si, replace(landing, t=dr.minimum(t, end), collided=collided, edge=edge, throughput=throughput), word
+    return (
+        si,
+        replace(landing, t=dr.minimum(t, end), collided=collided, edge=edge, throughput=throughput),
+        word,
+    )
 
 
 def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
@@ -136,7 +140,7 @@ def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
     return dr.select(collides, t, dr.inf), depth, rest
 
 
-def at(spectrum: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
+def at(spectrum: mi.Spectrum, channel: mi.UInt32):
     """The entry ``channel`` of a spectrum."""
     value = spectrum[0]
     for i in range(1, len(spectrum)):
@@ -145,7 +149,7 @@ def at(spectrum: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
 
 
 def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, active):
-    """Throughput after a segment with a collision at ``t`` or none, and the edge with its channels' densities.
+    """Throughput after a segment with a collision at ``t`` or none, and the edge with its channels' ratios.
 
     In gray media what is sampled cancels but for the albedo. In chromatic ones the densities of all channels
     count: the balance heuristic over the channel that is sampled (A. Wilkie et al. 2014).
@@ -170,8 +174,8 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
 def _passes(media: Media, si, hidden) -> mi.Bool:
     """Mask: an edge goes through this surface, which nobody looks at.
 
-    Of plugin ``null``, without emitter and sensor; ``hidden`` (a mask or None): emitters are passed, as by ``path``
-    under ``hide_emitters``.
+    Of plugin ``null``, without emitter and sensor; ``hidden`` (a mask or None): emitters are passed, as by
+    ``path`` under ``hide_emitters``.
     """
     emits = si.shape.emitter() != dr.zeros(mi.EmitterPtr)
     passes = mi.Bool(False)

@@ -28,11 +28,12 @@ _PROBES = 4096
 class Media:
     """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
 
-    ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for branches
-    while a kernel is recorded: ``homogeneous`` media and ``grids``; ``scatters``: some albedo is not 0; ``gray``:
-    no extinction of homogeneous media depends on the wavelength, so that optical depths are ``Float``, else
-    ``Spectrum``; ``directional``: extinction depends on the direction (microflakes); ``see_through``: surfaces of
-    plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays have to look at surfaces.
+    ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for
+    branches while a kernel is recorded: ``homogeneous`` media and ``grids``; ``scatters``: some albedo is not
+    0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths are
+    ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
+    ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
+    have to look at surfaces.
 
     Raises ``UnsupportedError`` for media whose own calls contradict each other.
     """
@@ -97,7 +98,9 @@ class Media:
 
     def is_null(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
         """Mask: the BSDF of the surface ``si`` lets everything pass straight on."""
-        return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(mi.BSDFFlags.Null)
+        return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(
+            mi.BSDFFlags.Null
+        )
 
     def mean(self, number: mi.UInt32) -> mi.Float:
         """Mean extinction of the medium (1 / scene unit), of a grid within its box; 0 in vacuum."""
@@ -113,7 +116,7 @@ class Media:
         answer = self.ask(number, self._majorant, interaction(mi.Point3f(0), d, shared), active)
         return dr.select(active & (number != 0), answer, 0)
 
-    def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+    def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool):
         """Majorant of a grid, one number for all channels (1 / scene unit)."""
         extinction = self.extinction(number, ray.d, ray, active)
         return extinction if self.gray else extinction[0]
@@ -123,7 +126,7 @@ class Media:
         return majorant[0] if self.gray else majorant
 
     def ask(self, number: mi.UInt32, question, *args):
-        """Answers of ``question(medium, *args)``, without meaning in vacuum; the last of ``args`` is a mask."""
+        """Answers of ``question(medium, *args)``, without meaning in vacuum; ``args`` end with a mask."""
         *others, active = args
         active = active & (number != 0)
         if len(self.objects) == 1:
@@ -147,10 +150,7 @@ class Space:
 
 # Lobes other than passing straight on.
 _OTHER_LOBES = int(
-    mi.BSDFFlags.Smooth
-    | mi.BSDFFlags.DeltaReflection
-    | mi.BSDFFlags.DeltaTransmission
-    | mi.BSDFFlags.Delta1D
+    mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Delta1D
 )
 
 
@@ -165,7 +165,8 @@ def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f
 def symmetric_frame(n: mi.Vector3f) -> mi.Frame3f:
     """A frame about unit ``n`` whose matrix is its own transpose: half a turn, or a reflection of the z axis.
 
-    Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix: another distribution than its density.
+    Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix: another distribution than its
+    density.
     """
     sign = dr.select(n.z >= 0, mi.Float(1), mi.Float(-1))
     h = dr.normalize(n + mi.Vector3f(0, 0, sign))
@@ -187,7 +188,7 @@ def depth_of(sigma: mi.Float | mi.Spectrum, length: mi.Float) -> mi.Float | mi.S
     return type(sigma)(dr.select(sigma > 0, sigma * length, 0))
 
 
-def of_depth(depth: mi.Float | mi.Spectrum) -> mi.Float:
+def of_depth(depth: mi.Float | mi.Spectrum):
     """T~ of an optical depth: the mean over the channels of exp(-depth), not below that of `DEEPEST`."""
     transmittance = dr.exp(-depth)
     if isinstance(depth, mi.Spectrum):
@@ -230,8 +231,8 @@ def _check(medium: mi.Medium):
 class _Look:
     """What a medium is like, from its own answers at random points and directions.
 
-    ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`; ``mean``
-    extinction.
+    ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`;
+    ``mean`` extinction.
     """
 
     def __init__(self, medium: mi.Medium):

@@ -30,17 +30,24 @@ class Crossing:
         return of_depth(self.depth)
 
     @property
-    def visible(self) -> mi.Bool:
+    def visible(self):
         """Mask: something passes. (NaN does, so that it is counted.)"""
         return ~dr.all(self.transmittance == 0)
 
 
 def between(
-    space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool, own, word: mi.UInt32, hidden: bool = False
+    space: Space,
+    ray: mi.Ray3f,
+    medium: mi.UInt32,
+    active: mi.Bool,
+    own,
+    word: mi.UInt32,
+    hidden: bool = False,
 ) -> Crossing:
     """What passes along ``ray``, which starts in ``medium``, up to its end; 0 where not ``active``.
 
-    ``own`` is as of `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are passed.
+    ``own`` is as of `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are
+    passed.
     """
     media = space.media
     if not media.null_lobes and not hidden:
@@ -70,9 +77,7 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
     transmittance, word, going = mi.Spectrum(1), mi.UInt32(word), mi.Bool(active)
     clear = mi.Bool(active)
     depth = mi.Float(0) if media.gray else mi.Spectrum(0)
-    while dr.hint(
-        going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]
-    ):
+    while dr.hint(going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
         si = scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
         hit = going & si.is_valid() & ~_is_end(si, own, ray.maxt - left + si.t)

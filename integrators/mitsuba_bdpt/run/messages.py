@@ -67,15 +67,15 @@ def warn_of_media(prepared, sensor):
         warn_once(
             scene,
             sensor,
-            f"bdpt: {media.contradiction}; light subpaths would see another scene than the camera, so there are "
-            "none: the image is that of `volpath`",
+            f"bdpt: {media.contradiction}; light subpaths would see another scene than the camera, so there "
+            "are none: the image is that of `volpath`",
         )
     if media.hides_infinity and prepared.emitters.at_infinity:
         warn_once(
             scene,
             sensor,
-            "bdpt: the medium that the sensor declares has no end, and no light from infinity (sky, sun) arrives "
-            "through it; put a shape with a null BSDF around it",
+            "bdpt: the medium that the sensor declares has no end, and no light from infinity (sky, sun) "
+            "arrives through it; put a shape with a null BSDF around it",
         )
 
 

@@ -1,7 +1,7 @@
 """Which medium light subpaths start in.
 
-Scenes seldom say it: an area light on a shape without exterior medium may stand in a ball of milk. It is found by
-rays of emission: the near side of the first boundary that they meet, or what surrounds the scene.
+Scenes seldom say it: an area light on a shape without exterior medium may stand in a ball of milk. It is
+found by rays of emission: the near side of the first boundary that they meet, or what surrounds the scene.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from ..transport.inputs import Shared
 # Rays by which an emitter, or a sensor, is asked for its medium.
 _PROBES = 64
 
-# Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding; edges).
+# Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding;
+# edges).
 _LINES = 4096
 _TOLERATED = 0.01
 
@@ -43,7 +44,9 @@ class LightMedia:
         endless = space.media.objects[self.outside - 1] if self.outside else None
         self.hides_infinity = endless is not None and endless.is_homogeneous()
         front, back = _declared(space, emitters)
-        probed, mixed = self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
+        probed, mixed = (
+            self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
+        )
         self._front = mi.UInt32([p if f is None else f for f, p in zip(front, probed, strict=True)] or [0])
         self._back = mi.UInt32([p if b is None else b for b, p in zip(back, probed, strict=True)] or [0])
         # Of emitters that stand partly in a medium, each ray is asked.
@@ -107,7 +110,9 @@ def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     u = np.random.default_rng(0).random((2, _PROBES))
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
     origin = sensor.world_transform() @ mi.Point3f(0)
-    number, found = boundaries.near_side(space, mi.Ray3f(origin + dr.zeros(mi.Point3f, _PROBES), d), mi.Bool(True))
+    number, found = boundaries.near_side(
+        space, mi.Ray3f(origin + dr.zeros(mi.Point3f, _PROBES), d), mi.Bool(True)
+    )
     return np.array(number), np.array(found)
 
 
@@ -116,7 +121,11 @@ def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
     number, found = _around(space, sensor)
     declared = space.media.sensor
     if found.any() and (number[found] != declared).mean() > _TOLERATED:
-        says = f"declares the medium {named(space.media.objects[declared - 1])}" if declared else "declares no medium"
+        says = (
+            f"declares the medium {named(space.media.objects[declared - 1])}"
+            if declared
+            else "declares no medium"
+        )
         return f"sensor {named(sensor)} {says}, but the boundaries around it say otherwise"
     if not space.scene.shapes():
         return ""
@@ -124,8 +133,8 @@ def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
     crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
     if wrong > _TOLERATED * crossings:
         return (
-            f"the shapes disagree about the medium between them at {100 * wrong / crossings:.0f} % of the boundaries "
-            "that random lines cross: give each the interior and exterior medium that is there"
+            f"the shapes disagree about the medium between them at {100 * wrong / crossings:.0f} % of the "
+            "boundaries that random lines cross: give each the interior and exterior medium that is there"
         )
     return ""
 

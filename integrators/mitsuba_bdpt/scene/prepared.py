@@ -8,8 +8,8 @@ import mitsuba as mi
 from ..emitters.emitters import Emitters
 from ..host.introspection import all_shapes, children, is_instance
 from ..media.media import Media, Space
-from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..sensors.kinds import prepare
+from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf
 from .light_media import LightMedia
 

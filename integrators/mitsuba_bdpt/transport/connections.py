@@ -68,7 +68,9 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    while dr.hint(slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]):
+    while dr.hint(
+        slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
+    ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
@@ -122,8 +124,9 @@ class _Drawn:
 
     The weighted ``value`` of the one drawn, the ``total`` size of all, the ``end`` of the visibility ray to
     it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, and how many are not zero,
-    and ``lost`` for want of a finite value. In scenes with media, where the weight is known after the ray only,
-    also its unweighted value (``joined``), its ``sides`` (see `Contribution`) and its ``size`` in the draw.
+    and ``lost`` for want of a finite value. In scenes with media, where the weight is known after the ray
+    only, also its unweighted value (``joined``), its ``sides`` (see `Contribution`) and its ``size`` in the
+    draw.
     """
 
     value: mi.Spectrum
@@ -196,8 +199,8 @@ def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to try at ``z``.
 
-    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with media,
-    where null events are no edges, several vertices may have the same number.)
+    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with
+    media, where null events are no edges, several vertices may have the same number.)
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
     if kernel.space is not None:

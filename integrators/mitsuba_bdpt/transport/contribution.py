@@ -35,7 +35,7 @@ class Contribution:
     kind: str = ""
     position: mi.Point2f | None = None
     counted: Counters = field(default_factory=Counters)
-    sides: tuple | None = None
+    sides: Any = None
 
     def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""

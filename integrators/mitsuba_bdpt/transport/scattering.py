@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import bsdf, phase
-from .bsdf import Evaluation, Step, Target
+from .bsdf import Evaluation, Target
 
 
 def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):
@@ -18,9 +18,7 @@ def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None)
     on_surface = _of(target, ~vertex.volume)
     step, f = None, None
     if kernel.surfaces:
-        step, f = take(
-            vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface
-        )
+        step, f = take(vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface)
     if not media.scatters:
         return step, f
     medium, active = vertex.edge.medium, active & vertex.volume
@@ -38,7 +36,11 @@ def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
     if vertex.volume is None:
         return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active, kernel.traits)
     return _chosen(
-        kernel, vertex, vertex.edge.medium, wo, active,
+        kernel,
+        vertex,
+        vertex.edge.medium,
+        wo,
+        active,
         lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, kernel.traits),
     )
 
@@ -48,7 +50,11 @@ def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio
     if vertex.volume is None:
         return bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, active, kernel.traits, cos_ratio)
     return _chosen(
-        kernel, vertex, vertex.medium, wo, active,
+        kernel,
+        vertex,
+        vertex.medium,
+        wo,
+        active,
         lambda mask: bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, mask, kernel.traits, cos_ratio),
     )
 

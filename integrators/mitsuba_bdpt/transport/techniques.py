@@ -112,7 +112,9 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     counted = Counters(shadow_s1=one(active))
     sight = Sight(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
     ends = mi.UInt32(1), k
-    return seen(kernel, Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides), sight)
+    return seen(
+        kernel, Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides), sight
+    )
 
 
 def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
