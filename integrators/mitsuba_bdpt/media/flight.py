@@ -64,7 +64,7 @@ class Edge:
             rays=self.rays + 1,
         )
 
-    def weight_transmittance(self) -> mi.Float:
+    def weight_transmittance(self):
         """T~ of the edge so far."""
         return of_depth(self.depth)
 

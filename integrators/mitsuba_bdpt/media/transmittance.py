@@ -25,7 +25,7 @@ class Crossing:
     clear: mi.Bool
 
     @property
-    def tr(self) -> mi.Float:
+    def tr(self):
         """T~ of the edge, which the weights have."""
         return of_depth(self.depth)
 

@@ -254,7 +254,7 @@ class _End:
         return self.hit
 
 
-def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active) -> tuple[mi.Bool, mi.Float]:
+def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active):
     """Whether the sensor lies on the part of the edge that ``walk`` follows now, and T~ of the edge to it."""
     begun = dr.norm(walk.o - walk.previous)
     length = dr.sqrt(z.dist2) - z.near - begun
