@@ -20,7 +20,8 @@ class Edge:
     of T~ so far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event``
     counts events, null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In
     chromatic media ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their
-    mean over channels, of all flights of the subpath (``Spectrum``); else None.
+    mean over channels, of all flights of the subpath (``Spectrum``); else None. ``lit``: next-event
+    estimation is allowed at the vertex before, None where it is everywhere.
     """
 
     medium: mi.UInt32
@@ -31,6 +32,7 @@ class Edge:
     rays: mi.UInt32
     channel: mi.UInt32 | None = None
     ratio: mi.Spectrum | None = None
+    lit: mi.Bool | None = None
 
     @staticmethod
     def begin(media: Media, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
@@ -47,12 +49,14 @@ class Edge:
             rays=mi.UInt32(1),
             channel=channel,
             ratio=ratio,
+            lit=None if media.all_lit else mi.Bool(True),
         )
 
-    def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, u: mi.Float) -> Edge:
+    def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, lit, u: mi.Float) -> Edge:
         """The edge after an event at its end, of this ``length`` since the ray began.
 
-        Where the event was ``null`` it goes on, else a new one begins. ``u`` decides its flight.
+        Where the event was ``null`` it goes on, else a new one begins: in ``medium``, from a vertex that is
+        ``lit``. ``u`` decides its flight.
         """
         return replace(
             self,
@@ -61,6 +65,7 @@ class Edge:
             depth=dr.select(null, self.depth, 0),
             rest=dr.select(null, self.rest, tracking.exponential(u)),
             event=self.event + 1,
+            lit=None if lit is None else dr.select(null, self.lit, lit),
             rays=self.rays + 1,
         )
 

@@ -33,7 +33,8 @@ class Media:
     0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths are
     ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
     ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
-    have to look at surfaces.
+    have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
+    (``sample_emitters``).
 
     Raises ``UnsupportedError`` for media whose own calls contradict each other.
     """
@@ -56,7 +57,10 @@ class Media:
         self._extinction = self._table([look.majorant for look in looks])
         self._mean = mi.Float([0.0, *(look.mean for look in looks)])
         self._homogeneous = mi.UInt32([0, *map(int, homogeneous)])
-        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous)
+        lit = [m.use_emitter_sampling() for m in objects]
+        self.all_lit = all(lit)
+        self._lit = mi.UInt32([1, *map(int, lit)])
+        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous, self._lit)
         bsdfs = list(bsdfs)
         null = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
         self.null_lobes = bool(null)
@@ -101,6 +105,10 @@ class Media:
         return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(
             mi.BSDFFlags.Null
         )
+
+    def is_lit(self, number: mi.UInt32) -> mi.Bool:
+        """Mask: next-event estimation is allowed at vertices in the medium, or on surfaces (number 0)."""
+        return dr.gather(mi.UInt32, self._lit, number) == 1
 
     def mean(self, number: mi.UInt32) -> mi.Float:
         """Mean extinction of the medium (1 / scene unit), of a grid within its box; 0 in vacuum."""

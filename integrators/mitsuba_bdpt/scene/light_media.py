@@ -21,7 +21,7 @@ _PROBES = 64
 
 # Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding;
 # edges).
-_LINES = 4096
+_LINES = 1024
 _TOLERATED = 0.01
 
 

@@ -15,7 +15,7 @@ from .counters import Counters, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
-from .walk import Vertex, newest_coefficient
+from .walk import Vertex, direct_coefficient, is_lit, newest_coefficient
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -42,7 +42,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     light_side = mis.alternatives(
         h,
         y.partial,
-        newest_coefficient(kernel, kernel.kappa.direct, y.edges),
+        newest_coefficient(kernel, direct_coefficient(kernel, is_lit(kernel, y)), y.edges),
         f_y.pdf_rev_w,
         f_z.pdf_fwd_w * cos_y * inverse,
     )

@@ -123,6 +123,11 @@ class Vertex:
         of_surface = bsdf.connectible(self.bsdf)
         return of_surface if self.volume is None else of_surface | self.volume
 
+    @property
+    def medium(self) -> Any:
+        """The number of the medium in which it was reached."""
+        return self.edge.medium
+
     def medium_towards(self, kernel: Kernel, d: mi.Vector3f) -> mi.UInt32 | None:
         """The number of the medium in which ``d`` leaves it; None in scenes without media."""
         if self.landing is None:
@@ -194,6 +199,19 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
         state = visit(vertex, state, walk)
         walk = _leave(kernel, side, walk, vertex, step, stream)
     return state, walk
+
+
+def is_lit(kernel: Kernel, vertex):
+    """Mask: next-event estimation is allowed at ``vertex``; None where it is everywhere."""
+    if kernel.space is None or kernel.space.media.all_lit:
+        return None
+    return ~vertex.volume | kernel.space.media.is_lit(vertex.medium)
+
+
+def direct_coefficient(kernel: Kernel, lit) -> mis.Coefficient:
+    """kappa of next-event estimation at a vertex, see `is_lit`."""
+    direct = kernel.kappa.direct
+    return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
 
 
 def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
@@ -321,7 +339,10 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     if vertex.volume is not None:
         passes = step.null & _is_sampled(side, walk, vertex)
         active |= passes
-    coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
+    first = side.coefficient
+    if side.adjoint:
+        first = direct_coefficient(kernel, is_lit(kernel, vertex))
+    coefficient = newest_coefficient(kernel, first, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
     throughput = vertex.throughput * step.weight
@@ -372,7 +393,7 @@ def _past_null(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, after: Wa
     """``after`` in a scene with media, and its ray: where it ``passes``, the edge goes on."""
     medium = vertex.medium_towards(kernel, after.d)
     u = kernel.points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
-    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, u)
+    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, is_lit(kernel, vertex), u)
     partial = mis.Partial(
         choose(passes, walk.partial.d_vcm, after.partial.d_vcm),
         choose(passes, walk.partial.d_vc, after.partial.d_vc),
