@@ -863,22 +863,17 @@ def test_layers_count_among_what_a_film_takes(monkeypatch):
 def test_scenes_that_are_refused():
     """Expected: one sentence that names the object and what to do."""
     bdpt = integrator()
-    fog = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": sensor(),
-            "lamp": {"type": "point"},
-            "cloud": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}},
-        }
-    )
-    with pytest.raises(NotImplementedError, match="cloud.*participating medium.*volpath"):
-        bdpt.render(fog)
-    with pytest.raises(NotImplementedError, match="volpath"):
-        bdpt.explain(fog)
-    cloud = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
-    clouds = grouped({"cloud": cloud})
-    with pytest.raises(NotImplementedError, match="cloud.*participating medium.*volpath"):
-        bdpt.render(clouds)
+    density = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2, 1), dtype=np.float32))}
+    fog = {"type": "homogeneous", "id": "fog", "sigma_t": density}
+    cloud = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
+    for scene in (
+        mi.load_dict({"type": "scene", "sensor": sensor(), "lamp": {"type": "point"}, "cloud": cloud}),
+        grouped({"cloud": cloud}),
+    ):
+        with pytest.raises(NotImplementedError, match="sigma_t of class GridVolume.*heterogeneous"):
+            bdpt.render(scene)
+        with pytest.raises(NotImplementedError, match="heterogeneous"):
+            bdpt.explain(scene)
     empty = mi.load_dict({"type": "scene", "lamp": {"type": "point"}})
     with pytest.raises(ValueError, match="no sensor"):
         bdpt.render(empty)

@@ -52,13 +52,12 @@ what they found. They draw the same numbers for all seeds, so that all renders o
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
 
-Not supported, and refused in words: scalar, polarized and Metal variants, participating media (also in shape
-groups; a medium that an emitter lies in is ignored, as by ``volpath``), derivatives
-(all other methods of ``integrator`` ignore gradients), renders under ``dr.freeze``, ``strategy_images`` on a
-``specfilm``. Threads need a
-scene each: Mitsuba's film belongs to it. Emitters and sensors of every kind take part; where one cannot
-have a strategy (a sensor of a class that is not Mitsuba's has no t = 1), it is skipped, and ``explain``
-says so.
+Not supported, and refused in words: scalar, polarized and Metal variants, derivatives (all other methods of
+``integrator`` ignore gradients), renders under ``dr.freeze``, ``strategy_images`` on a ``specfilm``. In
+scenes with participating media edges count as in ``volpath``; the medium that an emitter declares is ignored,
+as by ``volpath``: it is found from the boundaries around it. Threads need a scene each: Mitsuba's film
+belongs to it. Emitters and sensors of every kind take part; where one cannot have a strategy (a sensor of a
+class that is not Mitsuba's has no t = 1), it is skipped, and ``explain`` says so.
 """
 
 
@@ -152,6 +151,7 @@ class BDPTIntegrator:
             check_resumable(start, self.settings)
             render.resume(start)
         messages.warn_of_parameters(scene, sensor)
+        messages.warn_of_media(render.prepared, sensor)
         try:
             self._cancelled = False
             render.run(self.on_pass, lambda: self._cancelled)

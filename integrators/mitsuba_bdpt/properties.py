@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
-from .host.introspection import all_shapes, named
+from .host.introspection import named
 from .image import features, film_limits
 from .image.channels import Channels
 from .image.colour import Bands, film_colours

@@ -70,7 +70,8 @@ class Settings:
         -1,
         UNLIMITED,
         "the longest path in edges, -1 for unlimited",
-        "Longest path in edges, as in ``path``: 1 is directly visible emitters, -1 unlimited.",
+        """Longest path in edges, as in ``path`` (in scenes with participating media as in ``volpath``): 1 is
+        directly visible emitters, -1 unlimited.""",
         low=-1,
         high=UNLIMITED,
     )
@@ -134,7 +135,9 @@ class Settings:
     stored_vertices: int = _parameter(
         DEFAULT_STORED,
         f"the longest path that uses all strategies, 1 to {MAX_STORED}",
-        "Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1.",
+        """Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. (In scenes with
+        participating media 64 stands for 1024: subpaths are long, and of the later vertices some are kept for
+        all.)""",
         low=1,
         high=MAX_STORED,
     )

@@ -121,6 +121,8 @@ def _follow(scene, path):
     ray = mi.Ray3f(_point(path.p[0]), _vector(_direction(path, 0)))
     events = []
     for i in range(1, k):
+        if not path.shapes[i]:
+            raise Lost(f"vertex {i} lies in a medium, where paths are not followed")
         si = scene.ray_intersect(ray)
         dr.eval(si)
         _check_place(si, path, i)

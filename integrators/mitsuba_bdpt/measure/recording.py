@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from unittest import mock
 
@@ -332,11 +332,11 @@ class Recorder(Observer):
         """Join the camera vertex ``z`` with the light vertices of its lane."""
         found = []
 
-        def add(c, visible, total):
-            found.append(replace(c, active=visible))
+        def add(_, seen, total):
+            found.append(seen)
             return total
 
-        _, counted = connections.connect_all(traced, z, lane.path, total, add)
+        _, counted = connections.connect_all(traced, z, lane.path, stream, total, add)
         if traced.plan.connections == "all":
             for c in found:
                 total = self.add(traced, c, total, start, lane.shared)

@@ -9,18 +9,19 @@ import mitsuba as mi
 
 from ..geometry import rays
 from . import tracking
-from .media import Media, Space, coefficients, interaction, of_depth
+from .media import Media, Space, coefficients, depth_of, interaction, of_depth
 
 
 @dataclass
 class Edge:
     """What a subpath in media carries along an edge; vertices start new ones.
 
-    ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth of T~ so
-    far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event`` counts events,
-    null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In chromatic media
-    ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their mean over channels, of
-    all flights of the subpath (``Spectrum``); else None.
+    ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth
+    of T~ so far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event``
+    counts events, null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In
+    chromatic media ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their
+    mean over channels, of all flights of the subpath (``Spectrum``); else None. ``lit``: next-event
+    estimation is allowed at the vertex before, None where it is everywhere.
     """
 
     medium: mi.UInt32
@@ -31,6 +32,7 @@ class Edge:
     rays: mi.UInt32
     channel: mi.UInt32 | None = None
     ratio: mi.Spectrum | None = None
+    lit: mi.Bool | None = None
 
     @staticmethod
     def begin(media: Media, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
@@ -47,12 +49,14 @@ class Edge:
             rays=mi.UInt32(1),
             channel=channel,
             ratio=ratio,
+            lit=None if media.all_lit else mi.Bool(True),
         )
 
-    def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, u: mi.Float) -> Edge:
+    def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, lit, u: mi.Float) -> Edge:
         """The edge after an event at its end, of this ``length`` since the ray began.
 
-        Where the event was ``null`` it goes on, else a new one begins. ``u`` decides its flight.
+        Where the event was ``null`` it goes on, else a new one begins: in ``medium``, from a vertex that is
+        ``lit``. ``u`` decides its flight.
         """
         return replace(
             self,
@@ -61,10 +65,11 @@ class Edge:
             depth=dr.select(null, self.depth, 0),
             rest=dr.select(null, self.rest, tracking.exponential(u)),
             event=self.event + 1,
+            lit=None if lit is None else dr.select(null, self.lit, lit),
             rays=self.rays + 1,
         )
 
-    def weight_transmittance(self) -> mi.Float:
+    def weight_transmittance(self):
         """T~ of the edge so far."""
         return of_depth(self.depth)
 
@@ -135,13 +140,12 @@ def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
     t = edge.rest / own
     collides = t < end  # of nothing at all it is NaN or infinite
     travelled = dr.select(collides, t, end)
-    # In vacuum the end may be infinitely far.
-    depth = dr.select(sigma > 0, sigma * travelled, 0)
+    depth = depth_of(sigma, travelled)
     rest = dr.select(own > 0, edge.rest - own * travelled, edge.rest)
     return dr.select(collides, t, dr.inf), depth, rest
 
 
-def at(spectrum: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
+def at(spectrum: mi.Spectrum, channel: mi.UInt32):
     """The entry ``channel`` of a spectrum."""
     value = spectrum[0]
     for i in range(1, len(spectrum)):
@@ -150,7 +154,7 @@ def at(spectrum: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
 
 
 def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, active):
-    """Throughput after a segment with a collision at ``t`` or none, and the edge with its channels' densities.
+    """Throughput after a segment with a collision at ``t`` or none, and the edge with its channels' ratios.
 
     In gray media what is sampled cancels but for the albedo. In chromatic ones the densities of all channels
     count: the balance heuristic over the channel that is sampled (A. Wilkie et al. 2014).
@@ -175,8 +179,8 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
 def _passes(media: Media, si, hidden) -> mi.Bool:
     """Mask: an edge goes through this surface, which nobody looks at.
 
-    Of plugin ``null``, without emitter and sensor; ``hidden`` (a mask or None): emitters are passed, as by ``path``
-    under ``hide_emitters``.
+    Of plugin ``null``, without emitter and sensor; ``hidden`` (a mask or None): emitters are passed, as by
+    ``path`` under ``hide_emitters``.
     """
     emits = si.shape.emitter() != dr.zeros(mi.EmitterPtr)
     passes = mi.Bool(False)

@@ -28,11 +28,13 @@ _PROBES = 4096
 class Media:
     """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
 
-    ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for branches
-    while a kernel is recorded: ``homogeneous`` media and ``grids``; ``scatters``: some albedo is not 0; ``gray``:
-    no extinction of homogeneous media depends on the wavelength, so that optical depths are ``Float``, else
-    ``Spectrum``; ``directional``: extinction depends on the direction (microflakes); ``see_through``: surfaces of
-    plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays have to look at surfaces.
+    ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for
+    branches while a kernel is recorded: ``homogeneous`` media and ``grids``; ``scatters``: some albedo is not
+    0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths are
+    ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
+    ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
+    have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
+    (``sample_emitters``).
 
     Raises ``UnsupportedError`` for media whose own calls contradict each other.
     """
@@ -55,7 +57,10 @@ class Media:
         self._extinction = self._table([look.majorant for look in looks])
         self._mean = mi.Float([0.0, *(look.mean for look in looks)])
         self._homogeneous = mi.UInt32([0, *map(int, homogeneous)])
-        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous)
+        lit = [m.use_emitter_sampling() for m in objects]
+        self.all_lit = all(lit)
+        self._lit = mi.UInt32([1, *map(int, lit)])
+        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous, self._lit)
         bsdfs = list(bsdfs)
         null = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
         self.null_lobes = bool(null)
@@ -101,6 +106,10 @@ class Media:
             mi.BSDFFlags.Null
         )
 
+    def is_lit(self, number: mi.UInt32) -> mi.Bool:
+        """Mask: next-event estimation is allowed at vertices in the medium, or on surfaces (number 0)."""
+        return dr.gather(mi.UInt32, self._lit, number) == 1
+
     def mean(self, number: mi.UInt32) -> mi.Float:
         """Mean extinction of the medium (1 / scene unit), of a grid within its box; 0 in vacuum."""
         return dr.gather(mi.Float, self._mean, number)
@@ -115,7 +124,7 @@ class Media:
         answer = self.ask(number, self._majorant, interaction(mi.Point3f(0), d, shared), active)
         return dr.select(active & (number != 0), answer, 0)
 
-    def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool) -> mi.Float:
+    def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool):
         """Majorant of a grid, one number for all channels (1 / scene unit)."""
         extinction = self.extinction(number, ray.d, ray, active)
         return extinction if self.gray else extinction[0]
@@ -125,7 +134,7 @@ class Media:
         return majorant[0] if self.gray else majorant
 
     def ask(self, number: mi.UInt32, question, *args):
-        """Answers of ``question(medium, *args)``, without meaning in vacuum; the last of ``args`` is a mask."""
+        """Answers of ``question(medium, *args)``, without meaning in vacuum; ``args`` end with a mask."""
         *others, active = args
         active = active & (number != 0)
         if len(self.objects) == 1:
@@ -164,7 +173,8 @@ def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f
 def symmetric_frame(n: mi.Vector3f) -> mi.Frame3f:
     """A frame about unit ``n`` whose matrix is its own transpose: half a turn, or a reflection of the z axis.
 
-    Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix: another distribution than its density.
+    Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix: another distribution than its
+    density.
     """
     sign = dr.select(n.z >= 0, mi.Float(1), mi.Float(-1))
     h = dr.normalize(n + mi.Vector3f(0, 0, sign))
@@ -180,7 +190,13 @@ def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool
     return mi.Spectrum(sigma_s), mi.Spectrum(sigma_t)
 
 
-def of_depth(depth: mi.Float | mi.Spectrum) -> mi.Float:
+def depth_of(sigma: mi.Float | mi.Spectrum, length: mi.Float) -> mi.Float | mi.Spectrum:
+    """Optical depth of a ``length``, which may be infinite, in a medium of extinction ``sigma``."""
+    # (In spectral variants the choice by entries is no `Spectrum`.)
+    return type(sigma)(dr.select(sigma > 0, sigma * length, 0))
+
+
+def of_depth(depth: mi.Float | mi.Spectrum):
     """T~ of an optical depth: the mean over the channels of exp(-depth), not below that of `DEEPEST`."""
     transmittance = dr.exp(-depth)
     if isinstance(depth, mi.Spectrum):
@@ -223,8 +239,8 @@ def _check(medium: mi.Medium):
 class _Look:
     """What a medium is like, from its own answers at random points and directions.
 
-    ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`; ``mean``
-    extinction.
+    ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`;
+    ``mean`` extinction.
     """
 
     def __init__(self, medium: mi.Medium):

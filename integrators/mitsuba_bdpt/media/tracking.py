@@ -1,8 +1,8 @@
-"""Grids, whose transmittance is known in expectation only: delta tracking of flights, ratio tracking of joins.
+"""Grids, whose transmittance is known in expectation only: delta tracking and ratio tracking.
 
-E. R. Woodcock et al. 1965; J. Novák, A. Selle, W. Jarosz 2014, "Residual Ratio Tracking for Estimating Attenuation in
-Participating Media". Both fly through a homogeneous medium of the grid's majorant and meet tentative collisions.
-T~ of a grid is that of its mean extinction within its box.
+E. R. Woodcock et al. 1965; J. Novák, A. Selle, W. Jarosz 2014, "Residual Ratio Tracking for Estimating
+Attenuation in Participating Media". Both fly through a homogeneous medium of the grid's majorant and meet
+tentative collisions. T~ of a grid is that of its mean extinction within its box.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .media import Media, coefficients, interaction
 class Tracked:
     """What delta tracking finds: the distance ``t`` of a real collision (infinite if there is none).
 
-    ``depth`` optical depth of T~ up to it, ``rest`` what is left until the next tentative collision, ``throughput``
-    times the ratios of null collisions, the next random ``word``.
+    ``depth`` optical depth of T~ up to it, ``rest`` what is left until the next tentative collision,
+    ``throughput`` times the ratios of null collisions, the next random ``word``.
     """
 
     t: mi.Float
@@ -49,7 +49,7 @@ def _within(media: Media, number, ray, end, active):
 
 @dr.syntax
 def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tracked:
-    """Delta tracking along ``ray`` up to ``end``; the first tentative collision is after optical depth ``rest``."""
+    """Delta tracking along ``ray`` up to ``end``; first a tentative collision after depth ``rest``."""
     low, high, inside = _within(media, number, ray, end, active)
     majorant = media.majorant(number, ray, active)
     t, met = mi.Float(low), mi.Float(dr.inf)

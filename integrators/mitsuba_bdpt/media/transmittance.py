@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..geometry import rays
 from ..geometry.rounding import met
 from . import tracking
-from .media import Media, Space, of_depth
+from .media import Media, Space, depth_of, of_depth
 
 
 @dataclass
@@ -25,12 +25,12 @@ class Crossing:
     clear: mi.Bool
 
     @property
-    def tr(self) -> mi.Float:
+    def tr(self):
         """T~ of the edge, which the weights have."""
         return of_depth(self.depth)
 
     @property
-    def visible(self) -> mi.Bool:
+    def visible(self):
         """Mask: something passes. (NaN does, so that it is counted.)"""
         return ~dr.all(self.transmittance == 0)
 
@@ -46,7 +46,8 @@ def between(
 ) -> Crossing:
     """What passes along ``ray``, which starts in ``medium``, up to its end; 0 where not ``active``.
 
-    ``own`` is as of `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are passed.
+    ``own`` is as of `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are
+    passed.
     """
     media = space.media
     if not media.null_lobes and not hidden:
@@ -59,7 +60,7 @@ def between(
 def _along(media: Media, medium, ray, length, word, active):
     """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word."""
     sigma = media.extinction(medium, ray.d, ray, active)
-    depth = dr.select(sigma > 0, sigma * length, 0)
+    depth = depth_of(sigma, length)
     transmittance = mi.Spectrum(dr.exp(-depth))
     if media.grids:
         grid = active & (medium != 0) & ~media.is_homogeneous(medium)

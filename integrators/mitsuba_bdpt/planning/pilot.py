@@ -89,12 +89,15 @@ LIGHT_TIMES = 4
 SELDOM = 16
 
 
+# Lanes that go through a loop together, as long as one of them does.
+PACKET = 16
+
 # Of `Counters`, what light subpaths count alone.
 _OF_LIGHT = ("light", "shadow_t1")
 
 
 class Pilot:
-    """Sink (see `sink`) of a pilot's contributions.
+    """Sink (see `sink`) of a pilot's contributions, in a scene with or without ``media``.
 
     Those of a ``batch``, in which of camera samples that follow one another each `PER_PIXEL` are of the same
     pixel, in nets each `batch.NETS` times `batch.NET`.
@@ -102,8 +105,8 @@ class Pilot:
 
     alpha = False
 
-    def __init__(self, region: Region, batch: Batch, rarest: float):
-        self._region, self._lanes = region, batch.lanes
+    def __init__(self, region: Region, batch: Batch, rarest: float, media: bool = False):
+        self._region, self._lanes, self._media = region, batch.lanes, media
         self._first_net = batch.pixels * batch.samples
         self._least = dr.opaque(mi.Float64, 1 / rarest)
         self._samples = dr.zeros(mi.Float64, batch.size * SAMPLE.width)
@@ -112,7 +115,8 @@ class Pilot:
 
     def begin(self) -> Total:
         """Nothing found yet."""
-        return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {"joined": mi.UInt32(0)}
+        counted = ("joined", "evaluated") if self._media else ("joined",)
+        return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {name: mi.UInt32(0) for name in counted}
 
     def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
         """Add a contribution with t >= 2."""
@@ -147,6 +151,8 @@ class Pilot:
         joined = total["joined"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
         # In the order of `begin`, as a loop's state has to be.
         found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        if self._media:
+            found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
 
     def splat(self, kernel: Kernel, c: Contribution, shared: Shared) -> Counters:
@@ -162,6 +168,7 @@ class Pilot:
         """Add a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
         others = {"joined": total["joined"], "tile": self._tile(sample.start.position)}
+        others["evaluated"] = total["evaluated"] if self._media else 0
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
         return Counters()
@@ -181,6 +188,8 @@ class Pilot:
             name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
         }
         rays["joined"] = SAMPLE.of(rows, "joined").mean()
+        evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
+        rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
@@ -271,7 +280,7 @@ def measure(
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
-    pilot = Pilot(region, batch, max(stands_for, RAREST))
+    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None)
     # What is not in nets are independent numbers: the squared mean follows from products of samples.
     points = Points("sobol" if stratified else "independent", seed)
     counts = trace(kernel, pilot, batch, points, samples)
@@ -279,6 +288,7 @@ def measure(
     found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
     known = {"bsdfs": prepared.traits.asked.count, "far": prepared.emitters.far_share}
     contrast = prepared.emitters.contrast
+    known["media"] = float(prepared.space is not None)
     known["evenness"] = 1 / contrast if contrast < np.inf else 0.0  # also if it is no number
     return replace(found, rays=found.rays | known)
 

@@ -57,6 +57,28 @@ def warn_of_parameters(scene, sensor):
         )
 
 
+def warn_of_media(prepared, sensor):
+    """Say once what in the media of a prepared scene makes an image other than expected."""
+    media = prepared.light_media
+    if media is None:
+        return
+    scene = prepared.scene
+    if media.contradiction:
+        warn_once(
+            scene,
+            sensor,
+            f"bdpt: {media.contradiction}; light subpaths would see another scene than the camera, so there "
+            "are none: the image is that of `volpath`",
+        )
+    if media.hides_infinity and prepared.emitters.at_infinity:
+        warn_once(
+            scene,
+            sensor,
+            "bdpt: the medium that the sensor declares has no end, and no light from infinity (sky, sun) "
+            "arrives through it; put a shape with a null BSDF around it",
+        )
+
+
 def _some(found: list[str]) -> str:
     """The first `NAMED` of them, and how many more there are."""
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""

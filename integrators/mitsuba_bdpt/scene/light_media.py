@@ -1,7 +1,7 @@
 """Which medium light subpaths start in.
 
-Scenes seldom say it: an area light on a shape without exterior medium may stand in a ball of milk. It is found by
-rays of emission: the near side of the first boundary that they meet, or what surrounds the scene.
+Scenes seldom say it: an area light on a shape without exterior medium may stand in a ball of milk. It is
+found by rays of emission: the near side of the first boundary that they meet, or what surrounds the scene.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from ..transport.inputs import Shared
 # Rays by which an emitter, or a sensor, is asked for its medium.
 _PROBES = 64
 
-# Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding; edges).
-_LINES = 4096
+# Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding;
+# edges).
+_LINES = 1024
 _TOLERATED = 0.01
 
 
@@ -28,7 +29,8 @@ class LightMedia:
     """The medium of every emitter; made anew for each render.
 
     ``outside`` is the number of the medium that surrounds the scene: the sensor's, unless it is bounded;
-    ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do.
+    ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do;
+    ``hides_infinity``: light from infinity does not arrive.
     """
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor):
@@ -38,6 +40,9 @@ class LightMedia:
         self.outside = 0 if bounded else space.media.sensor
         self.contradiction = _contradiction(space, sensor, self.outside)
         self._outside = dr.opaque(mi.UInt32, self.outside)
+        # Nothing arrives from infinity through a homogeneous medium without end.
+        endless = space.media.objects[self.outside - 1] if self.outside else None
+        self.hides_infinity = endless is not None and endless.is_homogeneous()
         front, back = _declared(space, emitters)
         probed, mixed = (
             self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
@@ -122,12 +127,14 @@ def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
             else "declares no medium"
         )
         return f"sensor {named(sensor)} {says}, but the boundaries around it say otherwise"
+    if not space.scene.shapes():
+        return ""
     crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
     crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
     if wrong > _TOLERATED * crossings:
         return (
-            f"the shapes disagree about the medium between them at {100 * wrong / crossings:.0f} % of the boundaries "
-            "that random lines cross: give each the interior and exterior medium that is there"
+            f"the shapes disagree about the medium between them at {100 * wrong / crossings:.0f} % of the "
+            "boundaries that random lines cross: give each the interior and exterior medium that is there"
         )
     return ""
 

@@ -8,8 +8,8 @@ import mitsuba as mi
 from ..emitters.emitters import Emitters
 from ..host.introspection import all_shapes, children, is_instance
 from ..media.media import Media, Space
-from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..sensors.kinds import prepare
+from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf
 from .light_media import LightMedia
 
@@ -30,13 +30,15 @@ class PreparedScene:
         found = bsdfs(scene)
         _prepare_bitmaps(found)
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
-        self.delta = any(mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in found)
+        delta = int(mi.BSDFFlags.Delta)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         self.traits = bsdf.Traits.of(found)
         self.space = self.light_media = None
         if media := Media.of(scene, sensor, found):
             self.space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
             self.light_media = LightMedia(self.space, self.emitters, sensor)
+            delta &= ~int(mi.BSDFFlags.Null)  # which edges pass
+        self.delta = any(b.flags() & delta for b in found)
 
     def stored_vertices(self, settings: Settings) -> int:
         """The longest path that uses all strategies: with media, whose subpaths are long, another default."""

@@ -60,11 +60,11 @@ class CameraJoin:
 class SensorHit:
     """A light subpath that hits the sensor at z_0.
 
-    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_a`` density of z_0 (area measure) and ``pdf_w``
-    (solid angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
+    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_a`` density of z_0 (area measure) and ``pdf_w`` (solid
+    angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
     ``active``. ``surroundings`` see `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light
-    comes from infinity, None where the subpath's own ray has shown it; ``near`` distance from z_0 at which camera
-    rays along its last edge start.
+    comes from infinity, None where the subpath's own ray has shown it; ``near`` distance from z_0 at which
+    camera rays along its last edge start.
     """
 
     dist2: mi.Float

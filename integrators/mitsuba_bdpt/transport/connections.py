@@ -15,7 +15,7 @@ from .counters import Counters, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
-from .walk import Vertex, newest_coefficient
+from .walk import Vertex, direct_coefficient, is_lit, newest_coefficient
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -42,7 +42,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     light_side = mis.alternatives(
         h,
         y.partial,
-        newest_coefficient(kernel, kernel.kappa.direct, y.edges),
+        newest_coefficient(kernel, direct_coefficient(kernel, is_lit(kernel, y)), y.edges),
         f_y.pdf_rev_w,
         f_z.pdf_fwd_w * cos_y * inverse,
     )
@@ -124,8 +124,9 @@ class _Drawn:
 
     The weighted ``value`` of the one drawn, the ``total`` size of all, the ``end`` of the visibility ray to
     it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, and how many are not zero,
-    and ``lost`` for want of a finite value. In scenes with media, where the weight is known after the ray only,
-    also its unweighted value (``joined``), its ``sides`` (see `Contribution`) and its ``size`` in the draw.
+    and ``lost`` for want of a finite value. In scenes with media, where the weight is known after the ray
+    only, also its unweighted value (``joined``), its ``sides`` (see `Contribution`) and its ``size`` in the
+    draw.
     """
 
     value: mi.Spectrum
@@ -198,8 +199,8 @@ def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to try at ``z``.
 
-    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with media,
-    where null events are no edges, several vertices may have the same number.)
+    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with
+    media, where null events are no edges, several vertices may have the same number.)
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
     if kernel.space is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +36,7 @@ class Contribution:
     kind: str = ""
     position: mi.Point2f | None = None
     counted: Counters = field(default_factory=Counters)
-    sides: tuple | None = None
+    sides: Any = None
 
     def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""

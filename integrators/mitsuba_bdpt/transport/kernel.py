@@ -231,6 +231,8 @@ def _emission(kernel: Kernel, stream, shared):
         shared,
         mi.Bool(True),
     )
+    if kernel.light_media is not None and kernel.light_media.hides_infinity:
+        e = replace(e, weight=dr.select(e.infinite, 0, e.weight))
     kernel.observer.emitted(e)
     return e
 

@@ -1,9 +1,10 @@
 """Evaluation of Mitsuba's phase functions in both directions.
 
-A walk's throughput has the albedo of a volume vertex when it arrives there; what is left of sigma_s rho is the phase
-function rho, whose cosine is 1. ``wi`` is the direction that the subpath comes from. Phase functions are symmetric;
-that of microflakes is so together with the extinction along ``wi``, with whose density the subpath made the vertex:
-rho is asked with each subpath's own ``wi``, and no adjoint factor is needed.
+A walk's throughput has the albedo of a volume vertex when it arrives there; what is left of sigma_s rho is
+the phase function rho, whose cosine is 1. ``wi`` is the direction that the subpath comes from. Phase
+functions are symmetric; that of microflakes is so together with the extinction along ``wi``, with whose
+density the subpath made the vertex: rho is asked with each subpath's own ``wi``, and no adjoint factor is
+needed.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import bsdf, phase
-from .bsdf import Evaluation, Step, Target
+from .bsdf import Evaluation, Target
 
 
 def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):

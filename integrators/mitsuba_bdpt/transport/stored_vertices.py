@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -19,9 +19,9 @@ class StoredVertex:
     """A light vertex y_{s-1}, s >= 2, as an inner connection needs it.
 
     ``throughput_over_cos`` f cos / pdf of all events before this vertex, the edge to it included, over the
-    geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi|
-    (in volumes both are 1); ``partial`` partial sums in the area measure; ``edges`` number of edges up to it,
-    s - 1; ``anchor`` starts rays; ``medium`` the number of that in which it lies, 0 on surfaces, None in scenes
+    geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi| (in
+    volumes both are 1); ``partial`` partial sums in the area measure; ``edges`` number of edges up to it, s -
+    1; ``anchor`` starts rays; ``medium`` the number of that in which it lies, 0 on surfaces, None in scenes
     without media.
     """
 
@@ -61,9 +61,10 @@ class Thinning:
     """Which vertices of a long light subpath in media are kept, for the others too.
 
     The first half of `KEPT` all, of later ones the i-th with probability (`KEPT` / 2)^2 / (i (i - 1)), by
-    systematic sampling: with C(i) the sum of the probabilities of the first i and u in [0, 1), the i-th is kept if
-    an integer lies in (C(i - 1) + u, C(i) + u]. C(i) = `KEPT` - (`KEPT` / 2)^2 / i stays below `KEPT`, and so do
-    their number and their places in memory. In integers, of which `_UNIT` are 1: rounding is in the probability too.
+    systematic sampling: with C(i) the sum of the probabilities of the first i and u in [0, 1), the i-th is
+    kept if an integer lies in (C(i - 1) + u, C(i) + u]. C(i) = `KEPT` - (`KEPT` / 2)^2 / i stays below
+    `KEPT`, and so do their number and their places in memory. In integers, of which `_UNIT` are 1: rounding
+    is in the probability too.
 
     ``tried`` vertices so far; ``offset`` u.
     """
@@ -97,8 +98,8 @@ class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory, ``count`` of them.
 
     ``d_vcm`` and ``d_vc`` are their ``partial``; ``rounding`` offset and curvature of their anchors, the rest
-    of which is in ``si``; ``s`` the number of light vertices up to and including each; ``medium`` None in scenes
-    without media.
+    of which is in ``si``; ``s`` the number of light vertices up to and including each; ``medium`` None in
+    scenes without media.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
@@ -109,7 +110,7 @@ class LightPath:
     s: dr.Local[mi.UInt32]
     count: mi.UInt32
     medium: dr.Local[mi.UInt32] | None = None
-    thinning: Thinning | None = None
+    thinning: Any = None  # a `Thinning`, in scenes with media
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:

@@ -24,7 +24,7 @@ from .contribution import Contribution, roulette, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
 from .visibility import Sight, seen
-from .walk import Vertex, Walk, newest_coefficient
+from .walk import Vertex, Walk, direct_coefficient, is_lit, newest_coefficient
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
@@ -52,7 +52,8 @@ def hit_emitter(kernel: Kernel, z: Vertex) -> Contribution:
     endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need just this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
-    newest = mis.choose(directly, endpoints, mis.times(kernel.kappa.direct, pdf_connect))
+    direct = direct_coefficient(kernel, None if z.edge is None else z.edge.lit)
+    newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
     older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
@@ -79,6 +80,8 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     Returns an `emitters.Direct` and the `bsdf.Target` in which it lies.
     """
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
+    if (lit := is_lit(kernel, z)) is not None:
+        active &= lit
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
     e = kernel.emitters.sample_direct(z.si, u, active)
     return e, bsdf.Target(z.si.to_local(e.d), active & ~bsdf.is_zero(e.weight))
@@ -183,7 +186,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~bsdf.is_zero(value)
 
-    newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
+    newest = newest_coefficient(kernel, direct_coefficient(kernel, is_lit(kernel, y)), y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
     camera_side = 0
     if kernel.plan.arrival:
@@ -254,7 +257,7 @@ class _End:
         return self.hit
 
 
-def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active) -> tuple[mi.Bool, mi.Float]:
+def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active):
     """Whether the sensor lies on the part of the edge that ``walk`` follows now, and T~ of the edge to it."""
     begun = dr.norm(walk.o - walk.previous)
     length = dr.sqrt(z.dist2) - z.near - begun

@@ -13,8 +13,8 @@ from ..sampling.points import Purpose, Stream
 from .contribution import Contribution
 from .inputs import Kernel
 
-# Optical depth up to which a join's transmittance is guessed before its ray is traced, from the medium that it
-# starts in: a join that in truth passes through less is drawn e^2 times too rarely at most.
+# Optical depth up to which a join's transmittance is guessed before its ray is traced, from the medium that
+# it starts in: a join that in truth passes through less is drawn e^2 times too rarely at most.
 _GUESSED_DEPTH = 2.0
 
 
@@ -22,8 +22,8 @@ _GUESSED_DEPTH = 2.0
 class Sight:
     """The visibility ``ray`` of a join and what it ends at (`rays.Own` or None).
 
-    In scenes with media also the number of the ``medium`` in which the ray starts, and the ``word`` of its random
-    numbers; ``hidden``: emitters do not block it.
+    In scenes with media also the number of the ``medium`` in which the ray starts, and the ``word`` of its
+    random numbers; ``hidden``: emitters do not block it.
     """
 
     ray: mi.Ray3f
@@ -33,7 +33,7 @@ class Sight:
     hidden: bool = False
 
     def numbered(self, kernel: Kernel, stream: Stream, event: mi.UInt32, number=0) -> Sight:
-        """With random numbers of its own: of the ``number``-th join at a vertex, whose ``event`` names them."""
+        """With random numbers of the ``number``-th join at a vertex, whose ``event`` names them."""
         if kernel.space is None or not kernel.space.media.grids:
             return replace(self, word=mi.UInt32(0))
         return replace(self, word=kernel.points.series(stream, Purpose.TRACKING, event, 1 + number))

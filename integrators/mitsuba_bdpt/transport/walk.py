@@ -49,7 +49,7 @@ class Walk:
     seen: mi.Bool
     broken: mi.Bool
     active: mi.Bool
-    edge: flight.Edge | None = None
+    edge: Any = None  # a `flight.Edge`
 
     @staticmethod
     def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
@@ -103,14 +103,14 @@ class Vertex:
     active: mi.Bool
     event: mi.UInt32
     volume: mi.Bool | None = None
-    landing: flight.Landing | None = None
+    landing: Any = None  # a `flight.Landing`
     # Set where there is a `Side.join`, and nowhere else asked for: what it returns, and an `Evaluation`.
     endpoint: Any = None
     endpoint_active: Any = None
     f: Any = None
 
     @property
-    def edge(self) -> flight.Edge | None:
+    def edge(self) -> Any:
         """The edge to it as it arrives, None in scenes without media."""
         return None if self.landing is None else self.landing.edge
 
@@ -118,10 +118,15 @@ class Vertex:
         """Absolute geometric cosine of ``d``, 1 in volumes."""
         return volume_cosine(self.si, d, self.volume)
 
-    def connectible(self) -> mi.Bool:
+    def connectible(self):
         """Mask: its distribution of directions is not a delta distribution alone."""
         of_surface = bsdf.connectible(self.bsdf)
         return of_surface if self.volume is None else of_surface | self.volume
+
+    @property
+    def medium(self) -> Any:
+        """The number of the medium in which it was reached."""
+        return self.edge.medium
 
     def medium_towards(self, kernel: Kernel, d: mi.Vector3f) -> mi.UInt32 | None:
         """The number of the medium in which ``d`` leaves it; None in scenes without media."""
@@ -132,7 +137,7 @@ class Vertex:
 
 
 def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool | None) -> mi.Float:
-    """D of the geometry term: the absolute geometric cosine of ``d`` on surfaces, 1 where ``volume`` holds."""
+    """D of the geometry term: the absolute geometric cosine of ``d``, 1 where ``volume`` holds."""
     cos = dr.abs(dr.dot(si.n, d))
     return cos if volume is None else dr.select(volume, 1, cos)
 
@@ -194,6 +199,19 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
         state = visit(vertex, state, walk)
         walk = _leave(kernel, side, walk, vertex, step, stream)
     return state, walk
+
+
+def is_lit(kernel: Kernel, vertex):
+    """Mask: next-event estimation is allowed at ``vertex``; None where it is everywhere."""
+    if kernel.space is None or kernel.space.media.all_lit:
+        return None
+    return ~vertex.volume | kernel.space.media.is_lit(vertex.medium)
+
+
+def direct_coefficient(kernel: Kernel, lit) -> mis.Coefficient:
+    """kappa of next-event estimation at a vertex, see `is_lit`."""
+    direct = kernel.kappa.direct
+    return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
 
 
 def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
@@ -303,8 +321,8 @@ def _goes_on(side: Side, walk: Walk, vertex: Vertex):
 def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
     """`path` samples at the last vertex too: alpha is 1 unless that event is null.
 
-    In scenes with media null events are no edges, so that subpaths go on after them. `volpath` has alpha 1 where
-    something in a medium may scatter again.
+    In scenes with media null events are no edges, so that subpaths go on after them. `volpath` has alpha 1
+    where something in a medium may scatter again.
     """
     if vertex.volume is not None:
         return vertex.hit & (~vertex.volume | (walk.edges < side.last_edge))
@@ -321,7 +339,10 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     if vertex.volume is not None:
         passes = step.null & _is_sampled(side, walk, vertex)
         active |= passes
-    coefficient = newest_coefficient(kernel, side.coefficient, walk.edges)
+    first = side.coefficient
+    if side.adjoint:
+        first = direct_coefficient(kernel, is_lit(kernel, vertex))
+    coefficient = newest_coefficient(kernel, first, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
     throughput = vertex.throughput * step.weight
@@ -359,7 +380,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
 
 
 def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:
-    """``walk`` on its next edge, along ``ray``; after null events (``passes``, or None) edges are not counted."""
+    """``walk`` on its next edge, along ``ray``; null events (``passes``, or None) are no edges."""
     return replace(
         walk,
         pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=walk.active),
@@ -369,10 +390,10 @@ def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:
 
 
 def _past_null(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, after: Walk, passes, stream):
-    """``after`` in a scene with media, and its ray: where it ``passes``, its edge goes on as if nothing had been there."""
+    """``after`` in a scene with media, and its ray: where it ``passes``, the edge goes on."""
     medium = vertex.medium_towards(kernel, after.d)
     u = kernel.points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
-    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, u)
+    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, is_lit(kernel, vertex), u)
     partial = mis.Partial(
         choose(passes, walk.partial.d_vcm, after.partial.d_vcm),
         choose(passes, walk.partial.d_vc, after.partial.d_vc),
