@@ -69,17 +69,18 @@ def test_any_transmittance_is_a_partition():
     kappa = COEFFICIENTS["n1c1"]
     weights = recursion(paths, kappa, "balance")
     used = oracle.Explicit(paths, kappa).used
-    np.testing.assert_allclose(np.where(used, weights, 0).sum(1), 1, atol=1e-4)
+    possible = used.any(1)
+    np.testing.assert_allclose(np.where(used, weights, 0).sum(1)[possible], 1, atol=1e-4)
     paths.transmittance = np.ones_like(paths.transmittance)
     without = recursion(paths, kappa, "balance")
     mixed = np.where(used, np.where(np.arange(6) == 2, without, weights), 0)
-    assert np.abs(mixed.sum(1) - 1).mean() > 0.05
+    assert np.abs(mixed.sum(1) - 1)[possible].mean() > 0.02
 
 
 # -- the kernel ---------------------------------------------------------------------------------------
 
-SIGMA, G = 0.8, 0.4
-LANES, DEPTH = 192, 4
+SIGMA, G, NEAR = 0.8, 0.4, 0.1
+LANES, DEPTH = 512, 4
 
 
 def hg(cos):
@@ -128,6 +129,8 @@ def explicit_paths(made, scene):
     cos_camera[:, -1] = np.where(camera.radius > 0, np.abs(d[:, -1] @ camera.axis), 1)
     if light.kind == POSITION:
         cos_light[:, 0] = 1
+    in_fog = np.sqrt(dist2)
+    in_fog[:, -1] -= NEAR / np.abs(d[:, -1] @ camera.axis)  # camera rays start at the near plane
     to_camera, to_light = np.ones((n, k + 1)), np.ones((n, k + 1))
     for i in range(1, k):
         phase = hg((d[:, i - 1] * d[:, i]).sum(1))
@@ -147,7 +150,7 @@ def explicit_paths(made, scene):
         lens=np.full(n, camera.radius > 0),
         lens_pdf=np.full(n, camera.lens_density()),
         sensor_pdf=camera.density(d[:, -1]),
-        transmittance=np.exp(-SIGMA * np.sqrt(dist2)),
+        transmittance=np.exp(-SIGMA * in_fog),
         extinction=np.where(volume, SIGMA, 1.0),
     )
 
@@ -165,11 +168,13 @@ def test_kernel_in_fog_agrees_with_explicit_densities(kind, heuristic):
     """
     camera = parts.thinlens if kind == "lens" else parts.sensor
     light = parts.point() if kind == "point" else parts.lamp()
-    scene = mi.load_dict(parts.foggy(parts.fog(SIGMA, 0.9, G), camera, light=light))
+    scene = mi.load_dict(parts.room(camera(near=NEAR, medium=parts.fog(SIGMA, 0.9, G)), light))
     method = parts.integrator(skip="none", max_depth=DEPTH, heuristic=heuristic)
     made, _ = recorded(scene, method)
     by_length, seen = defaultdict(list), defaultdict(int)
     for path in made:
+        if kind == "lens" and (path.t == 0 or (path.s, path.t) == (1, 1)):
+            continue  # of these points on the lens there is no record
         by_length[len(path.p) - 1].append(path)
     for k, of_length in by_length.items():
         paths = explicit_paths(of_length, scene)
@@ -182,6 +187,7 @@ def test_kernel_in_fog_agrees_with_explicit_densities(kind, heuristic):
         assert off.mean() < 0.01, (k, s[off][:9], own[off][:9], wanted[off][:9])
         for i in range(len(s)):
             seen[min(s[i], 2), min(k + 1 - s[i], 2), bool((paths.extinction[i] != 1).any())] += 1
-    for strategy in ((1, 2), (2, 1), (2, 2), *(((0, 2),) if kind != "point" else ())):
-        assert seen[*strategy, True] > 50, (strategy, dict(seen))
+    for strategy in ((0, 2), (1, 2), (2, 1), (2, 2)):
+        least = (kind != "point") * 8 if strategy[0] == 0 else 100
+        assert seen[*strategy, True] >= least, (strategy, dict(seen))
     assert (paths.kind == (POSITION if kind == "point" else AREA)).all()
