@@ -47,6 +47,20 @@ def surface_anchor(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, shape_errors: Sha
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
 
 
+# Least cosine by which a ray's way through an anchor's offset is lengthened.
+_STEEPEST = 0.05
+
+
+def passed(ray: mi.Ray3f, si: mi.SurfaceInteraction3f, shape_errors: ShapeErrors) -> mi.Float:
+    """How far along ``ray`` it is beyond the surface ``si``, at its anchor's offset from it.
+
+    On the ray's own line: many surfaces do not move it aside, past what it is to end at.
+    """
+    anchor = surface_anchor(si, ray, shape_errors)
+    cos = dr.maximum(dr.abs(dr.dot(anchor.n, ray.d)), _STEEPEST)
+    return si.t + anchor.offset / cos
+
+
 def sampled_anchor(p: mi.Point3f, n: mi.Normal3f, reference: mi.Point3f, errors: Errors | None) -> Anchor:
     """Return the anchor of a point sampled on a shape of these ``errors``, None off shapes.
 

@@ -24,7 +24,7 @@ def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, 
         bounds = hit & si.is_medium_transition()
         number = dr.select(bounds, space.media.number(si.target_medium(-ray.d)), number)
         found |= bounds
-        o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+        o = mi.Point3f(segment(rays.passed(segment, si, space.shape_errors)))
         going = hit & ~bounds
     return number, found
 
@@ -47,6 +47,6 @@ def disagreements(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UI
         crossings += dr.select(bounds, mi.UInt32(1), 0)
         wrong += dr.select(bounds & (near != current), mi.UInt32(1), 0)
         current = dr.select(bounds, space.media.number(si.target_medium(ray.d)), current)
-        o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+        o = mi.Point3f(segment(rays.passed(segment, si, space.shape_errors)))
         going = mi.Bool(hit)
     return crossings, wrong

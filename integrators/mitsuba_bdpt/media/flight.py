@@ -195,14 +195,15 @@ def _onwards(space: Space, ray, si, landing: Landing, going) -> Landing:
     """Where ``going``, on the other side of the surface ``si``."""
     edge, media = landing.edge, space.media
     segment = mi.Ray3f(landing.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
-    o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
+    onwards = rays.passed(segment, si, space.shape_errors)
     beyond = media.number(si.target_medium(ray.d))
     crossed = replace(
         edge,
         medium=dr.select(si.is_medium_transition(), beyond, edge.medium),
-        maxt=edge.maxt - landing.t,
+        maxt=edge.maxt - onwards,
         rays=edge.rays + 1,
     )
+    o = mi.Point3f(segment(onwards))
     onward = mi.Ray3f(o, ray.d, crossed.maxt, ray.time, ray.wavelengths)
     pi = space.scene.ray_intersect_preliminary(onward, coherent=False, active=going)
     passed = replace(landing, o=o, pi=pi, edge=crossed)

@@ -89,8 +89,8 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
         transmittance = dr.select(going, transmittance * passed * onward, transmittance)
         crossed = hit & si.is_medium_transition()
         medium = dr.select(crossed, media.number(si.target_medium(ray.d)), medium)
-        o = mi.Point3f(rays.surface_anchor(si, segment, space.shape_errors).towards(ray.d))
-        left -= length
+        onwards = dr.select(hit, rays.passed(segment, si, space.shape_errors), 0)
+        o, left = mi.Point3f(segment(onwards)), left - onwards
         going = hit & clear & (left > 0)
     return Crossing(dr.select(active, transmittance, 0), depth, clear)
 
