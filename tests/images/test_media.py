@@ -216,20 +216,7 @@ def test_each_class_with_hits(name, pair, monkeypatch):
     st.assert_agree(st.Comparisons.join(family), at_least=30)
 
 
-@pytest.mark.parametrize(
-    "variant",
-    [
-        "llvm_ad_mono",
-        pytest.param(
-            "llvm_ad_spectral",
-            marks=pytest.mark.xfail(
-                strict=True,
-                raises=RuntimeError,
-                reason="the loop over segments changes the type of its optical depth",
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
 def test_colours_agree_with_volpathmis(variant):
     """Rationale: monochromatic variants have one channel, spectral ones four wavelengths that differ from
     sample to sample, for which a medium has no table. Expected: a chromatic ball and a chromatic room beside

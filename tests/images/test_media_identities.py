@@ -88,9 +88,6 @@ def test_a_null_wall_within_fog_is_nothing():
     assert_same({"m": thin, **room, "cut": cut(0.9, [0, 0, -0.3])}, {"m": thin, **room}, share=0.95)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="visibility rays grow by an offset with each null surface that they pass"
-)
 def test_a_null_shell_without_medium_is_nothing():
     """Rationale: null surfaces are no events, nested boundaries no bounces. Expected: a ball of fog within
     null shells that bound no medium has the image of the ball alone, see `assert_same`.

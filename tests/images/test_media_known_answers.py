@@ -166,7 +166,6 @@ def foggy_lamp(h, sigma, albedo):
     return {"type": "scene", "sensor": eye, "lamp": lamp}
 
 
-@pytest.mark.xfail(strict=True, reason="lines through the box of no shapes are not finite")
 def test_fog_without_shapes():
     """Rationale: the box around no shapes is empty. Expected: an image, and no warning."""
     scene = mi.load_dict(foggy_lamp(0.3, 0.6, 0.7))
