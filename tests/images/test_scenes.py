@@ -47,7 +47,7 @@ CLOSED_ROOMS = [
     "fog_lamp_in_glass",
     "fog_lamp",
 ]
-# Extinction of the medium that the sensor is in, and of those in bodies seen from outside, per unit of length.
+# Extinction, per unit of length, of the medium around the sensor and of those in bodies seen from outside.
 FOGS = {
     "fog_beam": 0.15,
     "fog_beam_thick": 0.6,
