@@ -10,7 +10,6 @@ SECTIONS = (
     "geometry",
     "transport",
     "spots",
-    "media",
     "weights",
     "fireflies",
     "non_finite",
