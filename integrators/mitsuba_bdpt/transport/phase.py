@@ -67,7 +67,8 @@ def sample(
 
     d, weight, pdf, pdf_rev, joined = media.ask(medium, questions, mei, u1, u2, active, wo, evaluated, asked)
     step = Step(
-        wo=si.to_local(d),
+        # Its length would drift along subpaths: frames are made of directions.
+        wo=dr.normalize(si.to_local(d)),
         weight=dr.select(pdf > 0, weight, 0),
         pdf_fwd_w=pdf,
         pdf_rev_w=pdf_rev,
