@@ -89,7 +89,7 @@ MUTANTS = (
     Mutant(
         "splats on hidden emitters",
         "transport/techniques.py",
-        "        active &= y.si.shape.emitter() == dr.zeros(mi.EmitterPtr)\n",
+        "        active &= ~on_emitter\n",
         "        pass\n",
         ("tests/images/test_plausible_bugs.py::test_light_on_a_hidden_lamp_is_not_splatted",),
     ),
@@ -170,8 +170,8 @@ MUTANTS = (
     Mutant(
         "weights: no squared distance in the area measure",
         "transport/mis.py",
-        "heuristic.scale(partial.d_vcm, dist2 / cos)",
-        "heuristic.scale(partial.d_vcm, dr.rcp(cos))",
+        "dist2 / (cos if tr is None else cos * tr)",
+        "dr.rcp(cos if tr is None else cos * tr)",
         ("tests/transport/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-odd]",),
     ),
     Mutant(
@@ -252,8 +252,8 @@ MUTANTS = (
     Mutant(
         "roulette: splats are not divided by",
         "transport/techniques.py",
-        "replace(c, value=value / survival, active=active, counted=counted)",
-        "replace(c, value=value, active=active, counted=counted)",
+        "replace(c, value=value / survival, active=active, counted=counted, sides=sides)",
+        "replace(c, value=value, active=active, counted=counted, sides=sides)",
         ("tests/images/test_plausible_bugs.py::test_what_plays_roulette_is_made_up_for",),
     ),
     Mutant(
@@ -485,6 +485,117 @@ MUTANTS = (
         "QUADRIC_ULPS = 8\n",
         "QUADRIC_ULPS = 0\n",
         ("tests/geometry/test_rays.py::test_far_ends_do_not_block[sphere-30.0]",),
+    ),
+    Mutant(
+        "media: T~ of one side of the weights",
+        "transport/mis.py",
+        "light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)",
+        "light_side = self.scale(light_side, tr)",
+        (
+            "tests/transport/test_media_oracle.py::test_recursion_with_transmittances[n1c1-balance]",
+            "tests/transport/test_media_oracle.py::test_kernel_in_fog_agrees_with_explicit_densities[lamp-balance]",
+            "tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[fog]",
+        ),
+    ),
+    Mutant(
+        "media: T~ in one class only",
+        "transport/visibility.py",
+        "weigh(*c.sides, crossing.tr)",
+        'weigh(*c.sides, crossing.tr if c.kind == "inner" else None)',
+        (
+            "tests/transport/test_media_oracle.py::test_kernel_in_fog_agrees_with_explicit_densities[point-balance]",
+            "tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[fog]",
+        ),
+    ),
+    Mutant(
+        "media: no T~ on arrival",
+        "transport/walk.py",
+        "tr = landing.edge.weight_transmittance()",
+        "tr = mi.Float(1)",
+        (
+            "tests/transport/test_media_oracle.py::test_kernel_in_fog_agrees_with_explicit_densities[point-balance]",
+            "tests/images/test_media_known_answers.py::test_glowing_sphere_filled_with_fog[all]",
+        ),
+    ),
+    Mutant(
+        "media: estimates of T in weights",
+        "transport/visibility.py",
+        "weigh(*c.sides, crossing.tr)",
+        "weigh(*c.sides, dr.mean(crossing.transmittance))",
+        ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[grid]",),
+    ),
+    Mutant(
+        "media: sigma_t does not cancel",
+        "media/flight.py",
+        "gray = sigma_s / dr.mean(sigma_t)",
+        "gray = sigma_s",
+        (
+            "tests/images/test_media_known_answers.py::test_slab_under_the_sun[gray-camera]",
+            "tests/images/test_media_known_answers.py::test_white_furnace[gray-camera]",
+        ),
+    ),
+    Mutant(
+        "media: the near side's medium where a join starts",
+        "transport/walk.py",
+        "self.si.target_medium(d)",
+        "self.si.target_medium(-d)",
+        ("tests/images/test_media_identities.py::test_joins_start_on_the_right_side_of_a_boundary",),
+    ),
+    Mutant(
+        "media: the near side's medium beyond a null surface",
+        "media/transmittance.py",
+        "si.target_medium(ray.d)",
+        "si.target_medium(-ray.d)",
+        ("tests/images/test_media_known_answers.py::test_fog_between_a_lamp_and_a_matte_wall[gray-camera]",),
+    ),
+    Mutant(
+        "media: null events are edges",
+        "transport/walk.py",
+        "edges=walk.edges + (1 if passes is None else dr.select(passes, mi.UInt32(0), 1))",
+        "edges=walk.edges + 1",
+        ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[mask]",),
+    ),
+    Mutant(
+        "media: one channel's density",
+        "media/flight.py",
+        "mean = dr.mean(edge.ratio * densities)",
+        "mean = at(edge.ratio * densities, edge.channel)",
+        ("tests/images/test_media_identities.py::test_flights_by_all_channels",),
+    ),
+    Mutant(
+        "media: thinned vertices stand for themselves only",
+        "transport/stored_vertices.py",
+        "y.throughput_over_cos / probability",
+        "y.throughput_over_cos",
+        ("tests/images/test_media.py::test_thinned_light_subpaths",),
+    ),
+    Mutant(
+        "media: the last volume vertex is not joined",
+        "transport/phase.py",
+        "asked = active | evaluated",
+        "asked = active",
+        ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[nested]",),
+    ),
+    Mutant(
+        "media: Mitsuba's frames for microflakes",
+        "media/media.py",
+        "mei.sh_frame = p, -d, symmetric_frame(-d)",
+        "mei.sh_frame = p, -d, mi.Frame3f(-d)",
+        ("tests/images/test_media.py::test_our_frames_make_microflakes_sample_their_density",),
+    ),
+    Mutant(
+        "media: joins grow beyond their ends",
+        "media/transmittance.py",
+        "left - onwards",
+        "left - length",
+        ("tests/images/test_media_identities.py::test_a_null_shell_without_medium_is_nothing",),
+    ),
+    Mutant(
+        "media: lamps start outside",
+        "scene/light_media.py",
+        "return dr.select(found, number, self._outside)",
+        "return dr.select(found, self._outside, self._outside)",
+        ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
     ),
 )
 
