@@ -170,8 +170,8 @@ MUTANTS = (
     Mutant(
         "weights: no squared distance in the area measure",
         "transport/mis.py",
-        "dist2 / (cos if tr is None else cos * tr)",
-        "dr.rcp(cos if tr is None else cos * tr)",
+        "heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr))",
+        "heuristic.scale(partial.d_vcm, dr.rcp(cos))",
         ("tests/transport/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-odd]",),
     ),
     Mutant(
@@ -252,8 +252,8 @@ MUTANTS = (
     Mutant(
         "roulette: splats are not divided by",
         "transport/techniques.py",
-        "replace(c, value=value / survival, active=active, counted=counted, sides=sides)",
-        "replace(c, value=value, active=active, counted=counted, sides=sides)",
+        "replace(c, value=value / survival, active=active",
+        "replace(c, value=value, active=active",
         ("tests/images/test_plausible_bugs.py::test_what_plays_roulette_is_made_up_for",),
     ),
     Mutant(

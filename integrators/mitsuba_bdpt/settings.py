@@ -70,8 +70,8 @@ class Settings:
         -1,
         UNLIMITED,
         "the longest path in edges, -1 for unlimited",
-        """Longest path in edges, as in ``path`` (in scenes with participating media as in ``volpath``): 1 is
-        directly visible emitters, -1 unlimited.""",
+        """Longest path in edges, as in ``path``: 1 is directly visible emitters, -1 unlimited. (In scenes with
+        participating media as in ``volpath``, where null surfaces do not count.)""",
         low=-1,
         high=UNLIMITED,
     )

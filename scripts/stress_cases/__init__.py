@@ -10,6 +10,7 @@ SECTIONS = (
     "geometry",
     "transport",
     "spots",
+    "media",
     "weights",
     "fireflies",
     "non_finite",

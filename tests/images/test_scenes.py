@@ -4,12 +4,14 @@ from pathlib import Path
 
 import make_meshes
 import make_textures
+import make_volumes
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np
 import pytest
+from mitsuba_bdpt.scene.prepared import PreparedScene
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = sorted((ROOT / "scenes").glob("*.xml"))
@@ -28,6 +30,10 @@ LAMPS = {
     "pool": [(0.401, -0.469, -0.787)],
     "ring_caustic": [(0.802, -0.422, 0.422)],
     "smallvcm_cornell_lamp": [(0, 0, -1)],
+    "fog_caustic": [(-0.567, -0.815, 0.142)],
+    "cloudy_ball": [(0.514, -0.771, 0.386)],
+    "skin_ball": [(0.573, -0.625, -0.521)],
+    "glass_slab": [(0.213, -0.355, 0.923)],
 }
 CLOSED_ROOMS = [
     "uplight_room",
@@ -37,7 +43,19 @@ CLOSED_ROOMS = [
     "pool",
     "furnace_point",
     "furnace_emission",
+    "fog_caustic",
+    "fog_lamp_in_glass",
+    "fog_lamp",
 ]
+# Extinction, per unit of length, of the medium around the sensor and of those in bodies seen from outside.
+FOGS = {
+    "fog_beam": 0.15,
+    "fog_beam_thick": 0.6,
+    "fog_caustic": 0.12,
+    "fog_lamp_in_glass": 0.12,
+    "fog_lamp": 0.3,
+}
+BODIES = {"cloudy_ball": 2.0, "skin_ball": 20.0, "glass_slab": 10.0}
 
 
 @pytest.fixture(autouse=True)
@@ -270,6 +288,33 @@ def test_textures_are_remade_exactly(tmp_path):
     for name, pixels in made.items():
         assert pixels.dtype == np.float16
         np.testing.assert_array_equal(pixels, committed[name])
+
+
+def test_volumes_are_remade_byte_for_byte(tmp_path):
+    """scripts/make_volumes.py gives the committed files and no others."""
+    make_volumes.make_all(tmp_path)
+    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    committed = {path.name: path.read_bytes() for path in (ROOT / "scenes" / "volumes").iterdir()}
+    assert made == committed
+
+
+@pytest.mark.parametrize("name", [*FOGS, *BODIES, "cloud_sky"])
+def test_media_are_declared_on_both_sides(name):
+    """Boundaries and the sensor agree on the media between them: nothing switches off light subpaths."""
+    scene = load(name)
+    prepared = PreparedScene(scene, scene.sensors()[0])
+    assert prepared.light_media.contradiction == ""
+    assert (scene.sensors()[0].get_medium() is not None) == (name in FOGS)
+
+
+@pytest.mark.parametrize("name", [*FOGS, *BODIES])
+def test_media_have_their_extinction(name):
+    """In every channel, exactly as in the table above but for single precision."""
+    scene = load(name)
+    inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
+    medium = scene.sensors()[0].get_medium() if name in FOGS else next(m for m in inner if m is not None)
+    sigma = np.array(medium.get_majorant(dr.zeros(mi.MediumInteraction3f))).ravel()
+    np.testing.assert_allclose(sigma, {**FOGS, **BODIES}[name], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["pool_water", "ring", "headlight_mirror"])

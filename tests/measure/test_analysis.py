@@ -228,6 +228,27 @@ def cells(text, first):
     return [cell.strip() for cell in line.split("|")[2:-1]]
 
 
+def test_scenes_with_media_have_a_table_of_their_own(results):
+    """Expected: `fog`, rendered by `volpath` and `volpathmis`, stands in a table with their columns, and is
+    judged by the stronger of them; the other scenes' table is as without it."""
+    fog = (
+        runs("bdpt", 3)
+        + runs("volpath", 3, rel_mse_trimmed=0.1)
+        + runs("volpathmis", 3, rel_mse_trimmed=0.06)
+    )
+    rows = results.rows + [r | {"scene": "fog"} for r in fog]
+    both = Results(rows, results.references | {"fog": KNOWN}, results.probes)
+    text = report.efficiency_table(both)
+    assert text.startswith(report.efficiency_table(results).rstrip("\n"))
+    assert "| scene | over volpath, trimmed | over volpath, raw | over volpathmis, trimmed |" in text
+    assert cells(text, "`fog`")[:3:2] == ["5x (5–5)", "3x (3–3)"]
+    assert both.against_path("fog").median == pytest.approx(3)
+    assert both.against_path("box").median == pytest.approx(0.8)
+    assert cells(report.gaps_table(both), "`fog`") == ["1x (1–1)", "0.2x (0.2–0.2)"]
+    assert "the stronger of `volpath` and `volpathmis`" in report.stronger(both)
+    assert report.stronger(results) == "the stronger `path`"
+
+
 def test_tables_say_what_the_rows_say(results):
     text = report.efficiency_table(results)
     assert cells(text, "`box`") == [
@@ -369,6 +390,7 @@ def test_names_are_those_of_the_preset():
     names = {m.name for m in read_preset(ROOT / "presets" / "benchmark.toml", Project(ROOT)).methods}
     assert names >= {
         *analysis.RIVALS,
+        *analysis.MEDIA_RIVALS,
         analysis.NONE,
         analysis.IMPOSSIBLE,
         analysis.INDEPENDENT,

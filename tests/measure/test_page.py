@@ -162,7 +162,13 @@ def results(outcome, statistics):
             raise outcome
         return outcome
 
-    return SimpleNamespace(against_path=against_path, of=lambda *_: [row], methods=["bdpt"], deciding=64)
+    return SimpleNamespace(
+        against_path=against_path,
+        of=lambda *_: [row],
+        methods=["bdpt"],
+        deciding=64,
+        standard_in=lambda _: ["path", "path multijitter"],
+    )
 
 
 @pytest.mark.parametrize(

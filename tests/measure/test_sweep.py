@@ -26,6 +26,7 @@ from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
 from mitsuba_bdpt.measure.rows import errors
+from mitsuba_bdpt.measure.scenes import path_tracers
 
 ROOT = Path(__file__).resolve().parents[2]
 PRESET = """
@@ -660,6 +661,8 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (('["cornell_box"]', '["cornell_box", "cornell_box"]'), "names one twice"),
         (("[2, 4]", "[2, 2]"), r"spp=\[2, 2\] of cornell_box names a budget twice"),
         (('type = "bdpt"', 'type = "bdpt"\nseeds = 1'), "the first integrator, 'ours', sets the time"),
+        (('type = "bdpt"', 'type = "bdpt"\nmedia = false'), "the first integrator, 'ours', sets the time"),
+        (('match = "seconds"', "media = 1"), "media=1 of integrator 'path' must be true or false"),
         (('match = "seconds"', "seeds = 1" + MORE), "'path' of .* is limited by scenes or seeds"),
         (("seeds = 2", "seeds = 0"), "seeds=0 must be a whole number"),
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] of cornell_box must be as many as spp"),
@@ -706,6 +709,22 @@ def test_presets_are_read(path):
     """Expected: every committed preset names scenes and integrators that exist."""
     for method in read_preset(path, REPOSITORY).methods:
         mi.load_dict(dict(method.parameters))
+
+
+@pytest.mark.parametrize("name", ["cornell_box", "lamp_behind_glass", "fog_lamp", "skin_ball", "cloud_sky"])
+def test_rivals_are_those_that_see_the_media(name):
+    """Rationale: `path` passes through fog as if it were not there. Expected: the benchmark renders scenes by
+    `path` and `ptracer` or by `volpath` and `volpathmis`, where the sensor is in a medium (fog_lamp) or some
+    shape bounds one; the equal-time picture and references "by path" take the first of them."""
+    scene = REPOSITORY.scene(name)
+    assert scene.has_media == (name in ("fog_lamp", "skin_ball", "cloud_sky"))
+    preset = read_preset(REPOSITORY.preset("benchmark"), REPOSITORY)
+    subject = next(subject for subject in preset.subjects if subject.name == name)
+    rendered = {m.name for m in cells.Cells(REPOSITORY, preset, subject).methods}
+    tracers = {"path", "path multijitter", "ptracer"}, {"volpath", "volpathmis"}
+    assert tracers[scene.has_media] <= rendered and not tracers[not scene.has_media] & rendered
+    assert set(path_tracers(scene.has_media)) <= tracers[scene.has_media]
+    assert making._way(scene, "path") == {"type": path_tracers(scene.has_media)[0]}
 
 
 def keys(folder, text=PRESET):

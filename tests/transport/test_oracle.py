@@ -538,6 +538,10 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
         shape_errors=Flat(),
+        space=None,
+        light_media=None,
+        sensor_medium=None,
+        scatters=True,
     )
     result = [f(0)] * (k + 2)
     stored = []
@@ -556,7 +560,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     def edges(vertex):
         return int(vertex.edges[0])
 
-    def connect_all(kernel_, z, path, total, add):
+    def connect_all(kernel_, z, path, stream, total, add):
         for y in stored:
             # Other pairs are not neighbours on a path of k edges.
             if edges(y) + edges(z) + 1 == k:

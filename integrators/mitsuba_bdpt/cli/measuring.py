@@ -129,7 +129,8 @@ def _declare_reference(parser) -> None:
     _add_resolution(parser)
     add("--max-depth", type=_depth, help="default: that of presets/benchmark.toml, else of the scene's file")
     text = (
-        "what renders it, path only where that converges; default: as references/scenes.toml says, else bdpt"
+        "what renders it, path (with media: volpath) only where that converges; default: as "
+        "references/scenes.toml says, else bdpt"
     )
     add("--by", choices=("path", "bdpt"), help=text)
 
@@ -149,11 +150,8 @@ def _declare_equal_time(parser) -> None:
     add = parser.add_argument
     add("scene", help="a scene file, or a name in PROJECT/scenes")
     add("--spp", type=WHOLE, default=64, help="of the last integrator; default: %(default)s")
-    text, default = (
-        "TYPE KEY=VALUE …, each in quotes; default: path bdpt",
-        [integrator("path"), integrator("bdpt")],
-    )
-    add("-i", "--integrators", nargs="+", type=integrator, default=default, help=text)
+    text = "TYPE KEY=VALUE …, each in quotes; default: path (with media: volpath) and bdpt"
+    add("-i", "--integrators", nargs="+", type=integrator, default=[], help=text)
     add("--sampler", help="type of the sensor's sampler; default: the file's")
     text = "image to take errors against, at its own size; default: a reference of the project"
     add("--reference", type=Path, metavar="EXR", help=text)

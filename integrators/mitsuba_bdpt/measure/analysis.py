@@ -29,6 +29,7 @@ OWN = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_tri
 
 # Names of integrators that the report looks for, as presets/benchmark.toml has them.
 RIVALS = ("path", "path multijitter")
+MEDIA_RIVALS = ("volpath", "volpathmis")  # in scenes with participating media
 NONE = "bdpt skip=none"
 IMPOSSIBLE = "bdpt skip=impossible"
 INDEPENDENT = "bdpt points=independent"
@@ -232,19 +233,25 @@ class Results:
     def rivals(self) -> list[str]:
         """What the first integrator is compared with at equal time.
 
-        `path`, then others that no figure of the project's own looks for.
+        Mitsuba's path tracers, then others that no figure of the project's own looks for.
         """
-        known = {*RIVALS, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, LIGHT_TRACER}
+        tracers = *RIVALS, *MEDIA_RIVALS
+        known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, LIGHT_TRACER}
         others = self.methods[1:]
-        return [name for name in RIVALS if name in others] + [name for name in others if name not in known]
+        return [name for name in tracers if name in others] + [name for name in others if name not in known]
 
     @cached_property
     def standard(self) -> list[str]:
         """The integrators that efficiencies by budget and costs are over.
 
-        `path` with each sampler; other rivals if it was not rendered under these names.
+        `path` with each sampler, `volpath` and `volpathmis`; other rivals if none was rendered under these
+        names. `standard_in` has those of a scene.
         """
-        return [rival for rival in self.rivals if rival in RIVALS] or self.rivals
+        return [rival for rival in self.rivals if rival in (*RIVALS, *MEDIA_RIVALS)] or self.rivals
+
+    def standard_in(self, scene: str) -> list[str]:
+        """Those of `standard` that were rendered in a scene."""
+        return [rival for rival in self.standard if self.of(scene, rival)]
 
     @cached_property
     def _of(self) -> dict:
@@ -317,7 +324,7 @@ class Results:
         Of those that were rendered and pass the bias check; raises `Biased` if none does.
         """
         found, biased = [], {}
-        rivals = [rival for rival in self.standard if self.of(scene, rival)]
+        rivals = self.standard_in(scene)
         if not rivals:
             raise Refused(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
         for rival in rivals:

@@ -71,7 +71,7 @@ class Cells:
         self.more: More | None = None  # of [more], if the scene is among its own
         if preset.more is not None and subject.name in preset.more.scenes:
             self.more = preset.more
-        self.methods = [m for m in preset.methods if m.scenes is None or subject.name in m.scenes]
+        self.methods = [m for m in preset.methods if m.takes_part_in(subject.scene)]
         self.common = {
             "scene": subject.name,
             "scene_sha256": subject.scene.sha256,

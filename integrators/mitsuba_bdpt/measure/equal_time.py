@@ -24,7 +24,7 @@ from ..files.whole import replacing
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from .project import RESOLUTION, Project
-from .scenes import SceneFile, depth_of, integrator_of
+from .scenes import SceneFile, depth_of, integrator_of, path_tracers
 from .showing import steps
 from .timing import timed
 
@@ -156,7 +156,10 @@ def run(options: Namespace) -> int:
     output = options.output or project.renders / f"equal_time_{file.name}.png"
     check_output(output, ".png")
     scene, target, depth = subject(project, file, options)
-    found = shots(scene, target, dict(options.integrators), depth, options.spp)
+    ways = dict(options.integrators) or {
+        kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")
+    }
+    found = shots(scene, target, ways, depth, options.spp)
     draw(found, target, f"{file.name}, equal time", output)
     print(output)
     for shot in found:

@@ -16,6 +16,7 @@ from .analysis import (
     ALONE,
     INDEPENDENT,
     LIGHT_TRACER,
+    MEDIA_RIVALS,
     NONE,
     RIVALS,
     Biased,
@@ -33,6 +34,9 @@ STYLES = {
     ALONE: ("#F0E442", "P", "-."),
     RIVALS[0]: ("#D55E00", "s", "-"),
     RIVALS[1]: ("#E69F00", "D", "--"),
+    # In other scenes than these two.
+    MEDIA_RIVALS[0]: ("#D55E00", "s", "-"),
+    MEDIA_RIVALS[1]: ("#E69F00", "D", "--"),
     LIGHT_TRACER: ("#CC79A7", "x", ":"),
 }
 PLAIN = ("#000000", ".", "-")
@@ -151,6 +155,8 @@ def efficiencies(results: Results, rivals, path: Path):
 
 def _ratios(axis, results, scene, rival, place):
     """One scene's efficiencies over one rival around the height ``place``, or the word for their absence."""
+    if not results.of(scene, rival):
+        return
     for (error, (label, colour, marker)), y in zip(ERRORS.items(), (place - 0.15, place + 0.15), strict=True):
         try:
             ratio = results.fair_efficiency(scene, rival, error)

@@ -4,12 +4,13 @@ A reference is good enough if its own error adds at most 1 % to the relMSE, raw 
 the samples per pixel that it is to judge, and of `path` in the same time where the reference is made by it.
 It is the mean of two halves with seeds of their own, rendered in turn until that is reached or the time is
 over; the halves differ by twice the standard error of their mean. What makes it stands in `Recipe`: `bdpt`
-with everything switched on, or `path` where that converges, so that `bdpt` is judged by another integrator;
-windows in which few samples find the light have more of them; furnaces are known exactly. Files lie in the
-project's references/: EXR in half precision with the image (R, G, B), half the difference of the halves
-(difference.R ...), and the provenance as JSON in the header, with what a bias check needs. Sums in double
-precision are kept in renders/, so that a further run improves a reference instead of starting anew; where
-they are gone, it goes on from the stored image, whose rounding to half precision is far below its own error.
+with everything switched on, or `path` (with media `volpath`) where that converges, so that `bdpt` is judged
+by another integrator; windows in which few samples find the light have more of them; furnaces are known
+exactly. Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the
+difference of the halves (difference.R ...), and the provenance as JSON in the header, with what a bias check
+needs. Sums in double precision are kept in renders/, so that a further run improves a reference instead of
+starting anew; where they are gone, it goes on from the stored image, whose rounding to half precision is far
+below its own error.
 """
 
 from __future__ import annotations
@@ -37,14 +38,14 @@ from .halves import PASS_SPP, Halves
 from .metrics import TRIM, rel_mse
 from .project import Project
 from .reference import Reference, load_reference, make_command, reference_path, write
-from .scenes import SceneFile, integrator_of
+from .scenes import SceneFile, integrator_of, path_tracers
 from .showing import amount
 
 WAYS = {
     "path": {"type": "path"},
     "bdpt": {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"},
 }
-"""What makes references."""
+"""What makes references; `path` of scenes with media is `volpath`, see `_way`."""
 
 FOCUS_TIMES = 16  # of the samples, in windows
 
@@ -74,7 +75,7 @@ class Recipe:
     """How the reference of a scene is made, from the table of its name in PROJECT/references/scenes.toml:
 
         [glass_caustics]
-        by = "bdpt"                 # or "path", where that converges; default: "bdpt"
+        by = "bdpt"                 # or "path", where that (with media: `volpath`) converges; default: "bdpt"
         windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
 
         [furnace_point]
@@ -219,13 +220,13 @@ def _pixels(image):
 class Aim:
     """The renders that a reference has to judge.
 
-    Those of default `bdpt` with ``spp`` samples per pixel, and of `path` in the same time where that
-    converges.
+    Those of default `bdpt` with ``spp`` samples per pixel, and of a path tracer in the same time where that
+    converges and makes the reference.
     """
 
-    def __init__(self, job: Job, scene, by_path: bool):
+    def __init__(self, job: Job, scene, by: str):
         self.name, self.depth, spp = job.scene.name, job.depth, job.spp
-        rivals = [({"type": "bdpt"}, spp)] + [(WAYS["path"], TWICE * spp)] * by_path
+        rivals = [({"type": "bdpt"}, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
         self.images = []
         for parameters, samples in rivals:
             rival = integrator_of(parameters, job.depth)
@@ -250,6 +251,11 @@ class Aim:
             for image in self.images
             for trim in (0.0, TRIM)
         )
+
+
+def _way(scene: SceneFile, by: str) -> dict:
+    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`."""
+    return {"type": path_tracers(scene.has_media)[0]} if by == "path" else WAYS[by]
 
 
 def _same(stored: Reference, **wanted) -> bool:
@@ -281,12 +287,12 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     """As `_known`, by an integrator; False if the time was over first."""
     by = job.by or recipe.by
-    parameters = WAYS[by] | {"max_depth": job.depth}
+    parameters = _way(job.scene, by) | {"max_depth": job.depth}
     integrator = mi.load_dict(parameters)
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, SAMPLER])
     scene = job.scene.load(job.resolution, SAMPLER)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(job, scene, by == "path")
+    aim = Aim(job, scene, by)
     windows = [Window(job, share) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):

@@ -22,7 +22,7 @@ from ..files.texts import write_text
 from ..files.whole import check_own
 from ..planning.explain import subpaths
 from . import figures, report
-from .analysis import NOTHING, Biased, Refused, Results
+from .analysis import NOTHING, RIVALS, Biased, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
 from .tables import ratio
@@ -55,22 +55,23 @@ PLOTS = {
 
 
 def answer(results: Results, scene: str) -> tuple[float, str]:
-    """How the first integrator does against the stronger `path` in a scene: the ratio, and a sentence.
+    """How the first integrator does against the strongest path tracer in a scene: the ratio, and a sentence.
 
-    The ratio is infinite where `path` fails, NaN where that cannot be said.
+    The ratio is infinite where that fails, NaN where that cannot be said.
     """
+    rival = (results.standard_in(scene) or RIVALS)[0].split()[0]
     try:
         found = results.against_path(scene)
     except Biased as why:
         lost = all(what == NOTHING for what in why.lacks.values())
-        return (math.inf if lost else math.nan), f"path fails the bias check here: {why}."
+        return (math.inf if lost else math.nan), f"{rival} fails the bias check here: {why}."
     except Refused as why:
         return math.nan, f"No figure: {str(why).rstrip('.')}."
     if found.median >= 1:
         span = f"({ratio(found.smallest)[:-1]} to {ratio(found.largest)})"
-        return found.median, f"path takes {ratio(found.median)} the time for the same error {span}."
+        return found.median, f"{rival} takes {ratio(found.median)} the time for the same error {span}."
     span = f"({ratio(1 / found.largest)[:-1]} to {ratio(1 / found.smallest)})"
-    return found.median, f"path is ahead: its efficiency is {ratio(1 / found.median)} ours {span}."
+    return found.median, f"{rival} is ahead: its efficiency is {ratio(1 / found.median)} ours {span}."
 
 
 def why(results: Results, scene: str) -> str:
@@ -191,11 +192,12 @@ def page(folder: Path, results: Results, made: dict) -> str:
         "scenes": [scene_data(folder, results, made, scene) for scene in results.scenes],
     }
     first, *others = (html.escape(name) for name in results.methods)
+    stronger = report.stronger(results).replace("`", "")
     introduction = (
         f"<p>{first} beside {', '.join(others)} in {len(results.scenes)} scenes, "
         f"{len(results.rows)} renders. Efficiency is 1 / (seconds · relMSE); ratios are medians "
         f"(smallest to largest) over renders with the same seed at {results.deciding} samples per pixel of "
-        f"{first}, trimmed of the worst 0.1 % of values, over the stronger of path's samplers.</p>"
+        f"{first}, trimmed of the worst 0.1 % of values, over {stronger}.</p>"
     )
     parts = {
         "TITLE": f"{TITLE} {html.escape(folder.resolve().name)}",

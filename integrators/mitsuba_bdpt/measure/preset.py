@@ -15,6 +15,7 @@
     match = "seconds"      # as many samples as fit into the seconds of the first (the nearest power of two,
                            # if the sampler is stratified); or "spp", the same samples
     scenes = ["kitchen"]   # only there; default: in all
+    media = false          # only in scenes without media; true: only in those with; default: both
     seeds = 5              # at most so many; default: all
 
     [scene.cornell_box]    # where a scene differs: max_depth (default: the scene's own), spp, seeds
@@ -53,8 +54,8 @@ class Method:
     """An integrator of a preset.
 
     ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it has in common with the first
-    one, ``scenes`` where it takes part (None: everywhere), ``seeds`` of a budget that it takes at most (None:
-    all).
+    one, ``scenes`` where it takes part (None: everywhere), ``media`` whether those have participating media
+    (None: either), ``seeds`` of a budget that it takes at most (None: all).
     """
 
     name: str
@@ -62,7 +63,14 @@ class Method:
     sampler: str
     match: str
     scenes: tuple | None
+    media: bool | None
     seeds: int | None
+
+    def takes_part_in(self, scene: SceneFile) -> bool:
+        """Whether it renders a scene."""
+        if self.scenes is not None and scene.name not in self.scenes:
+            return False
+        return self.media is None or self.media == scene.has_media
 
 
 @dataclass(frozen=True)
@@ -142,10 +150,11 @@ def _methods(path, entries, scenes) -> tuple:
     methods = tuple(_method(path, dict(entry), scenes) for entry in entries)
     if len({m.name for m in methods}) < len(methods):
         raise CommandError(f"{path}: two integrators have the same name")
-    if methods[0].scenes is not None or methods[0].seeds is not None or methods[0].match == "seconds":
+    first = methods[0]
+    if (first.scenes, first.media, first.seeds) != (None, None, None) or first.match == "seconds":
         raise CommandError(
-            f"{path}: the first integrator, {methods[0].name!r}, sets the time of the others; it takes "
-            "neither scenes nor seeds nor match = 'seconds'"
+            f"{path}: the first integrator, {first.name!r}, sets the time of the others; it takes "
+            "neither scenes nor media nor seeds nor match = 'seconds'"
         )
     return methods
 
@@ -196,12 +205,15 @@ def _method(path, entry, scenes) -> Method:
     name = text_of(path, "name of an integrator", entry.pop("name", kind))
     sampler = text_of(path, f"sampler of integrator {name!r}", entry.pop("sampler", "independent"))
     match, only, seeds = entry.pop("match", "spp"), entry.pop("scenes", None), entry.pop("seeds", None)
+    media = entry.pop("media", None)
     if "max_depth" in entry:
         raise CommandError(
             f"{path}: max_depth of integrator {name!r} would compare different images; set it for all"
         )
     if match not in MATCHES:
         raise CommandError(f"{path}: match={match!r} of integrator {name!r} must be one of {MATCHES}")
+    if media is not None and not isinstance(media, bool):
+        raise CommandError(f"{path}: media={media!r} of integrator {name!r} must be true or false")
     if only is not None:
         _names(path, f"scenes of integrator {name!r}", only)
     if unknown := [scene for scene in only or () if scene not in scenes]:
@@ -213,7 +225,8 @@ def _method(path, entry, scenes) -> Method:
             )
     if seeds is not None:
         whole_of(path, f"seeds of integrator {name!r}", seeds)
-    return Method(name, tuple(sorted(entry.items())), sampler, match, tuple(only) if only else None, seeds)
+    parameters = tuple(sorted(entry.items()))
+    return Method(name, parameters, sampler, match, tuple(only) if only else None, media, seeds)
 
 
 def _more(path, entry, scenes, methods) -> More:

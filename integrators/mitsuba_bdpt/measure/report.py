@@ -26,6 +26,7 @@ from .analysis import (
     IMPOSSIBLE,
     INDEPENDENT,
     LIGHT_TRACER,
+    MEDIA_RIVALS,
     NONE,
     RIVALS,
     Biased,
@@ -89,14 +90,26 @@ def _reference_command(project: Project, rows: list[dict], scene: str) -> str:
 
 
 def efficiency_table(results: Results) -> str:
-    """Per scene, against each rival: trimmed and raw; missing energy where the rival fails the bias check."""
-    head = ["scene", *(f"over {rival}, {kind}" for rival in results.rivals for kind in ("trimmed", "raw"))]
+    """Per scene, against each rival: trimmed and raw; missing energy where the rival fails the bias check.
+
+    A table for the scenes of each set of rivals: with media others are rendered than without.
+    """
+    groups = {}
+    for scene in results.scenes:
+        rivals = tuple(rival for rival in results.rivals if results.of(scene, rival))
+        groups.setdefault(rivals, []).append(scene)
+    return "\n".join(_efficiencies(results, rivals, scenes) for rivals, scenes in groups.items())
+
+
+def _efficiencies(results: Results, rivals, scenes) -> str:
+    """A part of `efficiency_table`."""
+    head = ["scene", *(f"over {rival}, {kind}" for rival in rivals for kind in ("trimmed", "raw"))]
     with_all = NONE in results.methods[1:]
     head += [f"over {NONE}, trimmed"] * with_all
     lines = []
-    for scene in results.scenes:
+    for scene in scenes:
         line = [f"`{scene}`"]
-        for rival in results.rivals:
+        for rival in rivals:
             try:
                 results.fair_efficiency(scene, rival)
             except Biased as why:
@@ -115,14 +128,22 @@ def efficiency_table(results: Results) -> str:
 def gaps_table(results: Results) -> str:
     """Table of how much of the error single values carry: raw over trimmed relMSE.
 
-    Of the first integrator and of the first of `Results.standard`, scenes with most of it first.
+    Of the first integrator and of the scene's first of `Results.standard`, scenes with most of it first.
     """
-    methods = results.methods[0], *results.standard[:1]
-    rows = [
-        [f"`{scene}`", *(said(lambda s=scene, m=method: results.gap(s, m)) for method in methods)]
-        for scene in results.by_gap(methods[0])
-    ]
-    return table(["scene", *methods], rows)
+    ours, rivals = results.methods[0], _first_rivals(results)
+    rows = []
+    for scene in results.by_gap(ours):
+        methods = [ours, *(results.standard_in(scene) or rivals)[:1]]
+        rows.append(
+            [f"`{scene}`", *(said(lambda s=scene, m=method: results.gap(s, m)) for method in methods)]
+        )
+    return table(["scene", ours, *([" or ".join(rivals)] if rivals else [])], rows)
+
+
+def _first_rivals(results: Results) -> list[str]:
+    """The first of `Results.standard` of each scene, each once; that of all if none was rendered."""
+    firsts = [name for scene in results.scenes for name in results.standard_in(scene)[:1]]
+    return list(dict.fromkeys(firsts)) or results.standard[:1]
 
 
 GALLERY = "../images/gallery"  # from docs/reports/figures.md
@@ -136,7 +157,8 @@ def gallery(results: Results) -> str:
         try:
             figure = ranged(results.against_path(scene))
         except Biased as why:
-            figure = f"`path`: {list(why.lacks.values())[-1]}"
+            rival, lacks = list(why.lacks.items())[-1]
+            figure = f"`{rival.split()[0]}`: {lacks}"
         except NotJudged:
             figure = "not judged"
         except Refused as why:
@@ -155,13 +177,17 @@ def estimate(x) -> str:
 def checks_table(results: Results, made: dict, notes: dict) -> str:
     """Per scene: cost per sample, slopes, bias checks; what is not as expected and has no note is marked."""
     ours = results.methods[0]
-    rival = (results.standard or RIVALS)[0]
+    rival = " or ".join(_first_rivals(results) or RIVALS[:1])
     head = ["scene", f"cost of a sample over {rival}", f"{NONE} over {rival}", "slope"]
     head += ["slope, independent points"]
     head += ["bias check", LIGHT_TRACER]
     lines = []
     for scene in results.scenes:
-        path = results.of(scene, rival, results.deciding)
+        path = [
+            row
+            for method in results.standard_in(scene)[:1]
+            for row in results.of(scene, method, results.deciding)
+        ]
         lines.append(
             [
                 f"`{scene}`",
@@ -256,8 +282,11 @@ def _verdict(check) -> str:
 def stronger(results: Results) -> str:
     """What efficiencies by budget are over, in words."""
     names = results.standard or [RIVALS[0]]
-    if set(names) <= set(RIVALS):
-        return "the stronger `path`"
+    if set(names) <= {*RIVALS, *MEDIA_RIVALS}:
+        media = (
+            ", with media the stronger of `volpath` and `volpathmis`," if set(names) & {*MEDIA_RIVALS} else ""
+        )
+        return f"the stronger `path`{media}"
     return f"the strongest of {', '.join(names)}" if len(names) > 1 else names[0]
 
 
@@ -307,11 +336,12 @@ def references_table(made: dict) -> str:
 
 
 def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
-    """Over the stronger `path` that passes the bias check; where none does, what they lack."""
+    """Over the strongest path tracer that passes the bias check; where none does, what they lack."""
     try:
         return ranged(results.against_path(scene, error))
     except Biased as why:
-        found = [said(lambda r=rival: results.efficiency(scene, r, error)) for rival in RIVALS]
+        rivals = results.standard_in(scene)
+        found = [said(lambda r=rival: results.efficiency(scene, r, error)) for rival in rivals]
         return f"{why} (against their error all the same: {', '.join(found)})"
 
 
@@ -326,14 +356,15 @@ def _near(found: Summary) -> str:
 
 
 def _near_one(results: Results, scene: str) -> str:
-    """Over each `path`."""
+    """Over each of `Results.standard`."""
     return "; ".join(
-        f"{said(lambda r=rival: results.fair_efficiency(scene, r), _near)} over {rival}" for rival in RIVALS
+        f"{said(lambda r=rival: results.fair_efficiency(scene, r), _near)} over {rival}"
+        for rival in results.standard_in(scene) or RIVALS
     )
 
 
 def _worst(results: Results) -> str:
-    """Of the scenes in which a `path` passes the bias check; those that cannot be judged are named."""
+    """Of the scenes in which a path tracer passes the bias check; those that cannot be judged are named."""
     found, others = {}, []
     for scene in results.scenes:
         try:

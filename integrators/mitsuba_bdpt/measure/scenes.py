@@ -14,6 +14,7 @@ import mitsuba as mi
 from ..errors import CommandError, message
 from ..files.loading import choose_sensor, in_proportion, parameters
 from ..files.named import named_files
+from ..host.introspection import all_shapes, is_instance
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,11 @@ class SceneFile:
         """That of the file's integrator; -1 (no limit) without one."""
         return depth_of(self.load().integrator())
 
+    @cached_property
+    def has_media(self) -> bool:
+        """Whether rays can be in a medium, see `has_media`."""
+        return has_media(self.load())
+
     @property
     def sha256(self) -> str:
         """SHA-256 of the file and of the meshes and textures that it names."""
@@ -77,6 +83,22 @@ class SceneFile:
 def digest(*paths: Path) -> str:
     """SHA-256 of files, one after the other."""
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+
+
+def has_media(scene: mi.Scene) -> bool:
+    """Whether rays of a scene can be in a medium: some sensor is in one, or some shape bounds one."""
+    shapes = (shape for shape in all_shapes(scene) if not is_instance(shape))
+    return any(sensor.get_medium() is not None for sensor in scene.sensors()) or any(
+        shape.is_medium_transition() for shape in shapes
+    )
+
+
+def path_tracers(media: bool) -> tuple[str, ...]:
+    """Types of Mitsuba's path tracers that render a scene with or without media (`has_media`) as it is.
+
+    `path` sees no media; without them the others are the same path tracer, but slower.
+    """
+    return ("volpath", "volpathmis") if media else ("path",)
 
 
 def depth_of(integrator) -> int:

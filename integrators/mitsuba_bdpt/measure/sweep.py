@@ -31,7 +31,7 @@ from ..run.rendering import raise_interrupt
 from ..settings import ALIASES
 from . import analysis, probes, showing
 from .bench import Bench, measure, measured
-from .cells import Cell, Cells, machine, software
+from .cells import FIRST_SEED, Cell, Cells, machine, software
 from .making import Job, check, obtained
 from .preset import Preset, read_preset
 from .project import Project
@@ -172,7 +172,8 @@ class Sweep:
         if not self._are_there(found):
             return []  # one of them failed
         try:
-            widths = analysis.widths(read_rows(self.output, cells, found), more.methods)
+            names = dict.fromkeys(cell.method for cell in cells.of(more.spp, FIRST_SEED, more.methods))
+            widths = analysis.widths(read_rows(self.output, cells, found), list(names))
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
             return []
