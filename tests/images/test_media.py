@@ -218,14 +218,14 @@ def test_each_class_with_hits(name, pair, monkeypatch):
 
 
 def test_thinned_light_subpaths(monkeypatch):
-    """Rationale: of long light subpaths in media some vertices are kept, for the others too. Expected: with 4
+    """Rationale: of long light subpaths in media some vertices are kept, for the others too. Expected: with 2
     vertices kept at most instead of 64 inner strategies and hits, all others left out, add up to ``volpath``
     limited to k, k = 3, 4. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
     """
     original = planner.plan
     monkeypatch.setattr(planner, "plan", lambda *args: replace(original(*args), **PAIRS["inner"]))
     for module in (inputs, stored_vertices):
-        monkeypatch.setattr(module, "KEPT", 4)
+        monkeypatch.setattr(module, "KEPT", 2)
     ours = layers(parts.tile_means(load("fog"), bdpt(strategy_images=True), 64, 12000, SEEDS))
     family = [st.compare_images(weighted_sum(ours, k), path_lengths("fog")[k], f"k={k}") for k in (3, 4)]
     st.assert_agree(st.Comparisons.join(family), at_least=20)
