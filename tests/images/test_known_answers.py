@@ -7,43 +7,21 @@ seeds (each seed an independent render) against the known value, with Sidak's co
 number of values tested at once. Seeds are fixed, so a test passes or fails always.
 """
 
+from functools import partial
+
 import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-from scipy import stats
+import welch as st
 
-# Chance that a correct program fails one call of `check`, had the seeds not been fixed.
-SIGNIFICANCE = 1e-4
 # Systematic error that float32 is allowed, relative: sums of some 1e3 terms, ray offsets.
 ROUNDING = 3e-5
 
 T = mi.ScalarTransform4f
 
 
-def check(samples, expected, relative):
-    """t-test of ``samples`` (seeds first, then any shape of values) against ``expected``.
-
-    Passes where the confidence interval of the mean holds the expected value. It must reach no
-    further than ``relative``: else the test could not see an error of that size.
-    """
-    samples = np.asarray(samples, dtype=np.float64)
-    samples = samples.reshape(len(samples), -1)
-    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64).ravel(), samples.shape[1:])
-    mean = samples.mean(0)
-    error = samples.std(0, ddof=1) / np.sqrt(len(samples))
-    level = 1 - (1 - SIGNIFICANCE) ** (1 / expected.size)
-    reach = stats.t.isf(level / 2, len(samples) - 1) * error + ROUNDING * np.abs(expected)
-    bad = np.abs(mean - expected) > reach
-    assert not bad.any(), "\n".join(
-        f"value {i}: {mean[i]:.6f} +- {error[i]:.6f}, expected {expected[i]:.6f}"
-        for i in np.flatnonzero(bad)[:20]
-    )
-    blind = reach > relative * np.abs(expected)
-    assert not blind.any(), (
-        f"too noisy to see an error of {relative}: "
-        f"{np.max(reach[blind] / np.maximum(np.abs(expected[blind]), 1e-12)):.2e}"
-    )
+check = partial(st.check_known, rounding=ROUNDING)
 
 
 def camera(origin=(0, 0, 0.5), target=(0.2, 0.1, -1), fov=60, size=16, rfilter="box", **film):

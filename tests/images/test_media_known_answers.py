@@ -5,14 +5,15 @@ number of values tested at once (`check`); where nothing is random, the toleranc
 Seeds are fixed. Each is rendered with all strategies, by default and by camera subpaths alone (`WAYS`).
 """
 
+from functools import partial
+
 import media_parts as parts
 import mitsuba as mi
 import numpy as np
 import pytest
-from scipy import integrate, stats
+import welch as st
+from scipy import integrate
 
-# Chance that a correct program fails one call of `check`, had the seeds not been fixed.
-SIGNIFICANCE = 1e-4
 # Systematic error that float32 is allowed, relative.
 ROUNDING = 5e-5
 
@@ -23,24 +24,7 @@ WAYS = {"all": {"skip": "none"}, "default": {}, "camera": {"light_paths": 0}}
 ways = pytest.mark.parametrize("way", WAYS)
 
 
-def check(samples, expected, relative):
-    """t-test of ``samples`` (seeds first) against ``expected``.
-
-    Passes where the confidence interval of the mean holds the expected value. It must reach no further than
-    ``relative``: else the test could not see an error of that size.
-    """
-    samples = np.asarray(samples, dtype=np.float64)
-    samples = samples.reshape(len(samples), -1)
-    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64).ravel(), samples.shape[1:])
-    mean, error = samples.mean(0), samples.std(0, ddof=1) / np.sqrt(len(samples))
-    level = 1 - (1 - SIGNIFICANCE) ** (1 / expected.size)
-    reach = stats.t.isf(level / 2, len(samples) - 1) * error + ROUNDING * np.abs(expected)
-    bad = np.abs(mean - expected) > reach
-    assert not bad.any(), "\n".join(
-        f"value {i}: {mean[i]:.6f} +- {error[i]:.6f}, expected {expected[i]:.6f}"
-        for i in np.flatnonzero(bad)[:20]
-    )
-    assert (reach <= relative * np.abs(expected)).all(), (reach / np.abs(expected)).max()
+check = partial(st.check_known, rounding=ROUNDING)
 
 
 def render(scene, way, spp, seeds=SEEDS, **parameters):

@@ -14,6 +14,7 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
+import views
 from mitsuba_bdpt.image.layers import strategies
 from welch import Comparisons, assert_agree, compare_images, tile_means, welch
 
@@ -33,24 +34,8 @@ def transform():
     return mi.ScalarTransform4f()
 
 
-def sensor(origin, target, fov=60, kind="perspective", size=SIZE, pixel_format="rgb", **more):
-    return {
-        "type": kind,
-        "fov": fov,
-        "near_clip": 0.05,
-        "far_clip": 50,
-        "to_world": transform().look_at(list(origin), list(target), [0, 1, 0]),
-        "sampler": {"type": "independent"},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "rfilter": {"type": "box"},
-            "pixel_format": pixel_format,
-            "component_format": "float32",
-        },
-        **more,
-    }
+def sensor(origin, target, fov=60, kind="perspective", **more):
+    return views.camera(kind, origin, target, fov, **more)
 
 
 def rgb(*value):

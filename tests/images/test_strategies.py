@@ -27,6 +27,8 @@ import numpy as np
 import pytest
 import welch as st
 from mitsuba_bdpt.image.layers import strategies
+from views import camera as sensor
+from views import thinlens
 
 DEPTH = 5
 SEEDS = 32
@@ -34,30 +36,6 @@ SIZE, TILES = 16, 4
 CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
 
 T = mi.ScalarTransform4f
-
-
-def sensor(kind="perspective", origin=(0.1, -0.05, 0.5), target=(0, 0, -1), fov=60, **more):
-    return {
-        "type": kind,
-        "fov": fov,
-        "near_clip": 0.05,
-        "far_clip": 50,
-        "to_world": T().look_at(list(origin), list(target), [0, 1, 0]),
-        "sampler": {"type": "independent"},
-        "film": {
-            "type": "hdrfilm",
-            "width": SIZE,
-            "height": SIZE,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
-            "component_format": "float32",
-        },
-        **more,
-    }
-
-
-def thinlens(**more):
-    return sensor("thinlens", aperture_radius=0.08, focus_distance=1.2, **more)
 
 
 def gray(x):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
+import views
 import welch as st
 
 SIZE, TILES = 16, 4
@@ -24,30 +25,12 @@ def matte(*value):
     return {"type": "diffuse", "reflectance": rgb(*value)}
 
 
-def sensor(
-    kind="perspective", origin=(0.1, -0.05, 0.5), target=(0, 0, -1), fov=60, size=SIZE, near=0.1, **more
-):
-    return {
-        "type": kind,
-        "fov": fov,
-        "near_clip": near,
-        "far_clip": 50,
-        "to_world": transform().look_at(list(origin), list(target), [0, 1, 0]),
-        "sampler": {"type": "independent"},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
-            "component_format": "float32",
-        },
-        **more,
-    }
+def sensor(near=0.1, **more):
+    return views.camera(near=near, **more)
 
 
-def thinlens(**more):
-    return sensor("thinlens", aperture_radius=0.08, focus_distance=1.2, **more)
+def thinlens(near=0.1, **more):
+    return views.thinlens(near=near, **more)
 
 
 def fog(sigma_t=0.5, albedo=0.8, g=0.3, **more):

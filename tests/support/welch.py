@@ -147,3 +147,29 @@ def agree(a, b, relative, rounding):
     assert reach[-1] < relative * scale[-1], (
         f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}"
     )
+
+
+def check_known(samples, expected, relative, rounding):
+    """t-test of ``samples`` (seeds first, then any shape of values) against ``expected``.
+
+    Passes where the confidence interval of the mean, to which the relative error ``rounding`` of float32 is
+    added, holds the expected value. It must reach no further than ``relative``: else the test could not see
+    an error of that size.
+    """
+    samples = np.asarray(samples, dtype=np.float64)
+    samples = samples.reshape(len(samples), -1)
+    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64).ravel(), samples.shape[1:])
+    mean = samples.mean(0)
+    error = samples.std(0, ddof=1) / np.sqrt(len(samples))
+    level = 1 - (1 - OF_AGREE) ** (1 / expected.size)
+    reach = stats.t.isf(level / 2, len(samples) - 1) * error + rounding * np.abs(expected)
+    bad = np.abs(mean - expected) > reach
+    assert not bad.any(), "\n".join(
+        f"value {i}: {mean[i]:.6f} +- {error[i]:.6f}, expected {expected[i]:.6f}"
+        for i in np.flatnonzero(bad)[:20]
+    )
+    blind = reach > relative * np.abs(expected)
+    assert not blind.any(), (
+        f"too noisy to see an error of {relative}: "
+        f"{np.max(reach[blind] / np.maximum(np.abs(expected[blind]), 1e-12)):.2e}"
+    )

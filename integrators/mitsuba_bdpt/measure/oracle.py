@@ -4,7 +4,7 @@ E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation" (1997), se
 of k edges, x_0 on an emitter and x_k on the sensor, can be made by the strategies (s, t) with t = k + 1 - s.
 Each makes the first s vertices from the light and the others from the camera, so its density is
 
-p_s = light[0] ... light[s-1] * camera[s] ... camera[k]
+    p_s = light[0] ... light[s-1] * camera[s] ... camera[k]
 
 with the arrays ``light`` and ``camera`` below: densities of each vertex from either side. Nothing is
 recursive here and nothing is shared with the code under test. Arithmetic is in float64 and in logarithms

@@ -14,7 +14,7 @@ import mitsuba as mi
 from ..errors import CommandError, message
 from ..files.loading import choose_sensor, in_proportion, parameters
 from ..files.named import named_files
-from ..host.introspection import all_shapes, is_instance
+from ..media.media import media_of
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,7 @@ def digest(*paths: Path) -> str:
 
 def has_media(scene: mi.Scene) -> bool:
     """Whether rays of a scene can be in a medium: some sensor is in one, or some shape bounds one."""
-    shapes = (shape for shape in all_shapes(scene) if not is_instance(shape))
-    return any(sensor.get_medium() is not None for sensor in scene.sensors()) or any(
-        shape.is_medium_transition() for shape in shapes
-    )
+    return bool(media_of(scene, scene.sensors()))
 
 
 def path_tracers(media: bool) -> tuple[str, ...]:

@@ -95,12 +95,19 @@ def choose_channel(u: mi.Float) -> mi.UInt32:
     return dr.minimum(mi.UInt32(u * count), count - 1)
 
 
-@dr.syntax
 def advance(space: Space, ray: mi.Ray3f, landing: Landing, word, active: mi.Bool, hidden) -> Landing:
     """Follow an edge to where it ends; ``landing`` is the ray's first hit, ``hidden`` see `_passes`.
 
     Random numbers of tracking follow ``word``.
     """
+    if not space.media.see_through and hidden is None:  # nothing to pass
+        return _segment(space.media, ray, landing, word, active)[1]
+    return _through_surfaces(space, ray, landing, word, active, hidden)
+
+
+@dr.syntax
+def _through_surfaces(space: Space, ray, landing: Landing, word, active, hidden) -> Landing:
+    """`advance` where there are surfaces to pass."""
     going = mi.Bool(active)
     while dr.hint(going, label="segments of an edge", exclude=[space, ray, hidden, active]):
         si, landing, word = _segment(space.media, ray, landing, word, going)

@@ -29,9 +29,9 @@ class Media:
     """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
 
     ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for
-    branches while a kernel is recorded: ``homogeneous`` media and ``grids``; ``scatters``: some albedo is not
-    0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths are
-    ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
+    branches while a kernel is recorded: ``grids``: some medium is not homogeneous; ``scatters``: some albedo
+    is not 0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths
+    are ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
     ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
     have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
     (``sample_emitters``).
@@ -44,7 +44,7 @@ class Media:
         for medium in objects:
             _check(medium)
         homogeneous = [m.is_homogeneous() for m in objects]
-        self.homogeneous, self.grids = any(homogeneous), not all(homogeneous)
+        self.grids = not all(homogeneous)
         self.sensor = 1 + objects.index(sensor) if sensor is not None else 0
         self._ids = [_registry_id(m) for m in objects]
         self._numbers = _numbers(self._ids)
@@ -70,16 +70,12 @@ class Media:
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Iterable[mi.BSDF]) -> Media | None:
         """Those of a scene seen by a sensor, whose shapes have these BSDFs; None if there are none."""
+        found = media_of(scene, [sensor])
         declared = sensor.get_medium()
-        found: dict[int, mi.Medium] = {}
-        for medium in [declared, *(m for shape in all_shapes(scene) for m in _sides(shape))]:
-            if medium is not None:
-                found.setdefault(_registry_id(medium), medium)
         if not found:
             return None
-        objects = list(found.values())
         sensor_medium = None if declared is None else found[_registry_id(declared)]
-        return Media(objects, sensor_medium, bsdfs)
+        return Media(list(found.values()), sensor_medium, bsdfs)
 
     def _table(self, majorants):
         """Extinction by number, ``Float`` or ``Spectrum``; None if it depends on more than the number."""
@@ -202,6 +198,13 @@ def of_depth(depth: mi.Float | mi.Spectrum):
     if isinstance(depth, mi.Spectrum):
         transmittance = dr.mean(transmittance)
     return dr.maximum(transmittance, _LEAST)
+
+
+def media_of(scene: mi.Scene, sensors: Iterable[mi.Sensor]) -> dict[int, mi.Medium]:
+    """The media that rays of a scene and these sensors may be in, by their place in Mitsuba's registry."""
+    media = [sensor.get_medium() for sensor in sensors]
+    media += [medium for shape in all_shapes(scene) for medium in _sides(shape)]
+    return {_registry_id(medium): medium for medium in media if medium is not None}
 
 
 def _sides(shape: mi.Shape) -> tuple:

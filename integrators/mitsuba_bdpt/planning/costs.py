@@ -14,12 +14,12 @@ COSTS = {
     "light_path": 1.7,  # to start a light subpath
     "far": 2.0,  # beside it, to start one from infinity
     "light": 0.76,  # each of its rays
+    "light_in_media": 1.2,  # the same in a scene with media
     "inner": 0.55,  # to look for connections at all, per sample
     "joined": 0.65,  # a connection that is drawn and tested
     "shadow_inner": 0.65,  # each that is tested, where all are
-    "light_in_media": 1.2,  # and in a scene with media
-    # There also a pair that is evaluated by the lane of a packet that has most of them: the others wait for
-    # it, and long subpaths differ. (Six scenes: 0.13 to 0.28.)
+    # In a scene with media, a pair that is evaluated by the lane of a packet that has most of them: others
+    # wait for it, and long subpaths differ. (Six scenes: 0.13 to 0.28.)
     "packets": 0.18,
     "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }

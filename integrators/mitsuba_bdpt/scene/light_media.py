@@ -36,9 +36,11 @@ class LightMedia:
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor):
         self._space, self._emitters = space, emitters
         # The sensor's medium has no end if some ray from it meets no boundary.
-        bounded = _around(space, sensor)[1].all()
-        self.outside = 0 if bounded else space.media.sensor
-        self.contradiction = _contradiction(space, sensor, self.outside)
+        number, found = _around(space, sensor)
+        self.outside = 0 if found.all() else space.media.sensor
+        self.contradiction = _contradiction_of_sensor(
+            space, sensor, number[found]
+        ) or _contradiction_of_shapes(space, self.outside)
         self._outside = dr.opaque(mi.UInt32, self.outside)
         # Nothing arrives from infinity through a homogeneous medium without end.
         endless = space.media.objects[self.outside - 1] if self.outside else None
@@ -116,17 +118,19 @@ def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     return np.array(number), np.array(found)
 
 
-def _contradiction(space: Space, sensor: mi.Sensor, outside: int) -> str:
-    """Why light and camera subpaths would not agree on the media; empty if they would."""
-    number, found = _around(space, sensor)
+def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: np.ndarray) -> str:
+    """Why the sensor is not in the medium ``around`` it (numbers, one for each ray); empty if it is."""
     declared = space.media.sensor
-    if found.any() and (number[found] != declared).mean() > _TOLERATED:
-        says = (
-            f"declares the medium {named(space.media.objects[declared - 1])}"
-            if declared
-            else "declares no medium"
-        )
-        return f"sensor {named(sensor)} {says}, but the boundaries around it say otherwise"
+    if not len(around) or (around != declared).mean() <= _TOLERATED:
+        return ""
+    says = "no medium"
+    if declared:
+        says = f"the medium {named(space.media.objects[declared - 1])}"
+    return f"sensor {named(sensor)} declares {says}, but the boundaries around it say otherwise"
+
+
+def _contradiction_of_shapes(space: Space, outside: int) -> str:
+    """Why boundaries do not agree on the medium between them; empty if they do."""
     if not space.scene.shapes():
         return ""
     crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))

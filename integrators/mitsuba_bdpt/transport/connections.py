@@ -15,7 +15,7 @@ from .counters import Counters, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
-from .walk import Vertex, direct_coefficient, is_lit, newest_coefficient
+from .walk import Vertex, is_lit, newest_coefficient, where_lit
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -39,10 +39,11 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~bsdf.is_zero(value)
 
+    direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
     light_side = mis.alternatives(
         h,
         y.partial,
-        newest_coefficient(kernel, direct_coefficient(kernel, is_lit(kernel, y)), y.edges),
+        newest_coefficient(kernel, direct, y.edges),
         f_y.pdf_rev_w,
         f_z.pdf_fwd_w * cos_y * inverse,
     )

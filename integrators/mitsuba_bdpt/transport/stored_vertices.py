@@ -20,9 +20,9 @@ class StoredVertex:
 
     ``throughput_over_cos`` f cos / pdf of all events before this vertex, the edge to it included, over the
     geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi| (in
-    volumes both are 1); ``partial`` partial sums in the area measure; ``edges`` number of edges up to it, s -
-    1; ``anchor`` starts rays; ``medium`` the number of that in which it lies, 0 on surfaces, None in scenes
-    without media.
+    volumes both are 1); ``partial`` partial sums in the area measure; ``edges`` number of edges up to it,
+    s - 1; ``anchor`` starts rays; ``medium`` the number of that in which it lies, 0 on surfaces, None in
+    scenes without media.
     """
 
     si: mi.SurfaceInteraction3f

@@ -24,7 +24,7 @@ from .contribution import Contribution, roulette, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
 from .visibility import Sight, seen
-from .walk import Vertex, Walk, direct_coefficient, is_lit, newest_coefficient
+from .walk import Vertex, Walk, is_lit, newest_coefficient, where_lit
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
@@ -52,7 +52,7 @@ def hit_emitter(kernel: Kernel, z: Vertex) -> Contribution:
     endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need just this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
-    direct = direct_coefficient(kernel, None if z.edge is None else z.edge.lit)
+    direct = where_lit(kernel, kernel.kappa.direct, None if z.edge is None else z.edge.lit)
     newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
     older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
@@ -186,7 +186,8 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~bsdf.is_zero(value)
 
-    newest = newest_coefficient(kernel, direct_coefficient(kernel, is_lit(kernel, y)), y.edges)
+    direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
+    newest = newest_coefficient(kernel, direct, y.edges)
     light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
     camera_side = 0
     if kernel.plan.arrival:

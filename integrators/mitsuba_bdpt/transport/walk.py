@@ -208,9 +208,8 @@ def is_lit(kernel: Kernel, vertex):
     return ~vertex.volume | kernel.space.media.is_lit(vertex.medium)
 
 
-def direct_coefficient(kernel: Kernel, lit) -> mis.Coefficient:
-    """kappa of next-event estimation at a vertex, see `is_lit`."""
-    direct = kernel.kappa.direct
+def where_lit(kernel: Kernel, direct: mis.Coefficient, lit) -> mis.Coefficient:
+    """The coefficient ``direct`` of next-event estimation where it is allowed, see `is_lit`; else 0."""
     return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
 
 
@@ -341,7 +340,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         active |= passes
     first = side.coefficient
     if side.adjoint:
-        first = direct_coefficient(kernel, is_lit(kernel, vertex))
+        first = where_lit(kernel, first, is_lit(kernel, vertex))
     coefficient = newest_coefficient(kernel, first, walk.edges)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
 
