@@ -597,6 +597,30 @@ MUTANTS = (
         "return dr.select(found, self._outside, self._outside)",
         ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
     ),
+    Mutant(
+        "media: null collisions are alike in all channels",
+        "media/tracking.py",
+        "throughput * ((majorant - sigma_t) / null)",
+        "throughput",
+        ("tests/images/test_media_identities.py::test_null_collisions_by_channel",),
+    ),
+    Mutant(
+        "media: grids have no end",
+        "media/tracking.py",
+        "return low, high, active & meets & (low < high)",
+        "return low * 0, end, active",
+        ("tests/images/test_media_identities.py::test_nothing_is_lost_outside_of_a_dense_grid",),
+    ),
+    Mutant(
+        "media: lamps are in no medium",
+        "scene/light_media.py",
+        "return dr.select(found, number, self._outside)",
+        "return mi.UInt32(0)",
+        (
+            "tests/images/test_media_identities.py::test_spots_in_fog[spot]",
+            "tests/images/test_media_identities.py::test_spots_in_fog[beam]",
+        ),
+    ),
 )
 
 

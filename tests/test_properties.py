@@ -736,6 +736,26 @@ def test_explain_says_what_is_lost(lamp, area, parameters, expected):
         assert re.search(pattern, line), text
 
 
+@pytest.mark.parametrize("albedo, vertex", [(0.5, "surface or scattering in a medium"), (0.0, "surface")])
+def test_explain_says_what_is_lost_in_fog(albedo, vertex):
+    """Rationale: in fog a path between two panes of glass has a scattering in the place of a surface, and
+    null surfaces are no delta surfaces. Expected: the sentence names both, where the fog scatters; without
+    glass there is none."""
+    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": albedo}
+    eye = sensor() | {"medium": fog}
+
+    def lost(surface):
+        ball = {"type": "sphere", "bsdf": {"type": surface}}
+        wall = {"type": "sphere", "radius": 3, "bsdf": diffuse()}
+        scene = mi.load_dict({"type": "scene", "lamp": GLASS_LAMP, "ball": ball, "wall": wall, "eye": eye})
+        text = integrator(max_depth=32).explain(scene)
+        return [line for line in text.splitlines() if line.startswith("lost: ")]
+
+    (line,) = lost("dielectric")
+    assert f"a single other {vertex}, delta surfaces, sensor" in line
+    assert not lost("null")
+
+
 def test_connections_that_are_zero_are_those_of_either_way():
     """Rationale: what a connection adds is counted as zero before its ray is traced, whoever adds up the
     others. Expected: exactly as many whether all light vertices are joined or one is drawn, on the same

@@ -10,9 +10,9 @@ from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 _STARTS = {Start.DELTA_EMITTER: "delta emitter, delta surfaces", Start.BEAM: "directionalarea"}
 _RESTS = {
-    Rest.SEEN_SURFACE: ", a surface that the sensor sees",
-    Rest.SURFACES: ", two other surfaces or more, delta surfaces or none, sensor",
-    Rest.SURFACE_BETWEEN_DELTA: ", a single other surface, delta surfaces, sensor (no two neighbours can be "
+    Rest.SEEN_VERTEX: ", a {vertex} that the sensor sees",
+    Rest.VERTICES: ", two other {vertices} or more, delta surfaces or none, sensor",
+    Rest.VERTEX_BETWEEN_DELTA: ", a single other {vertex}, delta surfaces, sensor (no two neighbours can be "
     "joined)",
     Rest.SENSOR: ", sensor",
     Rest.LONG: ", ... on paths longer than {longest} edges (stored_vertices)",
@@ -22,7 +22,10 @@ _RESTS = {
 def words(lost: UnreachablePaths) -> str:
     """Paths that no strategy in use can make, in words."""
     starts = " or ".join(_STARTS[start] for start in lost.starts)
-    rest = _RESTS[lost.rest].format(longest=lost.longest)
+    vertex, vertices = ("surface or scattering in a medium", "surfaces or scatterings in media")
+    if not lost.volumes:
+        vertex, vertices = "surface", "surfaces"
+    rest = _RESTS[lost.rest].format(longest=lost.longest, vertex=vertex, vertices=vertices)
     return f"{starts}{rest} (needs {lost.needs})" if lost.needs else f"{starts}{rest}"
 
 

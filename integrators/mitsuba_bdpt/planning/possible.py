@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from ..emitters.emitters import Emitters
@@ -142,9 +142,9 @@ class Start(Enum):
 class Rest(Enum):
     """What follows such a start on paths that only some strategies can make."""
 
-    SEEN_SURFACE = "a surface that is not delta, seen by the sensor"
-    SURFACES = "two surfaces or more that are not delta, then delta surfaces or none"
-    SURFACE_BETWEEN_DELTA = "a single surface that is not delta, then delta surfaces"
+    SEEN_VERTEX = "a vertex that is not delta, seen by the sensor"
+    VERTICES = "two vertices or more that are not delta, then delta surfaces or none"
+    VERTEX_BETWEEN_DELTA = "a single vertex that is not delta, then delta surfaces"
     SENSOR = "the sensor itself"
     LONG = "any, on paths longer than light subpaths are stored"
 
@@ -154,13 +154,14 @@ class UnreachablePaths:
     """Paths that no strategy in use makes: from one of the ``starts`` by the ``rest``.
 
     ``needs`` is the strategy that would make them, empty if there is none. ``longest``, for `Rest.LONG`: the
-    number of edges beyond which they are not made.
+    number of edges beyond which they are not made. ``volumes``: vertices that are not delta may lie in media.
     """
 
     starts: tuple[Start, ...]
     rest: Rest
     needs: str = ""
     longest: int = 0
+    volumes: bool = False
 
 
 def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnreachablePaths, ...]:
@@ -175,14 +176,15 @@ def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> t
     if not p.arrival:  # t = 0 finds all that follow
         for start in starts:
             if not p.splat:
-                lost.append(UnreachablePaths((start,), Rest.SEEN_SURFACE, "t=1"))
+                lost.append(UnreachablePaths((start,), Rest.SEEN_VERTEX, "t=1"))
             if p.connections == "none":
-                lost.append(UnreachablePaths((start,), Rest.SURFACES, "inner connections"))
+                lost.append(UnreachablePaths((start,), Rest.VERTICES, "inner connections"))
         if deltas:
-            lost.append(UnreachablePaths((Start.DELTA_EMITTER,), Rest.SURFACE_BETWEEN_DELTA))
+            lost.append(UnreachablePaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
         if not camera.delta and starts:
             lost.append(UnreachablePaths(starts, Rest.SENSOR, "t=0"))
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
         lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))
-    return tuple(lost)
+    volumes = prepared.space is not None and prepared.space.media.scatters
+    return tuple(replace(paths, volumes=volumes) for paths in lost)
