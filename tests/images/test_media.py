@@ -209,7 +209,14 @@ PAIRS = {
 
 @pytest.mark.parametrize(
     "name, pair",
-    [("fog", "t=1"), ("fog", "inner"), ("chromatic", "inner"), ("rough", "inner"), ("rough in fog", "t=1"), ("fog, lens", "t=0")],
+    [
+        ("fog", "t=1"),
+        ("fog", "inner"),
+        ("chromatic", "inner"),
+        ("rough", "inner"),
+        ("rough in fog", "t=1"),
+        ("fog, lens", "t=0"),
+    ],
 )
 def test_each_class_with_hits(name, pair, monkeypatch):
     """Rationale: see the module. Expected: the weighted images of s = 0 and one other class, all others left

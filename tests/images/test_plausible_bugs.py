@@ -135,7 +135,8 @@ def test_no_number_decides_two_things(kind):
         for vertex in (0, 1, 2):
             drawn += [np.array(points.draw_1d(side, stream, p, vertex)) for p in set(Purpose)]
     found = np.corrcoef(np.array(drawn))
-    assert len(drawn) == 2 * 3 * len(set(Purpose)) and np.abs(found - np.eye(len(drawn))).max() < 5 / 4096**0.5
+    assert len(drawn) == 2 * 3 * len(set(Purpose))
+    assert np.abs(found - np.eye(len(drawn))).max() < 5 / 4096**0.5
 
 
 def test_subpaths_draw_from_their_own_streams(monkeypatch):
