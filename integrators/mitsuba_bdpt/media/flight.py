@@ -18,7 +18,8 @@ class Edge:
 
     ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth
     of T~ so far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event``
-    counts events, null ones included, and names random numbers; ``rays`` traced so far, of the subpath. In
+    counts events, null ones included, and names random numbers; ``rays`` traced so far, of the subpath, and
+    tentative ``collisions`` (None where there are no grids). In
     chromatic media ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their
     mean over channels, of all flights of the subpath (``Spectrum``); else None. ``lit``: next-event
     estimation is allowed at the vertex before, None where it is everywhere.
@@ -30,6 +31,7 @@ class Edge:
     rest: mi.Float
     event: mi.UInt32
     rays: mi.UInt32
+    collisions: mi.UInt32 | None = None
     channel: mi.UInt32 | None = None
     ratio: mi.Spectrum | None = None
     lit: mi.Bool | None = None
@@ -47,6 +49,7 @@ class Edge:
             rest=tracking.exponential(u),
             event=mi.UInt32(1),
             rays=mi.UInt32(1),
+            collisions=mi.UInt32(0) if media.grids else None,
             channel=channel,
             ratio=ratio,
             lit=None if media.all_lit else mi.Bool(True),
@@ -130,6 +133,8 @@ def _segment(media: Media, ray, landing: Landing, word, active):
         t = dr.select(grid, found.t, t)
         depth, rest = dr.select(grid, found.depth, depth), dr.select(grid, found.rest, rest)
         throughput, word = found.throughput, found.word
+        before = 0 if edge.collisions is None else edge.collisions
+        edge = replace(edge, collisions=before + found.collisions)
     collided = active & (t < end)
     edge = replace(edge, depth=edge.depth + depth, rest=rest)
     throughput, edge = _weighted(media, segment, t, collided, throughput, edge, depth, active)

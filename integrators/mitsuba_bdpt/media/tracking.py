@@ -21,7 +21,8 @@ class Tracked:
     """What delta tracking finds: the distance ``t`` of a real collision (infinite if there is none).
 
     ``depth`` optical depth of T~ up to it, ``rest`` what is left until the next tentative collision,
-    ``throughput`` times the ratios of null collisions, the next random ``word``.
+    ``throughput`` times the ratios of null collisions, the next random ``word``, and the number of tentative
+    ``collisions``.
     """
 
     t: mi.Float
@@ -29,6 +30,7 @@ class Tracked:
     rest: mi.Float
     throughput: mi.Spectrum
     word: mi.UInt32
+    collisions: mi.UInt32
 
 
 def exponential(u: mi.Float) -> mi.Float:
@@ -54,6 +56,7 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
     majorant = media.majorant(number, ray, active)
     t, met = mi.Float(low), mi.Float(dr.inf)
     rest, throughput, word = mi.Float(rest), mi.Spectrum(throughput), mi.UInt32(word)
+    collisions = mi.UInt32(0)
     going = inside & (majorant > 0)
     while dr.hint(
         going, label="delta tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
@@ -72,18 +75,23 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
         met = dr.select(tentative & ~passed, t, met)
         u, word = sequential(word)
         rest = dr.select(passed, exponential(u), rest)
+        collisions += dr.select(tentative, mi.UInt32(1), 0)
         going = mi.Bool(passed)
     travelled = dr.maximum(dr.minimum(met, high) - low, 0)
     depth = dr.select(inside, media.mean(number) * travelled, 0)
-    return Tracked(met, depth, rest, throughput, word)
+    return Tracked(met, depth, rest, throughput, word, collisions)
 
 
 @dr.syntax
 def ratio(media: Media, number, ray, end, word, active):
-    """Ratio tracking along ``ray`` up to ``end``: transmittance (``Spectrum``), depth of T~, next word."""
+    """Ratio tracking along ``ray`` up to ``end``.
+
+    Returns transmittance (``Spectrum``), depth of T~, the next random word and the number of collisions.
+    """
     low, high, inside = _within(media, number, ray, end, active)
     majorant = media.majorant(number, ray, active)
     t, transmittance, word = mi.Float(low), mi.Spectrum(1), mi.UInt32(word)
+    collisions = mi.UInt32(0)
     going = inside & (majorant > 0)
     while dr.hint(
         going, label="ratio tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
@@ -91,8 +99,10 @@ def ratio(media: Media, number, ray, end, word, active):
         u, word = sequential(word)
         t += exponential(u) / majorant
         going &= t < high
+        collisions += dr.select(going, mi.UInt32(1), 0)
         mei = interaction(ray(dr.select(going, t, 0)), ray.d, ray)
         _, sigma_t = media.ask(number, coefficients, mei, going)
         transmittance = dr.select(going, transmittance * (1 - sigma_t / majorant), transmittance)
         going &= ~dr.all(transmittance == 0)
-    return transmittance, dr.select(inside, media.mean(number) * (high - low), 0), word
+    depth = dr.select(inside, media.mean(number) * (high - low), 0)
+    return transmittance, depth, word, collisions

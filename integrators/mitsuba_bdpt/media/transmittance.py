@@ -17,12 +17,15 @@ from .media import Media, Space, depth_of, of_depth
 class Crossing:
     """``transmittance`` of an edge, an unbiased estimate (``Spectrum``), and the optical ``depth`` of its T~.
 
-    ``clear``: no surface is in the way.
+    ``clear``: no surface is in the way. How many ``segments`` it has, and tentative ``collisions`` in grids
+    (None without any).
     """
 
     transmittance: mi.Spectrum
     depth: mi.Float | mi.Spectrum
     clear: mi.Bool
+    segments: mi.UInt32
+    collisions: mi.UInt32 | None
 
     @property
     def tr(self):
@@ -52,21 +55,22 @@ def between(
     media = space.media
     if not media.null_lobes and not hidden:
         visible = active & ~rays.occluded(space.scene, ray, active, own)
-        transmittance, depth, _ = _along(media, medium, ray, ray.maxt, word, visible)
-        return Crossing(dr.select(visible, transmittance, 0), depth, visible)
+        transmittance, depth, _, collisions = _along(media, medium, ray, ray.maxt, word, visible)
+        traced = dr.select(active, mi.UInt32(1), 0)
+        return Crossing(dr.select(visible, transmittance, 0), depth, visible, traced, collisions)
     return _through_surfaces(space, ray, medium, active, own, word, hidden)
 
 
 def _along(media: Media, medium, ray, length, word, active):
-    """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word."""
+    """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word, collisions."""
     sigma = media.extinction(medium, ray.d, ray, active)
     depth = depth_of(sigma, length)
-    transmittance = mi.Spectrum(dr.exp(-depth))
+    transmittance, collisions = mi.Spectrum(dr.exp(-depth)), None
     if media.grids:
         grid = active & (medium != 0) & ~media.is_homogeneous(medium)
-        estimate, of_mean, word = tracking.ratio(media, medium, ray, length, word, grid)
+        estimate, of_mean, word, collisions = tracking.ratio(media, medium, ray, length, word, grid)
         transmittance, depth = dr.select(grid, estimate, transmittance), dr.select(grid, of_mean, depth)
-    return transmittance, depth, word
+    return transmittance, depth, word, collisions
 
 
 @dr.syntax
@@ -77,12 +81,15 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
     transmittance, word, going = mi.Spectrum(1), mi.UInt32(word), mi.Bool(active)
     clear = mi.Bool(active)
     depth = mi.Float(0) if media.gray else mi.Spectrum(0)
+    segments, collisions = mi.UInt32(0), mi.UInt32(0) if media.grids else None
     while dr.hint(going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
         si = scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
         hit = going & si.is_valid() & ~_is_end(si, own, ray.maxt - left + si.t)
         length = dr.select(hit, si.t, left)
-        passed, of_segment, word = _along(media, medium, segment, length, word, going)
+        passed, of_segment, word, met_here = _along(media, medium, segment, length, word, going)
+        segments += dr.select(going, mi.UInt32(1), 0)
+        collisions = None if collisions is None or met_here is None else collisions + met_here
         depth = dr.select(going, depth + of_segment, depth)
         onward = dr.select(hit, _onward(space, si, hit, hidden), 1)
         clear &= ~going | ~dr.all(onward == 0)
@@ -92,7 +99,7 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
         onwards = dr.select(hit, rays.passed(segment, si, space.shape_errors), 0)
         o, left = mi.Point3f(segment(onwards)), left - onwards
         going = hit & clear & (left > 0)
-    return Crossing(dr.select(active, transmittance, 0), depth, clear)
+    return Crossing(dr.select(active, transmittance, 0), depth, clear, segments, collisions)
 
 
 def _is_end(si, own, t) -> mi.Bool:

@@ -8,6 +8,9 @@ import mitsuba as mi
 # Kinds of rays in the statistics, of what the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 
+# What edges through media count, there.
+MEDIA = ("segments", "collisions")
+
 
 def rays(render) -> dict:
     """Rays of a `Render` so far, by kind."""
@@ -34,6 +37,7 @@ def statistics(render) -> dict:
         },
         "rays": rays(render),
         "connections": connections,
+        **({"media": {n: counts[n] for n in MEDIA}} if render.prepared.space is not None else {}),
         "skipped": list(render.plan.skipped),
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,

@@ -11,7 +11,7 @@ from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream
 from . import bsdf, mis, scattering
 from .contribution import Contribution, drop_non_finite, roulette, size_of, worth_a_ray
-from .counters import Counters, one
+from .counters import Counters, counted_in_media, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
@@ -69,6 +69,7 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
+    crossed = Counters.zeros(*counted_in_media(kernel.space))
     while dr.hint(
         slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
     ):
@@ -77,10 +78,17 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
         nonzero += one(c.active)
         lost += c.counted.non_finite
         sight = _sight(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
-        total = add(c, seen(kernel, c, sight), total)
+        visible = seen(kernel, c, sight)
+        total = add(c, visible, total)
+        crossed = crossed + _in_media(visible.counted)
         slot += 1
     counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
-    return total, counted
+    return total, counted + crossed
+
+
+def _in_media(counted: Counters) -> Counters:
+    """Of ``counted`` what edges through media count."""
+    return Counters(segments=counted.segments, collisions=counted.collisions)
 
 
 def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> tuple[mi.Spectrum, Counters]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import drjit as dr
 import mitsuba as mi
 
+from ..media.media import Space
 from .plan import Plan
 
 
@@ -18,7 +19,8 @@ class Counters:
     and inner connections. Inner connections by what became of them: ``evaluated``, of these ``zero``;
     ``rouletted`` (splats too) have no ray. ``non_finite``: values that count as zero because they are not
     finite: contributions (those of s = 1 and t <= 1 if they are visible, inner ones before it is known),
-    subpaths that end for want of a finite throughput, colours, features.
+    subpaths that end for want of a finite throughput, colours, features. In scenes with media ``segments``
+    of edges, those of joins included, each with a ray of its own, and tentative ``collisions`` in grids.
 
     Records are added up, never changed: Dr.Jit's loops would not see it.
     """
@@ -32,6 +34,8 @@ class Counters:
     zero: mi.UInt32 | None = None
     rouletted: mi.UInt32 | None = None
     non_finite: mi.UInt32 | None = None
+    segments: mi.UInt32 | None = None
+    collisions: mi.UInt32 | None = None
 
     @staticmethod
     def zeros(*names: str) -> Counters:
@@ -63,14 +67,21 @@ def one(mask: mi.Bool) -> mi.UInt32:
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
-def counted_by_light(plan: Plan) -> Counters:
+def counted_in_media(space: Space | None) -> list[str]:
+    """The names of what edges through media count."""
+    return [] if space is None else ["segments"] + ["collisions"] * space.media.grids
+
+
+def counted_by_light(plan: Plan, space: Space | None) -> Counters:
     """What the vertices of light subpaths count."""
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
-    return Counters.zeros(*names, *["non_finite"] * (plan.splat or plan.arrival))
+    names += ["non_finite"] * (plan.splat or plan.arrival)
+    return Counters.zeros(*names, *counted_in_media(space) * plan.splat)
 
 
-def counted_by_camera(plan: Plan) -> Counters:
+def counted_by_camera(plan: Plan, space: Space | None) -> Counters:
     """What the vertices of camera subpaths count."""
-    one = plan.connections == "one"
+    one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
-    return Counters.zeros(*names, *["shadow_inner", "evaluated", "zero"] * (plan.connections != "none"))
+    names += ["shadow_inner", "evaluated", "zero"] * inner
+    return Counters.zeros(*names, *counted_in_media(space) * (plan.direct or inner))

@@ -85,7 +85,7 @@ from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
 from . import bsdf, contribution, mis, stored_vertices, techniques
 from .batch import Batch, Places
-from .counters import Counters, counted_by_camera, counted_by_light, one
+from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Shared
 from .observer import Observer
 from .sharing import Sharing
@@ -216,9 +216,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_v
         path = replace(path, thinning=stored_vertices.Thinning.begin(u))
     walk = _light_walk(kernel, e, stream, shared)
     active, side = walk.active, _light_side(kernel, e, stream, shared, walk)
-    state = path, counted_by_light(plan)
+    state = path, counted_by_light(plan, kernel.space)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters += counted
+    counters += counted + walk.counted(active)
     return path, counters + Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
 
 
@@ -292,7 +292,8 @@ def _splat(kernel: Kernel, sink, c, shared) -> Counters:
 @dr.syntax
 def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
-    counters = Counters.zeros("camera") + counted_by_camera(kernel.plan)
+    walked = Counters.zeros("camera", *counted_in_media(kernel.space))
+    counters = walked + counted_by_camera(kernel.plan, kernel.space)
     served = mi.UInt32(0)
     while dr.hint(
         served < kernel.camera_paths_per_light_path,
@@ -311,9 +312,10 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     walk = _camera_walk(kernel, sample, active)
     side = _camera_side(kernel, sink, sample, lane.shared, walk)
     visit = _camera_visit(kernel, sink, lane, sample)
-    state = sink.begin(), counted_by_camera(kernel.plan)
+    state = sink.begin(), counted_by_camera(kernel.plan, kernel.space)
     (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
     counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
+    counters += walk.counted(active)
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 

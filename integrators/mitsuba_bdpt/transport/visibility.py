@@ -11,6 +11,7 @@ from ..geometry import rays
 from ..media import transmittance
 from ..sampling.points import Purpose, Stream
 from .contribution import Contribution
+from .counters import Counters
 from .inputs import Kernel
 
 # Optical depth up to which a join's transmittance is guessed before its ray is traced, from the medium that
@@ -53,6 +54,7 @@ def seen(kernel: Kernel, c: Contribution, sight: Sight) -> Contribution:
         weight=weight,
         shares=shares,
         active=c.active & crossing.visible,
+        counted=c.counted + Counters(segments=crossing.segments, collisions=crossing.collisions),
     )
 
 

@@ -19,6 +19,7 @@ from ..media import flight
 from ..sampling.points import Purpose
 from ..sensors.records import CameraJoin
 from . import bsdf, mis, scattering
+from .counters import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
 
@@ -77,6 +78,15 @@ class Walk:
     def traced(self) -> mi.UInt32:
         """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
         return dr.maximum(self.edges if self.edge is None else self.edge.rays, 2) - 1
+
+    def counted(self, active: mi.Bool) -> Counters:
+        """What the edges of a walk that has ended count, in lanes that were ``active`` at its start."""
+        if self.edge is None:
+            return Counters()
+        segments, collisions = dr.select(active, self.traced(), 0), self.edge.collisions
+        return Counters(
+            segments=segments, collisions=None if collisions is None else dr.select(active, collisions, 0)
+        )
 
 
 @dataclass
