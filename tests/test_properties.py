@@ -143,7 +143,7 @@ def test_defaults():
     s = bdpt.settings
     assert (bdpt.max_depth, bdpt.rr_depth, s.hide_emitters, s.heuristic) == (-1, 5, False, "balance")
     assert (s.skip, s.light_paths, s.connections, s.points) == ("auto", "auto", "auto", "sobol")
-    assert (s.stored_vertices, s.strategy_images, s.spp_per_pass, s.timeout) == (64, False, 0, -1)
+    assert (s.stored_vertices, s.strategy_images, s.spp_per_pass, s.timeout) == (-1, False, 0, -1)
     assert bdpt.statistics == {}
     assert "max_depth = -1" in str(integrator()) and "skip = none" in str(integrator(skip="none"))
 

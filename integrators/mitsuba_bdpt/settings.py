@@ -17,6 +17,7 @@ UNLIMITED = 2**32 - 1
 # on a thread's stack.
 MAX_STORED = 1024
 
+# Edges of paths that use all strategies if ``stored_vertices`` is not given; with media `MAX_STORED`.
 DEFAULT_STORED = 64
 
 HEURISTICS = ("balance", "power", "maximum", "uniform")
@@ -133,12 +134,12 @@ class Settings:
         """JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.""",
     )
     stored_vertices: int = _parameter(
-        DEFAULT_STORED,
-        f"the longest path that uses all strategies, 1 to {MAX_STORED}",
-        """Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. (In scenes with
-        participating media 64 stands for 1024: subpaths are long, and of the later vertices some are kept for
-        all.)""",
-        low=1,
+        -1,
+        f"the longest path that uses all strategies, 1 to {MAX_STORED}, or -1 to choose",
+        """Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. -1: 64, in scenes
+        with participating media 1024 (subpaths are long there, and of the later vertices some are kept for
+        all).""",
+        low=-1,
         high=MAX_STORED,
     )
     strategy_images: bool = _parameter(

@@ -284,22 +284,42 @@ def test_glowing_sphere_filled_with_fog(way):
     check(render(scene, way, 256, rr_depth=5), 1.0, 0.01)
 
 
+def coloured_grid():
+    """A grid of even extinction .9, .4, .1 (per channel) around the unit sphere."""
+    values = np.broadcast_to(np.float32([0.9, 0.4, 0.1]), (2, 2, 2, 3))
+    medium = parts.grid(np.zeros((2, 2, 2)), [-1.1] * 3, 2.2, 1.0, 0.0)
+    medium["sigma_t"] |= {"raw": True, "grid": mi.VolumeGrid(np.ascontiguousarray(values))}
+    return medium
+
+
+ABSORBED = np.exp([-0.9, -0.4, -0.1])
+METERS = {
+    "gray": (lambda: parts.fog(1.0, 1.0), 1.0),
+    "chromatic": (lambda: parts.coloured(1.0) | {"albedo": 1.0}, 1.0),
+    "chromatic, absorbing": (lambda: parts.coloured(1.0) | {"albedo": 0.0}, ABSORBED),
+    "grid": (lambda: parts.grid(np.full((2, 2, 2), 1.0), [-1.1] * 3, 2.2, 1.0, 1.0), 1.0),
+    "coloured grid": (coloured_grid, ABSORBED),
+}
+
+
 @pytest.mark.parametrize("way", ["all", "default"])
-def test_meter_in_fog(way):
-    """Rationale: t = 0 and the last edge of light subpaths: all the light of a point lamp in fog of albedo 1
-    falls on the wall around it. A black unit sphere which is itself an irradiance meter. Expected: intensity
-    / radius^2 of light that scatters any number of times (which camera subpaths alone cannot find: e^-1 of it
-    comes straight). Tolerance: below 2 %, t-test over 12 renders.
+@pytest.mark.parametrize("kind", METERS)
+def test_meter_in_fog(kind, way):
+    """Rationale: t = 0 and the last edge of light subpaths, which ends before the flight does (in coloured
+    grids there is none). A point lamp in fog within a black unit sphere, which is an irradiance meter.
+    Expected: with albedo 1 intensity / radius^2, of light that scatters any number of times (which camera
+    subpaths alone cannot find: e^-1 of it comes straight); with albedo 0 times the transmittance. Tolerance:
+    below 2 %, t-test over 12 renders.
     """
+    medium, expected = METERS[kind]
     film = {"type": "hdrfilm", "width": 1, "height": 1, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    medium = parts.fog(1.0, 1.0)
-    meter = {"type": "irradiancemeter", "film": film | {"component_format": "float32"}, "medium": medium}
+    meter = {"type": "irradiancemeter", "film": film | {"component_format": "float32"}, "medium": medium()}
     scene = {
         "type": "scene",
         "wall": parts.wall(bsdf=parts.matte(0, 0, 0), sensor=meter),
         "lamp": {"type": "point", "position": [0, 0, 0], "intensity": 1.0},
     }
-    check(render(scene, way, 1 << 14), 1.0, 0.02)
+    check(render(scene, way, 1 << 14), expected, 0.02)
 
 
 def chandrasekhar(albedo, mu, n=64):

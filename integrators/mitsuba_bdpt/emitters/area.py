@@ -79,6 +79,10 @@ class AreaEmitters(Group):
         extent = 2 * context.scene.bbox().bounding_sphere().radius
         found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
         self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
+        self._seen_through = any(
+            sphere.inner_radius > 0 and mi.has_flag(e.get_shape().bsdf().flags(), mi.BSDFFlags.Null)
+            for sphere, e in zip(found, emitters, strict=True)
+        )
         self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
         self._spheres = table(found)
         for index, (emitter, _) in enumerate(pairs):
@@ -120,6 +124,10 @@ class AreaEmitters(Group):
             sphere = look_up(self._spheres, index, active)
             inside = dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius)
             by_area |= active & (sphere.inner_radius > 0) & inside
+            if self._seen_through:
+                # From outside the near half is sampled alone, of one that glows inwards the dark one.
+                beyond = dr.dot(ds.p - sphere.center, ds.d) > 0
+                pdf_w = dr.select((sphere.inner_radius > 0) & ~inside & beyond, 0, pdf_w)
         if self._by_shape.any:
             by_area |= self._by_shape.at(index, active)
         inv_area = dr.gather(mi.Float, self._surfaces.inv_area, index, active)

@@ -188,6 +188,17 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
     return throughput * estimate, replace(edge, ratio=ratio)
 
 
+def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum:
+    """Throughput after a flight through homogeneous media of optical ``depth`` that ends before it collides.
+
+    As `_weighted`: in gray media transmittance over density is 1.
+    """
+    if edge.ratio is None:
+        return throughput
+    transmittance = dr.exp(-depth)
+    return throughput * (transmittance / dr.mean(edge.ratio * transmittance))
+
+
 def _passes(media: Media, si, hidden) -> mi.Bool:
     """Mask: an edge goes through this surface, which nobody looks at.
 

@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UnsupportedError
+from ..errors import UnsupportedError, UsageError
 from ..geometry.rounding import ShapeErrors
 from ..host.introspection import all_shapes, children, is_instance, named
 
@@ -28,15 +28,17 @@ _PROBES = 4096
 class Media:
     """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
 
-    ``objects`` the media; ``sensor`` the number of the one that the sensor declares. What there is, for
-    branches while a kernel is recorded: ``grids``: some medium is not homogeneous; ``scatters``: some albedo
-    is not 0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths
-    are ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
-    ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
-    have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
+    ``objects`` the media, ``looks`` what each is like (`_Look`); ``sensor`` the number of the one that the
+    sensor declares. What there is, for branches while a kernel is recorded: ``grids``: some medium is not
+    homogeneous; ``coloured_grids``: the extinction of some grid depends on the wavelength; ``scatters``: some
+    albedo is not 0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical
+    depths are ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction
+    (microflakes); ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``:
+    visibility rays have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
     (``sample_emitters``).
 
-    Raises ``UnsupportedError`` for media whose own calls contradict each other.
+    Raises ``UnsupportedError`` for media whose own calls contradict each other, ``UsageError`` for numbers
+    that are no medium's.
     """
 
     def __init__(self, objects: list[mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
@@ -49,8 +51,10 @@ class Media:
         self._ids = [_registry_id(m) for m in objects]
         self._numbers = _numbers(self._ids)
         looks = [_Look(m) for m in objects]
+        self.looks = looks
         self.scatters = any(look.scatters for look in looks)
         self.gray = all(look.gray for look in looks)
+        self.coloured_grids = any(look.coloured_grid for look in looks)
         self.directional = any(look.directional for look in looks)
         self._spectral_table = self.gray or not mi.is_spectral
         # With an entry for vacuum.
@@ -227,53 +231,121 @@ def _numbers(ids: list[int]) -> mi.UInt32:
 
 
 def _check(medium: mi.Medium):
-    """Raise ``UnsupportedError`` if the extinction of a homogeneous medium is that of a grid."""
-    extinction = children(medium).get("sigma_t")
-    if not medium.is_homogeneous() or extinction is None:
+    """Raise ``UnsupportedError`` if the extinction of a homogeneous medium depends on where it is asked."""
+    if not medium.is_homogeneous():
         return
-    if extinction.class_name() != "ConstVolume":
+    extinction = children(medium).get("sigma_t")
+    if extinction is not None and extinction.class_name() != "ConstVolume":
         raise UnsupportedError(
             f"medium {named(medium)} of type homogeneous has a sigma_t of class {extinction.class_name()}, "
             "of which Mitsuba takes the value at the origin for flights; use a constant, or a medium of type "
             "heterogeneous"
         )
+    mei = probes(medium)
+    there = np.array(mi.Spectrum(medium.get_majorant(mei)))
+    mei.p = mi.Point3f(0)
+    if not np.allclose(there, np.array(mi.Spectrum(medium.get_majorant(mei))), rtol=1e-5):
+        raise UnsupportedError(
+            f"medium {named(medium)} of type homogeneous has microflakes that vary in space, of which "
+            "Mitsuba takes those at the origin for flights; use a constant S, or a medium of type "
+            "heterogeneous"
+        )
+
+
+def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
+    """Random points within a grid, or within all that varies in a homogeneous medium.
+
+    With directions of arrival and wavelengths.
+    """
+    rng = np.random.default_rng(0)
+    mei = dr.zeros(mi.MediumInteraction3f, _PROBES)
+    wi = random_directions(rng, _PROBES)
+    mei.wi, mei.sh_frame = wi, symmetric_frame(wi)
+    if mi.is_spectral:
+        low, high = mi.MI_CIE_MIN, mi.MI_CIE_MAX
+        mei.wavelengths = mi.Spectrum(rng.uniform(low, high, (len(mi.Spectrum(0)), _PROBES)))
+    extinction, volumes = children(medium).get("sigma_t"), _volumes(medium)
+    if not medium.is_homogeneous() and isinstance(extinction, mi.Volume):
+        volumes = [extinction]
+    mei.p = _points_within([volume.bbox() for volume in volumes], rng)
+    return mei
+
+
+def random_directions(rng, count: int) -> mi.Vector3f:
+    """So many unit vectors, evenly spread over the sphere."""
+    z, phi = rng.uniform(-1, 1, count), rng.uniform(0, 2 * np.pi, count)
+    r = np.sqrt(1 - z * z)
+    return mi.Vector3f(r * np.cos(phi), r * np.sin(phi), z)
+
+
+def _volumes(owner) -> list[mi.Volume]:
+    """What varies in space of a medium, its phase function included."""
+    found = []
+    for held in children(owner).values():
+        if isinstance(held, mi.PhaseFunction):
+            found += _volumes(held)
+        elif isinstance(held, mi.Volume) and held.class_name() != "ConstVolume":
+            found.append(held)
+    return found
+
+
+def _points_within(boxes: list[mi.BoundingBox3f], rng) -> mi.Point3f:
+    """Points spread over boxes, in each as many; the origin without any."""
+    if not boxes:
+        return dr.zeros(mi.Point3f, _PROBES)
+    low = np.array([box.min for box in boxes], dtype=float).reshape(len(boxes), 3)
+    high = np.array([box.max for box in boxes], dtype=float).reshape(len(boxes), 3)
+    which = np.arange(_PROBES) % len(boxes)
+    u = rng.random((_PROBES, 3))
+    return mi.Point3f((low[which] + u * (high - low)[which]).T)
+
+
+def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str:
+    """What the extinctions of a medium should not be, in words; empty if nothing.
+
+    Raises ``UsageError`` if it is homogeneous, of which nothing would be left, or too much.
+    """
+    with np.errstate(all="ignore"):
+        albedo = np.where(sigma_t != 0, sigma_s / sigma_t, 0)
+    if medium.is_homogeneous() and (np.isnan(sigma_t).any() or np.isnan(albedo).any()):
+        raise UsageError(f"medium {named(medium)} has a sigma_t, scale or albedo that is NaN; use numbers")
+    for what, value in (("sigma_t", sigma_t), ("albedo", albedo)):
+        least = np.nanmin(value, initial=0)
+        if least >= 0:
+            continue
+        text = f"medium {named(medium)} has {what} down to {least:.4g}"
+        if medium.is_homogeneous():
+            raise UsageError(f"{text}; use 0 or more")
+        return f"{text}: light and camera subpaths do not agree about it; use 0 or more"
+    most = np.nanmax(albedo, initial=0)
+    if most > 1 + 1e-3:  # by more than rounding
+        return (
+            f"medium {named(medium)} has albedo up to {most:.4g}: more light is scattered than arrives, and the "
+            "image may have no limit as max_depth grows; use 1 or less"
+        )
+    return ""
 
 
 class _Look:
     """What a medium is like, from its own answers at random points and directions.
 
     ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`;
-    ``mean`` extinction.
+    ``coloured_grid``; ``mean`` extinction, ``least`` (of the majorant) of all channels; ``strange`` what
+    its numbers should not be, in words, or empty.
+
+    Raises ``UsageError`` if a homogeneous medium has numbers that are no medium's.
     """
 
     def __init__(self, medium: mi.Medium):
-        rng = np.random.default_rng(0)
-        mei = dr.zeros(mi.MediumInteraction3f, _PROBES)
-        z = rng.uniform(-1, 1, _PROBES)
-        phi = rng.uniform(0, 2 * np.pi, _PROBES)
-        r = np.sqrt(1 - z * z)
-        wi = mi.Vector3f(r * np.cos(phi), r * np.sin(phi), z)
-        mei.wi, mei.sh_frame = wi, mi.Frame3f(wi)
-        if mi.is_spectral:
-            low, high = mi.MI_CIE_MIN, mi.MI_CIE_MAX
-            mei.wavelengths = mi.Spectrum(rng.uniform(low, high, (len(mi.Spectrum(0)), _PROBES)))
-        homogeneous = medium.is_homogeneous()
-        extinction = children(medium).get("sigma_t")
-        if not homogeneous and isinstance(extinction, mi.Volume):
-            mei.p = _points_within(extinction.bbox(), rng)
+        mei, homogeneous = probes(medium), medium.is_homogeneous()
         majorant = np.array(mi.Spectrum(medium.get_majorant(mei)) + dr.zeros(mi.Spectrum, _PROBES))
         sigma_s, _, sigma_t = (np.array(mi.Spectrum(s)) for s in medium.get_scattering_coefficients(mei))
-        self.majorant = majorant.max(1)
+        self.strange = _strange(medium, sigma_s, sigma_t)
+        self.majorant, self.least = majorant.max(1), float(majorant.min())
         # A grid's flights are sampled with one number for all channels.
         self.gray = not homogeneous or bool((majorant == majorant[:1]).all())
+        self.coloured_grid = not homogeneous and not (sigma_t == sigma_t[:1]).all()
         same = majorant == majorant[:, :1]
         self.directional = homogeneous and not same.all() and (self.gray or not mi.is_spectral)
         self.scatters = bool((sigma_s > 0).any()) or not homogeneous
         self.mean = float((majorant if homogeneous else sigma_t).mean())
-
-
-def _points_within(box: mi.BoundingBox3f, rng) -> mi.Point3f:
-    """Points spread over a box."""
-    low, high = np.array(box.min), np.array(box.max)
-    u = rng.random((3, _PROBES))
-    return mi.Point3f(low[:, None] + u * (high - low)[:, None])

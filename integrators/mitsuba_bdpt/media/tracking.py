@@ -38,6 +38,12 @@ def exponential(u: mi.Float) -> mi.Float:
     return dr.select(u > 0, -dr.log(1 - u), 2.0**-25)
 
 
+def _tracks(majorant, throughput, inside):
+    """Where a majorant is tracked, and ``throughput``, NaN where that is not finite, to be counted."""
+    finite = dr.isfinite(majorant)
+    return inside & finite & (majorant > 0), dr.select(inside & ~finite, dr.nan, throughput)
+
+
 def _within(media: Media, number, ray, end, active):
     """Where ``ray`` is within the grid's box, up to ``end``: from, to, and whether at all."""
 
@@ -57,7 +63,7 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
     t, met = mi.Float(low), mi.Float(dr.inf)
     rest, throughput, word = mi.Float(rest), mi.Spectrum(throughput), mi.UInt32(word)
     collisions = mi.UInt32(0)
-    going = inside & (majorant > 0)
+    going, throughput = _tracks(majorant, throughput, inside)
     while dr.hint(
         going, label="delta tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
     ):
@@ -92,7 +98,7 @@ def ratio(media: Media, number, ray, end, word, active):
     majorant = media.majorant(number, ray, active)
     t, transmittance, word = mi.Float(low), mi.Spectrum(1), mi.UInt32(word)
     collisions = mi.UInt32(0)
-    going = inside & (majorant > 0)
+    going, transmittance = _tracks(majorant, transmittance, inside)
     while dr.hint(
         going, label="ratio tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
     ):

@@ -61,6 +61,16 @@ def between(
     return _through_surfaces(space, ray, medium, active, own, word, hidden)
 
 
+def depth_along(space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool):
+    """Optical depth of T~ along ``ray``, which starts in ``medium``, up to its end or what blocks it.
+
+    The end may lie on a surface, which rounding puts before it or behind it.
+    """
+    if not space.media.null_lobes:
+        return _along(space.media, medium, ray, ray.maxt, mi.UInt32(0), active)[1]
+    return _through_surfaces(space, ray, medium, active, None, mi.UInt32(0), False).depth
+
+
 def _along(media: Media, medium, ray, length, word, active):
     """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word, collisions."""
     sigma = media.extinction(medium, ray.d, ray, active)

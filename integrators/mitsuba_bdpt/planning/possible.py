@@ -34,7 +34,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     inner = possible("inner", 3, emitters.traced, _UNTRACED)
     why = _why_not_endpoints(emitters, camera, settings)
     endpoints = skip("(1,1)", "impossible", why) if why else True
-    why = _why_not_arrival(emitters, camera, settings)
+    why = _why_not_arrival(prepared, settings)
     arrival = skip("t=0", "impossible", why) if why else True
     for name, why in emitters.left_out:
         skip(name, "impossible", why)
@@ -45,7 +45,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         skip("t=0, t=1, (1,1), inner", "by hand", "light_paths=0")
     if inner and connections == "none":
         inner = skip("inner", "by hand", "connections=none")
-    if light_paths and settings.stored_vertices < min(settings.max_depth, DEFAULT_STORED):
+    if light_paths and 0 < settings.stored_vertices < min(settings.max_depth, DEFAULT_STORED):
         skip(
             f"t=0, t=1 and inner for paths longer than {settings.stored_vertices} edges",
             "by hand",
@@ -121,14 +121,18 @@ def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -
     return _why_no_light(emitters, settings)
 
 
-def _why_not_arrival(emitters: Emitters, camera: Sensor, settings: Settings) -> str:
+def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     """Why t=0 is impossible; empty if it is not."""
+    emitters, camera = prepared.emitters, prepared.camera
     if not camera.area:
         return camera.no_area
     if settings.hide_emitters and emitters.on_shapes:
         return "hide_emitters: camera rays pass through emitting shapes, which block light subpaths"
     if emitters.count and not emitters.traced:
         return _UNTRACED
+    media = None if prepared.space is None else prepared.space.media
+    if media is not None and (media.coloured_grids or (media.grids and not media.gray)):
+        return "what a flight through a grid carries of each colour is known at its end, not at the sensor"
     return _why_no_light(emitters, settings)
 
 

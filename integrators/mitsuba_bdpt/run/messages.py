@@ -63,6 +63,9 @@ def warn_of_media(prepared, sensor):
     if media is None:
         return
     scene = prepared.scene
+    for look in prepared.space.media.looks:
+        if look.strange:
+            warn_once(scene, sensor, f"bdpt: {look.strange}")
     if media.contradiction:
         warn_once(
             scene,

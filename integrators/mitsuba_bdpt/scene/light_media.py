@@ -11,40 +11,49 @@ import mitsuba as mi
 import numpy as np
 
 from ..emitters.emitters import Emitters
-from ..host.introspection import named
+from ..host.introspection import is_instance, named
 from ..media import boundaries
 from ..media.media import Space
 from ..transport.inputs import Shared
+from ..transport.phase import asymmetry
 
-# Rays by which an emitter, or a sensor, is asked for its medium.
-_PROBES = 64
+# Rays by which a sensor is asked for its medium; an emitter by so many, fewer where there are many emitters.
+# A part of an emitter that is a thousandth of it and lies in another medium is missed by one in sixty.
+_PROBES, _OF_EMITTER, _OF_EMITTERS = 64, 4096, 1 << 20
 
 # Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding;
-# edges).
-_LINES = 1024
-_TOLERATED = 0.01
+# edges): lines through the scene, and so many through each shape that bounds a medium.
+_LINES, _TOLERATED = 1024, 0.01
+_OF_SHAPE, _TOLERATED_OF_SHAPE, _MOST_SHAPES = 32, 0.05, 1024
+
+# Relative difference of sigma_t rho and its reverse, on average, that rounding leaves.
+_SYMMETRIC = 1e-3
 
 
 class LightMedia:
     """The medium of every emitter; made anew for each render.
 
-    ``outside`` is the number of the medium that surrounds the scene: the sensor's, unless it is bounded;
+    ``outside`` is the number of the medium that surrounds the scene, see `_outside`;
     ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do;
     ``hides_infinity``: light from infinity does not arrive.
     """
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor):
         self._space, self._emitters = space, emitters
-        # The sensor's medium has no end if some ray from it meets no boundary.
         number, found = _around(space, sensor)
-        self.outside = 0 if found.all() else space.media.sensor
-        self.contradiction = _contradiction_of_sensor(
-            space, sensor, number[found]
-        ) or _contradiction_of_shapes(space, self.outside)
+        self.outside = _outside(space, found)
         self._outside = dr.opaque(mi.UInt32, self.outside)
+        self.contradiction = (
+            _contradiction_of_shapes(space, self.outside)
+            or _contradiction_of_sensor(space, sensor, number[found])
+            or _contradiction_of_phases(space)
+            or (_contradiction_at_infinity(space, self.outside) if emitters.at_infinity else "")
+        )
         # Nothing arrives from infinity through a homogeneous medium without end.
         endless = space.media.objects[self.outside - 1] if self.outside else None
-        self.hides_infinity = endless is not None and endless.is_homogeneous()
+        self.hides_infinity = (
+            endless is not None and endless.is_homogeneous() and space.media.looks[self.outside - 1].least > 0
+        )
         front, back = _declared(space, emitters)
         probed, mixed = (
             self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
@@ -78,7 +87,8 @@ class LightMedia:
         """By emitter: the medium that its rays start in, and whether they do not all start in the same."""
         count = self._emitters.count
         rng = np.random.default_rng(0)
-        n = _PROBES * count
+        each = min(max(_OF_EMITTERS // max(count, 1), _PROBES), _OF_EMITTER)
+        n = each * count
         u = rng.random((3, n))
         u_point = mi.Point2f((np.arange(n) + rng.random(n)) / n, u[0])
         zeros = dr.zeros(mi.Spectrum if mi.is_spectral else mi.Color0f, n)
@@ -88,11 +98,14 @@ class LightMedia:
         e = self._emitters.sample_emission(u_point, mi.Point2f(u[1], u[2]), shared, mi.Bool(True))
         number = np.array(self._near_side(e, mi.Bool(True)) + dr.zeros(mi.UInt32, n))
         index = np.array(e.index + dr.zeros(mi.UInt32, n))
+        order = np.argsort(index, kind="stable")
+        parts = np.split(number[order], np.searchsorted(index[order], np.arange(1, count)))
         probed, mixed = [], []
-        for emitter in range(count):
-            of_this = number[index == emitter]
+        for emitter, of_this in zip(self._emitters.scene.emitters(), parts, strict=True):
             probed.append(int(of_this[0]) if len(of_this) else 0)
-            mixed.append(len(set(of_this)) != 1)
+            # One that is seldom chosen is not known well enough.
+            unknown = len(of_this) < _PROBES // 2 and emitter.sampling_weight() > 0
+            mixed.append(unknown or bool((of_this != probed[-1]).any()))
         return probed, mixed
 
 
@@ -107,15 +120,32 @@ def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
     return front, back
 
 
+def _outside(space: Space, found: np.ndarray) -> int:
+    """The number of the medium that surrounds the scene; ``found`` see `_around`.
+
+    The sensor's if some of its rays meet no boundary, else what boundaries say that are met from outside.
+    """
+    if not found.all():
+        return space.media.sensor
+    rays, _ = _lines(space, space.scene.bbox(), 0)
+    number, met = (np.array(x) for x in boundaries.near_side(space, rays, mi.Bool(True)))
+    return int(np.bincount(number[met]).argmax()) if met.any() else 0
+
+
 def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the media before the first boundaries around the sensor, and whether there are any."""
-    u = np.random.default_rng(0).random((2, _PROBES))
-    d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
-    origin = sensor.world_transform() @ mi.Point3f(0)
-    number, found = boundaries.near_side(
-        space, mi.Ray3f(origin + dr.zeros(mi.Point3f, _PROBES), d), mi.Bool(True)
-    )
+    u = np.random.default_rng(0).random((5, _PROBES))
+    film, aperture = mi.Point2f(u[2], u[3]), mi.Point2f(u[0], u[1])
+    own, _ = sensor.sample_ray_differential(sensor.shutter_open(), mi.Float(u[4]), film, aperture)
+    at_one_point = sensor.class_name() in _AT_ONE_POINT
+    d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1])) if at_one_point else own.d
+    rays = mi.Ray3f(own.o + dr.zeros(mi.Point3f, _PROBES), d)
+    number, found = boundaries.near_side(space, rays, mi.Bool(True))
     return np.array(number), np.array(found)
+
+
+# Sensors whose rays start near to one point, around which everything is looked at.
+_AT_ONE_POINT = frozenset("PerspectiveCamera ThinLensCamera RadianceMeter".split())
 
 
 def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: np.ndarray) -> str:
@@ -123,32 +153,93 @@ def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: np.ndarray
     declared = space.media.sensor
     if not len(around) or (around != declared).mean() <= _TOLERATED:
         return ""
-    says = "no medium"
-    if declared:
-        says = f"the medium {named(space.media.objects[declared - 1])}"
-    return f"sensor {named(sensor)} declares {says}, but the boundaries around it say otherwise"
+    says = _called(space, declared)
+    there = _called(space, int(np.bincount(around[around != declared]).argmax()))
+    return (
+        f"sensor {named(sensor)} declares {says}, but the boundaries around it say that it is in {there}: "
+        "let it refer to that (name medium), or mend the media of the shapes around it"
+    )
+
+
+def _called(space: Space, number: int) -> str:
+    return f"the medium {named(space.media.objects[number - 1])}" if number else "no medium"
 
 
 def _contradiction_of_shapes(space: Space, outside: int) -> str:
     """Why boundaries do not agree on the medium between them; empty if they do."""
     if not space.scene.shapes():
         return ""
-    crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
+    crossings, wrong = boundaries.disagreements(space, *_lines(space, space.scene.bbox(), outside))
     crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
+    remedy = "give each the interior and exterior medium that is there, and leave a gap where faces coincide"
     if wrong > _TOLERATED * crossings:
         return (
             f"the shapes disagree about the medium between them at {100 * wrong / crossings:.0f} % of the "
-            "boundaries that random lines cross: give each the interior and exterior medium that is there"
+            f"boundaries that random lines cross: {remedy}"
+        )
+    bounds = [s for s in space.scene.shapes() if s.is_medium_transition() or is_instance(s)][:_MOST_SHAPES]
+    if not bounds:
+        return ""
+    crossings, wrong = boundaries.disagreements(space, *_lines_through(space, bounds, outside))
+    crossings, wrong = (np.array(x).reshape(len(bounds), _OF_SHAPE).sum(1) for x in (crossings, wrong))
+    bad = np.flatnonzero(wrong > np.maximum(_TOLERATED_OF_SHAPE * crossings, 2))
+    if not len(bad):
+        return ""
+    return (
+        f"shape {named(bounds[bad[0]])} and those around it disagree about the medium between them: {remedy}"
+    )
+
+
+def _contradiction_of_phases(space: Space) -> str:
+    """Why light does not scatter alike in both directions; empty if it does."""
+    for medium in space.media.objects:
+        if asymmetry(medium) > _SYMMETRIC:
+            return (
+                f"the phase function of medium {named(medium)} ({medium.phase_function().class_name()}) "
+                "times the extinction along the direction of arrival is not symmetric"
+            )
+    return ""
+
+
+def _contradiction_at_infinity(space: Space, outside: int) -> str:
+    """Why light from infinity is not that of the camera's side through the medium ``outside``."""
+    if not outside:
+        return ""
+    medium, look = space.media.objects[outside - 1], space.media.looks[outside - 1]
+    if not medium.is_homogeneous():
+        return (
+            f"the grid of medium {named(medium)} has no boundary, so that light from infinity starts within "
+            "it: put a shape with a null BSDF around it"
+        )
+    if look.least == 0 and look.majorant.max() > 0:
+        return (
+            f"medium {named(medium)} has no end and lets some wavelengths of light from infinity through, "
+            "but not others: put a shape with a null BSDF around it"
         )
     return ""
 
 
-def _lines(space: Space, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
-    """Random lines through the scene, from outside, and the medium that they start in."""
-    box = space.scene.bbox()
-    low, high = np.array(box.min, dtype=np.float64), np.array(box.max, dtype=np.float64)
-    u = np.random.default_rng(1).random((5, _LINES))
+def _lines(space: Space, box: mi.BoundingBox3f, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
+    """Random lines through a box, from outside of the scene, and the medium that they start in."""
+    low, high = (np.array(x, dtype=np.float64)[:, None] for x in (box.min, box.max))
+    return _through(space, low, high, _LINES, 1), dr.opaque(mi.UInt32, outside)
+
+
+def _lines_through(space: Space, shapes: list[mi.Shape], outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
+    """As `_lines`, `_OF_SHAPE` through the box of each shape, one shape after the other."""
+    boxes = [shape.bbox() for shape in shapes]
+    low, high = (
+        np.repeat(np.array([np.array(x, dtype=np.float64).ravel() for x in corner]), _OF_SHAPE, axis=0).T
+        for corner in ([box.min for box in boxes], [box.max for box in boxes])
+    )
+    return _through(space, low, high, _OF_SHAPE * len(shapes), 2), dr.opaque(mi.UInt32, outside)
+
+
+def _through(space: Space, low: np.ndarray, high: np.ndarray, count: int, seed: int) -> mi.Ray3f:
+    """So many random lines through random points between ``low`` and ``high``, from outside of the scene."""
+    scene = space.scene.bbox()
+    diagonal = np.array(scene.max, dtype=np.float64) - np.array(scene.min, dtype=np.float64)
+    u = np.random.default_rng(seed).random((5, count))
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
-    through = low[:, None] + u[2:] * (high - low)[:, None]
-    away = float(np.linalg.norm(high - low)) * 1.1
-    return mi.Ray3f(mi.Point3f(through) - d * away, d), dr.opaque(mi.UInt32, outside)
+    through = low + u[2:] * (high - low)
+    return mi.Ray3f(mi.Point3f(through) - d * (float(np.linalg.norm(diagonal)) * 1.1), d)

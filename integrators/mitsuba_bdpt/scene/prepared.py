@@ -41,9 +41,10 @@ class PreparedScene:
         self.delta = any(b.flags() & delta for b in found)
 
     def stored_vertices(self, settings: Settings) -> int:
-        """The longest path that uses all strategies: with media, whose subpaths are long, another default."""
-        given = settings.stored_vertices
-        return MAX_STORED if self.space is not None and given == DEFAULT_STORED else given
+        """The longest path in edges that uses all strategies: as given, else by whether there are media."""
+        if settings.stored_vertices > 0:
+            return settings.stored_vertices
+        return DEFAULT_STORED if self.space is None else MAX_STORED
 
 
 def _prepare_bitmaps(found):

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream
 from . import bsdf, mis, scattering
-from .contribution import Contribution, drop_non_finite, roulette, size_of, worth_a_ray
+from .contribution import Contribution, drop_non_finite, foreseen, roulette, size_of, worth_a_ray
 from .counters import Counters, counted_in_media, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
@@ -169,7 +169,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
-        of_this = c.weighted() if kept is None else c.weighted() * _guess(kernel, z, y)
+        of_this = foreseen(kernel, c) if kept is None else foreseen(kernel, c) * _guess(kernel, z, y)
         size = size_of(of_this)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).

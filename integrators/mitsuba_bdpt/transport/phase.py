@@ -4,16 +4,18 @@ A walk's throughput has the albedo of a volume vertex when it arrives there; wha
 the phase function rho, whose cosine is 1. ``wi`` is the direction that the subpath comes from. Phase
 functions are symmetric; that of microflakes is so together with the extinction along ``wi``, with whose
 density the subpath made the vertex: rho is asked with each subpath's own ``wi``, and no adjoint factor is
-needed.
+needed. Media in which even that product is not symmetric (`asymmetry`; Mitsuba's ``blendphase`` of
+microflakes) get no light subpaths.
 """
 
 from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..host.introspection import children
-from ..media.media import Media, interaction, symmetric_frame
+from ..media.media import Media, interaction, probes, random_directions, symmetric_frame
 from .bsdf import Evaluation, Step, Target
 
 # Plugins whose density of the reverse is the same number.
@@ -22,18 +24,39 @@ _SYMMETRIC = frozenset(
 )
 
 
-def _is_symmetric(phase: mi.PhaseFunction) -> bool:
+def is_symmetric(phase: mi.PhaseFunction) -> bool:
+    """Whether its plugin is known to have the same density in reverse."""
     if phase.class_name() == "BlendPhaseFunction":
         nested = [v for v in children(phase).values() if isinstance(v, mi.PhaseFunction)]
-        return all(map(_is_symmetric, nested))
+        return bool(nested) and all(map(is_symmetric, nested))
     return phase.class_name() in _SYMMETRIC
+
+
+def asymmetry(medium: mi.Medium) -> float:
+    """By how much sigma_t(w) rho(w -> w') and sigma_t(w') rho(w' -> w) differ: at random points, on average.
+
+    Relative to their mean; 0 of plugins that are known (`is_symmetric`).
+    """
+    phase = medium.phase_function()
+    if is_symmetric(phase):
+        return 0.0
+    there = probes(medium)
+    back, count = mi.MediumInteraction3f(there), dr.width(there.wi)
+    back.wi = random_directions(np.random.default_rng(1), count)
+    back.sh_frame = symmetric_frame(back.wi)
+    found = []
+    for mei, wo in ((there, back.wi), (back, there.wi)):
+        value, _ = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, wo, mi.Bool(True))
+        _, _, sigma_t = medium.get_scattering_coefficients(mei, mi.Bool(True))
+        found.append(np.array(mi.Spectrum(sigma_t) * mi.Spectrum(value) + dr.zeros(mi.Spectrum, count)))
+    return float(np.abs(found[0] - found[1]).mean() / max(found[0].mean(), np.finfo(float).tiny))
 
 
 def _evaluated(medium: mi.Medium, mei, wo, active):
     """rho from ``mei.wi`` to ``wo`` (world), and the densities of ``wo`` and of the reverse."""
     phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
     value, pdf = phase.eval_pdf(ctx, mei, wo, active)
-    if _is_symmetric(phase):
+    if is_symmetric(phase):
         return mi.Spectrum(value), pdf, mi.Float(pdf)
     back = mi.MediumInteraction3f(mei)
     back.wi, back.sh_frame = mi.Vector3f(wo), symmetric_frame(wo)

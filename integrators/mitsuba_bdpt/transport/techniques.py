@@ -15,12 +15,12 @@ import mitsuba as mi
 
 from ..emitters.records import Direct, Emission
 from ..geometry import rays
-from ..media import transmittance
+from ..media import flight, transmittance
 from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraJoin, SensorHit
 from . import bsdf, mis
-from .contribution import Contribution, roulette, worth_a_ray
+from .contribution import Contribution, foreseen, roulette, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
 from .visibility import Sight, seen
@@ -198,12 +198,16 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
-    active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
+    active, survival, rouletted = roulette(kernel, foreseen(kernel, c), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
     sight = Sight(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides)
     return seen(kernel, c, sight.numbered(kernel, stream, y.event))
+
+
+# Of distances, relative.
+_ROUNDING = 1e-4
 
 
 def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
@@ -216,13 +220,15 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     directly = walk.edges == 1
     z = kernel.camera.hit(_reaching(walk, y), y, emission.infinite & directly)
     active = z.active & (walk.edges <= kernel.last_arrival)
-    tr = None
+    throughput, tr = walk.throughput, None
     if kernel.space is not None:
-        begun, tr = _edge_to_sensor(kernel, walk, y, z, active)
-        active &= begun
+        reached, depth = _edge_to_sensor(kernel, walk, y, z, active)
+        active &= reached
+        throughput = flight.without_collision(walk.edge, throughput, depth)
+        tr = of_depth(walk.edge.depth + depth)
     if kernel.plan.hide_emitters:
         active &= walk.seen
-    value = walk.throughput * (z.importance * dr.rcp(kernel.count_light))
+    value = throughput * (z.importance * dr.rcp(kernel.count_light))
     active &= ~bsdf.is_zero(value)
 
     # (1,1) makes y_0 by emission, not by next-event estimation from z_0, and cannot make that of a beam.
@@ -259,12 +265,16 @@ class _End:
 
 
 def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active):
-    """Whether the sensor lies on the part of the edge that ``walk`` follows now, and T~ of the edge to it."""
-    begun = dr.norm(walk.o - walk.previous)
-    length = dr.sqrt(z.dist2) - z.near - begun
+    """Whether the sensor lies on the part of the edge that ``walk`` follows now, and its optical depth.
+
+    That is between ``walk.o`` and ``y`` (rounding aside, which may be the sensor's own surface).
+    """
+    distance = dr.sqrt(z.dist2) - z.near
+    length = distance - dr.norm(walk.o - walk.previous)
     ray = mi.Ray3f(walk.o, walk.d, dr.maximum(length, 0), y.si.time, y.si.wavelengths)
-    crossing = transmittance.between(kernel.space, ray, walk.edge.medium, active, None, mi.UInt32(0))
-    return length > 0, of_depth(walk.edge.depth + crossing.depth)
+    depth = transmittance.depth_along(kernel.space, ray, walk.edge.medium, active)
+    before_end = ~y.hit | (distance <= dr.norm(y.si.p - walk.previous) * (1 + _ROUNDING))
+    return (length > 0) & before_end, depth
 
 
 def _hidden(kernel: Kernel, ray: mi.Ray3f, active):
