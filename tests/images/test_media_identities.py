@@ -300,7 +300,7 @@ def hole_in_fog():
     "scene, why",
     [
         (inside_without_saying, "declares no medium"),
-        (hole_in_fog, "boundaries around it say that it is in no medium"),
+        (hole_in_fog, "disagree about the medium between them"),
         (hole_in_cloud, "disagree"),
     ],
 )

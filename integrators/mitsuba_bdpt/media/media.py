@@ -244,7 +244,7 @@ def _check(medium: mi.Medium):
     mei = probes(medium)
     there = np.array(mi.Spectrum(medium.get_majorant(mei)))
     mei.p = mi.Point3f(0)
-    if not np.allclose(there, np.array(mi.Spectrum(medium.get_majorant(mei))), rtol=1e-5):
+    if not np.allclose(there, np.array(mi.Spectrum(medium.get_majorant(mei))), rtol=1e-5, equal_nan=True):
         raise UnsupportedError(
             f"medium {named(medium)} of type homogeneous has microflakes that vary in space, of which "
             "Mitsuba takes those at the origin for flights; use a constant S, or a medium of type "
@@ -320,8 +320,8 @@ def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str
     most = np.nanmax(albedo, initial=0)
     if most > 1 + 1e-3:  # by more than rounding
         return (
-            f"medium {named(medium)} has albedo up to {most:.4g}: more light is scattered than arrives, and the "
-            "image may have no limit as max_depth grows; use 1 or less"
+            f"medium {named(medium)} has albedo up to {most:.4g}: more light is scattered than arrives, and "
+            "the image may have no limit as max_depth grows; use 1 or less"
         )
     return ""
 
