@@ -49,7 +49,10 @@ WAYS = {
 
 FOCUS_TIMES = 16  # of the samples, in windows
 
-SAMPLER = "multijitter"  # of `path`: half the error of `independent` at equal time; `bdpt` has its own points
+# Samplers of `path`: half the error of `independent` at equal time (`bdpt` has its own points); of `volpath`,
+# whose images have pixels that are NaN in grids with `multijitter` (Mitsuba 3.9.1).
+SAMPLER = "multijitter"
+OF_MEDIA = "independent"
 
 FIRST_SEED = 1_000_000  # far from the seeds of measurements
 WINDOW_PASSES = 4  # in one render of a window
@@ -289,13 +292,14 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     by = job.by or recipe.by
     parameters = _way(job.scene, by) | {"max_depth": job.depth}
     integrator = mi.load_dict(parameters)
-    key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, SAMPLER])
-    scene = job.scene.load(job.resolution, SAMPLER)
+    sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
+    key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
+    scene = job.scene.load(job.resolution, sampler)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
     aim = Aim(job, scene, by)
-    windows = [Window(job, share) for share in recipe.windows]
+    windows = [Window(job, share, sampler) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
-    if stored is not None and _same(stored, integrator=parameters, sampler=SAMPLER):
+    if stored is not None and _same(stored, integrator=parameters, sampler=sampler):
         halves.go_on_from(stored, [window.slices for window in windows])
     started = time.perf_counter()
     reached = halves.rounds > 0 and aim.reached(halves.reference({}))
@@ -313,7 +317,7 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     provenance = _provenance(
         job,
         integrator=parameters,
-        sampler=SAMPLER,
+        sampler=sampler,
         spp=round(2 * float(halves.counts.min()) * PASS_SPP),
         spp_in_windows=round(2 * float(halves.counts.max()) * PASS_SPP),
         first_seed=FIRST_SEED,
@@ -336,8 +340,8 @@ class Window:
     The ``scene`` with that crop window, and the ``slices`` of rows and columns.
     """
 
-    def __init__(self, job: Job, share):
-        self.scene = job.scene.load(job.resolution, SAMPLER)
+    def __init__(self, job: Job, share, sampler: str):
+        self.scene = job.scene.load(job.resolution, sampler)
         if not self.scene.sensors()[0].film().rfilter().is_box_filter():
             raise CommandError(f"scene={job.scene.name!r}: windows need rfilter 'box', or borders differ")
         size = np.array(self.scene.sensors()[0].film().size())
