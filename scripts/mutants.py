@@ -527,8 +527,8 @@ MUTANTS = (
     Mutant(
         "media: sigma_t does not cancel",
         "media/flight.py",
-        "gray = sigma_s / dr.mean(sigma_t)",
-        "gray = sigma_s",
+        "albedo = sigma_s / dr.mean(sigma_t)",
+        "albedo = sigma_s",
         (
             "tests/images/test_media_known_answers.py::test_slab_under_the_sun[gray-camera]",
             "tests/images/test_media_known_answers.py::test_white_furnace[gray-camera]",

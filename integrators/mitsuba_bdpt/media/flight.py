@@ -175,15 +175,15 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
         return dr.select(collided, 0, throughput), edge
     mei = interaction(ray(dr.select(collided, t, 0)), ray.d, ray)
     sigma_s, sigma_t = media.ask(edge.medium, coefficients, mei, collided)
-    gray = sigma_s / dr.mean(sigma_t)
+    albedo = sigma_s / dr.mean(sigma_t)
     if media.gray:
-        return dr.select(collided, throughput * gray, throughput), edge
+        return dr.select(collided, throughput * albedo, throughput), edge
     homogeneous = media.is_homogeneous(edge.medium) & active
     transmittance = dr.exp(-depth)
     densities = dr.select(collided, sigma_t, 1) * transmittance
     mean = dr.mean(edge.ratio * densities)
     estimate = dr.select(collided, sigma_s, 1) * transmittance / mean
-    estimate = dr.select(homogeneous, estimate, dr.select(collided, gray, 1))
+    estimate = dr.select(homogeneous, estimate, dr.select(collided, albedo, 1))
     ratio = dr.select(homogeneous, edge.ratio * densities / mean, edge.ratio)
     return throughput * estimate, replace(edge, ratio=ratio)
 

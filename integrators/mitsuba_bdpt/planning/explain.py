@@ -68,7 +68,10 @@ def explain(
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
-    lines += [f"lost: {words(lost)}" for lost in unreachable_paths(prepared, p, settings)]
+    missing = unreachable_paths(prepared, p, settings)
+    lines += [f"lost: {words(lost)}" for lost in missing]
+    if missing and prepared.space is not None:
+        lines.append("lost: how much that is is not estimated in scenes with media")
     if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "

@@ -64,8 +64,9 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
 def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, total, add):
     """Join ``z`` with every stored light vertex, a visibility ray each.
 
-    ``add(contribution, seen, total)`` adds a contribution to the running ``total`` and returns it: as it was
-    before its visibility ray, and after (`visibility.seen`). Returns the ``total`` and `Counters`.
+    ``add(contribution, seen, total)`` adds a contribution to the running ``total`` and returns it: as the
+    draw of `connect_one` sees it before its visibility ray, and after (`visibility.seen`). Returns the
+    ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -79,7 +80,7 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
         lost += c.counted.non_finite
         sight = _sight(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
         visible = seen(kernel, c, sight)
-        total = add(c, visible, total)
+        total = add(_as_drawn(kernel, z, y, c), visible, total)
         crossed = crossed + _in_media(visible.counted)
         slot += 1
     counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
@@ -169,7 +170,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
-        of_this = foreseen(kernel, c) if kept is None else foreseen(kernel, c) * _guess(kernel, z, y)
+        of_this = foreseen(kernel, _as_drawn(kernel, z, y, c))
         size = size_of(of_this)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
@@ -192,10 +193,13 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     return drawn
 
 
-def _guess(kernel: Kernel, z: Vertex, y: StoredVertex) -> mi.Float:
-    """The guessed transmittance between ``z`` and ``y``."""
+def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:
+    """The connection ``c`` of ``z`` and ``y`` as it is drawn: in media with a guess of the transmittance."""
+    if kernel.space is None:
+        return c
     between = y.si.p - z.si.p
-    return guessed(kernel, z.medium_towards(kernel, between), dr.norm(between))
+    guess = guessed(kernel, z.medium_towards(kernel, between), dr.norm(between))
+    return replace(c, value=c.value * guess)
 
 
 def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:

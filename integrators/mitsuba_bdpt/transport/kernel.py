@@ -51,6 +51,17 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             roulette of the subpath; the next edge <- a ray
         add the total to the film                                           sink.end
 
+In scenes with media y and z may lie in one as well; null surfaces are passed and are no edges::
+
+    the medium of the first edge <- boundaries around the emitter; the      scene.light_media
+        one that the sensor declares
+    an edge ends where a flight collides, or at a surface that is not       walk._landing, media.flight
+        null; throughput <- times the albedo
+    d_vcm <- over T~ of the edge, on arrival                                walk._vertex, mis.to_area
+    BSDF -> phase function, cosine -> 1, in a volume                        scattering, phase
+    a shadow ray -> transmittance T of the value and T~ of the weight       visibility, media.transmittance
+    keep y -> of a long subpath 64 vertices that stand for all              stored_vertices.Thinning
+
 Each strategy i of a path adds w_i f / (n_i p_i). n_i is its number of samples per camera sample: the light
 subpaths per camera subpath for t <= 1, else 1. The weights w_i are those of a `mis.Heuristic`; of the balance
 heuristic (eq. 37)
@@ -211,7 +222,8 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_v
             stored_vertices.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    if kernel.space is not None:  # the other number of this purpose, at vertex 0, is another one
+    if kernel.space is not None:
+        # No purpose is left to name this number (`points`); that of vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=stored_vertices.Thinning.begin(u))
     walk = _light_walk(kernel, e, stream, shared)

@@ -66,7 +66,7 @@ def _blocked(kernel: Kernel, sight: Sight, active):
 
 
 def guessed(kernel: Kernel, medium: mi.UInt32 | None, distance: mi.Float) -> mi.Float:
-    """A guess of the transmittance over a ``distance`` from a point in ``medium``, for draws and roulette."""
+    """A guess of the transmittance over a ``distance`` from a point in ``medium``, for draws."""
     if kernel.space is None:
         return mi.Float(1)
     return dr.exp(-dr.minimum(kernel.space.media.mean(medium) * distance, _GUESSED_DEPTH))
