@@ -149,8 +149,8 @@ def mixed():
     return {"type": "blendbsdf", "weight": 0.4, "a": {"type": "null"}, "b": parts.matte(0.7, 0.5, 0.3)}
 
 
-# With a point `volpath` would miss the light that `thindielectric` reflects, with a lamp of some area it loses
-# light behind null lobes.
+# With a point `volpath` would miss the light that `thindielectric` reflects, with a lamp of some area it
+# loses light behind null lobes.
 BOUNDARIES = {
     "thindielectric": lambda: parts.room(ball=parts.ball("thindielectric", interior=parts.fog(3, 0.7))),
     "blendbsdf": lambda: parts.room(
