@@ -109,6 +109,12 @@ SCENES = {
         light=parts.point(), ball=parts.ball(interior=parts.fog(4, 0.9) | {"phase": microflakes()})
     ),
 }
+# Where `volpath` is no reference, and why.
+NO_REFERENCE = {
+    "ball": "a lamp of some area behind a null boundary, see above",
+    "lamp in milk": "so is its lamp",
+    "microflakes": "Mitsuba samples another distribution than their density, see the end of this file",
+}
 CHROMATIC = ("chromatic", "chromatic ball", "grid and chromatic")
 SLOW = ("glass", "chromatic ball", "grid and chromatic")
 
@@ -157,7 +163,7 @@ def weighted_sum(found, k):
     return sum(found[k, s, k + 1 - s][0] for s in range(k + 2))
 
 
-@pytest.mark.parametrize("name", named(*list(SCENES)[:11]))
+@pytest.mark.parametrize("name", named(*(name for name in SCENES if name not in NO_REFERENCE)))
 def test_weighted_strategies_add_up_to_volpath(name):
     """Rationale: see the module. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
 
@@ -210,7 +216,9 @@ PAIRS = {
 @pytest.mark.parametrize(
     "name, pair",
     [
+        ("fog", "s=1"),
         ("fog", "t=1"),
+        ("chromatic", "t=1"),
         ("fog", "inner"),
         ("chromatic", "inner"),
         ("rough", "inner"),

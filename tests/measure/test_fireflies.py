@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import media_parts
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -210,3 +211,63 @@ def test_refractions_on_the_light_side(rr_depth):
     assert len(found) == 40
     assert [f.doubt for f in found if f.doubt] == []
     assert any(f.path.s >= 3 and "S" in f.letters for f in found)
+
+
+# -- media ---------------------------------------------------------------------------------------------
+
+
+def test_paths_in_media_are_named():
+    """Rationale: `fireflies` ended in a traceback at the first vertex in a medium. Expected: such a vertex
+    has the letter V and the name "medium"; paths with one are not followed and the row says so. Nor are
+    others in such a scene, here those that come straight from a lamp.
+    """
+    ball = media_parts.ball(interior=media_parts.fog(4, 0.9))
+    for light, expected in ((media_parts.point(), "lies in a medium, where"), (None, "has media, through")):
+        room = media_parts.room(light=light, ball=ball)
+        room["wall"] = media_parts.wall() | {"bsdf": media_parts.matte(0.2, 0.2, 0.2)}
+        found = worst(mi.load_dict(room), 4, 40, 0.02)
+        assert len(found) == 40
+        for firefly in found:
+            inner = [letter for letter in firefly.letters.split() if letter != "¦"][1:-1]
+            assert firefly.names == ", ".join("medium" for _ in inner) and set(inner) == (
+                {"V"} if light else set()
+            )
+            assert firefly.rebuilt is None and expected in firefly.doubt
+        row = fireflies.line("ball", found, sum(f.error for f in found), 40)
+        assert row[6:8] == ["not known", "not known"] and expected in row[8]
+
+
+@pytest.mark.parametrize("boundary", ["null", "mask"])
+def test_replays_in_media(boundary):
+    """Rationale: what passes a surface is no vertex in scenes with media, and albedos change the throughput
+    along edges, which is not roulette. Expected: replays add up to what was rendered, as above; without
+    roulette subpaths live with probability 1, with it some with less and none with more (rounding: 1e-4).
+    """
+    bsdf = {"type": "mask", "opacity": 0.4, "bsdf": media_parts.matte(0.35, 0.35, 0.35)}
+    ball = media_parts.ball("null" if boundary == "null" else bsdf, interior=media_parts.coloured(6.0))
+    scene = mi.load_dict(media_parts.room(light=media_parts.point(), ball=ball))
+    for rr_depth in (100, 1):
+        integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "rr_depth": rr_depth, "skip": "none"})
+        _, outliers = recording.render(scene, integrator, np.full((16, 16, 3), 0.2), 16, 3)
+        splats, samples = ([o for o in outliers if bool(o.s) is splat][:10] for splat in (True, False))
+        survival = []
+        for outlier, paths in zip(splats + samples, recording.replay(splats + samples), strict=True):
+            assert sum(path.value for path in paths) == pytest.approx(outlier.value, rel=1e-4)
+            assert all(len(path.p) == path.s + path.t for path in paths)
+            survival += [path.survival for path in paths]
+        assert max(survival) < 1 + 1e-4
+        assert min(survival) > 1 - 1e-4 if rr_depth == 100 else min(survival) < 0.9
+
+
+def test_what_is_passed_is_no_vertex():
+    """Expected: of visits with the numbers 1, 1, 2, 2, 3 (two surfaces were passed) the last of each is the
+    vertex; what was joined where the first surface was passed has that one.
+    """
+    numbers = [1, 1, 2, 2, 3]
+    visits = [
+        SimpleNamespace(number=np.array([number]), p=np.full((3, 1), i)) for i, number in enumerate(numbers)
+    ]
+    subpath = recording._Subpath(np.zeros((3, 1)), np.zeros(1, dtype=bool), visits)
+    assert subpath.chain(4, 0) == [1, 3, 4] and subpath.chain(3, 0) == [1, 3]
+    assert subpath.chain(2, 0, before=1) == [0] and subpath.chain(1, 0) == subpath.chain(0, 0) == []
+    assert subpath.ends_at(3, 0).tolist() == [3] * 3 and np.isinf(subpath.ends_at(5, 0)).all()

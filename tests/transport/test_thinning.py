@@ -33,7 +33,7 @@ def test_probabilities_are_those_stated():
     assert kept[:, : KEPT // 2].all()
     i = np.arange(KEPT // 2 + 1, COUNT + 1)
     np.testing.assert_allclose(
-        probability[0, KEPT // 2 :], (KEPT / 2) ** 2 / (i * (i - 1)), rtol=2e-2, atol=1e-6
+        probability[0, KEPT // 2 :], (KEPT / 2) ** 2 / (i * (i - 1)), rtol=1e-4, atol=1e-6
     )
 
 

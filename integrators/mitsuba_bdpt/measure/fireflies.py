@@ -8,12 +8,14 @@ kind of path:
 * error: the share of the squared error of all renders that these samples have; largest: how far one is off,
   in values of its pixel; samples: how many of the samples examined (``top`` of each render).
 * path: from the lamp L to the eye E in P. Heckbert's letters, S for delta events, G for rough ones, D for
-  diffuse ones, and the materials on the way; `¦` is where the strategy joins light and camera vertices.
+  diffuse ones, V for those in a medium, and the materials on the way; `¦` is where the strategy joins light
+  and camera vertices.
 * other strategies: the densest other one, with its density over that of the strategy that made the path, by
   one sample of each; "none" if no other can make it.
 * `path`: what Mitsuba's `path` adds with the same path (s = 0 and s = 1, balance heuristic) over what was
   added. Its roulette is counted where s = 0 or 1 made the path; it is the same there.
-* found anew: how many of these paths were found again from their vertices with the same estimate and weight.
+* found anew: how many of these paths were found again from their vertices with the same estimate and weight;
+  in scenes with media none is.
 """
 
 from __future__ import annotations
@@ -73,7 +75,9 @@ class Names:
         """Heckbert's letters from the lamp to the eye, `¦` where the strategy joins."""
         found = ["E"] + ["S" if d else "?" for d in path.delta[1:-1]] + ["L"]
         for i, letter in enumerate(found):
-            if letter == "?":
+            if letter == "?" and not path.shapes[i]:
+                found[i] = "V"
+            elif letter == "?":
                 flags = self._shapes[path.shapes[i]].bsdf().flags()
                 found[i] = "D" if mi.has_flag(flags, mi.BSDFFlags.Diffuse) else "G"
         if path.s and path.t:
@@ -81,9 +85,9 @@ class Names:
         return " ".join(found[::-1])
 
     def vertices(self, path) -> str:
-        """The materials between lamp and eye, by class where they have no name."""
-        bsdfs = (self._shapes[number].bsdf() for number in path.shapes[-2:0:-1])
-        return ", ".join(bsdf.id() or bsdf.class_name() for bsdf in bsdfs)
+        """The materials between lamp and eye, by class where they have no name; "medium" in one."""
+        bsdfs = (self._shapes[number].bsdf() if number else None for number in path.shapes[-2:0:-1])
+        return ", ".join("medium" if b is None else b.id() or b.class_name() for b in bsdfs)
 
 
 def fireflies(scene, integrator, target, spp: int, seed: int, level: float, top: int):

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..media.media import media_of
 from . import endpoints, oracle
 
 # Lobes of a delta BSDF are looked for with these numbers; a direction is the same up to this cosine, a vertex
@@ -97,7 +98,15 @@ class _Source:
 
 
 def rebuild(scene, emitters, path) -> Rebuilt:
-    """The `recording.Path` found anew; ``emitters`` of the render know their densities. Raises `Lost`."""
+    """The `recording.Path` found anew; ``emitters`` of the render know their densities. Raises `Lost`.
+
+    In scenes with media none is found.
+    """
+    for i in range(1, len(path.p) - 1):
+        if not path.shapes[i]:
+            raise Lost(f"vertex {i} lies in a medium, where paths are not followed")
+    if media_of(scene, scene.sensors()):
+        raise Lost("the scene has media, through which edges are not followed")
     events, end = _follow(scene, path)
     hit = int(dr.reinterpret_array(mi.UInt32, end.emitter(scene))[0]) != 0
     source = _hit_source(scene, emitters, path, end) if hit else _directional_source(scene, emitters, path)
@@ -121,8 +130,6 @@ def _follow(scene, path):
     ray = mi.Ray3f(_point(path.p[0]), _vector(_direction(path, 0)))
     events = []
     for i in range(1, k):
-        if not path.shapes[i]:
-            raise Lost(f"vertex {i} lies in a medium, where paths are not followed")
         si = scene.ray_intersect(ray)
         dr.eval(si)
         _check_place(si, path, i)

@@ -199,6 +199,8 @@ class Path:
 class _Visit:
     """What a walk left at a vertex, arrays of the lanes.
 
+    ``number`` of the vertex in its subpath, 1 after the endpoint: in scenes with media what passes a surface
+    keeps it. ``departed``: the throughput with which the edge to it began, which media change on the way.
     ``joined``: position (or direction, where ``infinite``) of the endpoint with which the vertex was joined;
     ``pdf_w`` of the sensor's direction there.
     """
@@ -209,6 +211,8 @@ class _Visit:
     hit: np.ndarray
     throughput: np.ndarray
     weight: np.ndarray
+    number: np.ndarray
+    departed: np.ndarray
     joined: np.ndarray | None = None
     infinite: np.ndarray | None = None
     pdf_w: np.ndarray | None = None
@@ -225,9 +229,23 @@ class _Subpath:
     infinite: np.ndarray
     visits: list = field(default_factory=list)
 
+    def chain(self, count: int, i: int, before: int | None = None) -> list[int]:
+        """Places in ``visits`` of the ``count`` - 1 vertices after the endpoint in lane ``i``, in order.
+
+        The last vertex is the latest of its number ``before`` a place, each other one before the next. Fewer
+        if there are not so many.
+        """
+        found, before = [], len(self.visits) if before is None else before
+        for number in range(count - 1, 0, -1):
+            places = [k for k in range(before) if self.visits[k].number[i] == number]
+            if places:
+                found.append(before := places[-1])
+        return found[::-1]
+
     def ends_at(self, s: int, i: int):
         """Position of the vertex ``s`` - 1 in lane ``i``; infinite if there is none."""
-        return self.visits[s - 2].p[:, i] if 2 <= s <= len(self.visits) + 1 else np.full(3, np.inf)
+        places = self.chain(s, i)
+        return self.visits[places[-1]].p[:, i] if len(places) == s - 1 > 0 else np.full(3, np.inf)
 
 
 @contextlib.contextmanager
@@ -270,22 +288,24 @@ class Recorder(Observer):
     def vertex(self, side, walk, vertex, step):
         """A subpath has reached a vertex."""
         subpath = self.light if side.adjoint else self.camera
-        subpath.visits.append(self._visit(side, vertex, step))
+        subpath.visits.append(self._visit(side, walk, vertex, step))
 
     def drawn(self, end):
         """A connection was drawn."""
         self._drawn = self._numbers(end, 3)
 
     @staticmethod
-    def _survival(subpath, count: int, i: int) -> float:
-        """The probability with which roulette let the first ``count`` vertices of a subpath come about."""
-        visits = subpath.visits[: count - 1] if count else []
+    def _survival(subpath, places: list[int], i: int) -> float:
+        """The probability with which roulette let a subpath come to the last of these ``places``.
+
+        Also where it only passed a surface, roulette is played. What media take on the way is none of it.
+        """
         found = 1.0
-        for a, b in pairwise(visits):
-            found *= (a.throughput[:, i] * a.weight[:, i]).max() / b.throughput[:, i].max()
+        for a, b in pairwise(subpath.visits[: places[-1] + 1] if places else []):
+            found *= (a.throughput[:, i] * a.weight[:, i]).max() / b.departed[:, i].max()
         return found
 
-    def _visit(self, side, vertex, step) -> _Visit:
+    def _visit(self, side, walk, vertex, step) -> _Visit:
         shape = dr.reinterpret_array(mi.UInt32, vertex.si.shape)
         away = mi.Point3f(-vertex.si.wi)  # of rays that have left the scene: their direction, in world space
         delta = mi.Bool(False) if step is None else step.delta
@@ -296,6 +316,8 @@ class Recorder(Observer):
             self._numbers(vertex.hit).astype(bool),
             self._numbers(vertex.throughput, 3),
             self._numbers(1.0 if step is None else step.weight, 3),
+            self._numbers(walk.edges).astype(int),
+            self._numbers(walk.throughput, 3),
         )
         end = vertex.endpoint
         if end is not None and side.adjoint:
@@ -364,6 +386,8 @@ class Recorder(Observer):
     def _note(self, c, value):
         numbers = {name: self._numbers(getattr(c, name)) for name in ("s", "t", "weight", "active")}
         numbers |= {"value": self._numbers(value, 3), "estimate": self._numbers(c.value, 3)}
+        # Of the subpath that is being made, so far.
+        numbers["visits"] = np.full((2, self._count), [[len(self.camera.visits)], [len(self.light.visits)]])
         self.contributions.append(numbers)
 
     def paths(self, i: int) -> list[Path]:
@@ -377,32 +401,36 @@ class Recorder(Observer):
 
     def _path(self, i: int, c) -> Path:
         s, t = int(c["s"]), int(c["t"])
-        towards, pdf_w = self._vertices(self.camera, t, i, joined=s > 0), self.pdf_w[i]
+        camera, light = self.camera.chain(t, i, c["visits"][0]), self.light.chain(s, i, c["visits"][1])
+        towards, pdf_w = self._vertices(self.camera, t, i, camera, joined=s > 0), self.pdf_w[i]
         if s == 0:
-            back, infinite = [], not self.camera.visits[t - 2].hit[i]
+            back, infinite = [], not self.camera.visits[camera[-1]].hit[i]
         elif s == 1 and t > 1:  # next-event estimation has a point of its own
-            last = self.camera.visits[t - 2]
+            last = self.camera.visits[camera[-1]]
             back, infinite = [(last.joined[:, i], 0, False)], bool(last.infinite[i])
         else:
-            back = self._vertices(self.light, s, i, joined=True)[::-1]
+            back = self._vertices(self.light, s, i, light, joined=True)[::-1]
             infinite = bool(self.light.infinite[i])
         if t == 1 and s > 1:  # and so has light tracing
-            last = self.light.visits[s - 2]
+            last = self.light.visits[light[-1]]
             towards, pdf_w = [(last.joined[:, i], 0, False)], last.pdf_w[i]
         p, shapes, delta = zip(*towards, *back, strict=True)
         numbers = (c["value"], c["estimate"], float(c["weight"]))
-        survival = self._survival(self.camera, t, i) * self._survival(self.light, s, i)
+        survival = self._survival(self.camera, camera, i) * self._survival(self.light, light, i)
         return Path(s, t, *numbers, pdf_w, np.array(p), list(shapes), list(delta), infinite, survival)
 
-    def _vertices(self, subpath, count: int, i: int, joined: bool) -> list:
+    @staticmethod
+    def _vertices(subpath, count: int, i: int, places: list[int], joined: bool) -> list:
         """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath.
 
-        No event at the endpoint, and none of delta where it is ``joined``.
+        These are in ``places``. No event at the endpoint, and none of delta where it is ``joined``.
         """
         if not count:
             return []
         found = [(subpath.start[:, i], 0, False)]
-        found += [(v.p[:, i], int(v.shape[i]), bool(v.delta[i])) for v in subpath.visits[: count - 1]]
+        found += [
+            (v.p[:, i], int(v.shape[i]), bool(v.delta[i])) for v in map(subpath.visits.__getitem__, places)
+        ]
         if joined or count > 1:
             found[-1] = (*found[-1][:2], False)
         return found
