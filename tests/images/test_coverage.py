@@ -471,7 +471,8 @@ def test_the_page_names_tests_that_exist():
 
 
 MEDIA_PLUGINS = """homogeneous heterogeneous null mask blendbsdf dielectric thindielectric roughdielectric
-    isotropic hg rayleigh tabphase blendphase sggx perspective thinlens orthographic irradiancemeter batch""".split()
+    isotropic hg rayleigh tabphase blendphase sggx
+    perspective thinlens orthographic irradiancemeter batch""".split()
 
 
 def test_rows_of_media_link_tests_of_their_plugins():
