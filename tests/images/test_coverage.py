@@ -470,6 +470,31 @@ def test_the_page_names_tests_that_exist():
         assert f"\ndef {name}(" in (ROOT / "tests" / file).read_text(), f"{file} has no {name}"
 
 
+MEDIA_PLUGINS = """homogeneous heterogeneous null mask blendbsdf dielectric thindielectric roughdielectric
+    isotropic hg rayleigh tabphase blendphase sggx
+    perspective thinlens orthographic irradiancemeter batch""".split()
+
+
+def test_rows_of_media_link_tests_of_their_plugins():
+    """Rationale: a row named phase functions that its test never rendered. Expected: each of these plugins
+    stands in some row of the section on media, and in quotation marks in a file of tests that the row links,
+    or in the parts of their scenes.
+    """
+    section = PAGE.read_text().partition("\n## Participating media\n")[2].partition("\n## ")[0]
+    parts_of_scenes = "".join(
+        (ROOT / "tests" / "support" / f"{x}.py").read_text() for x in ("media_parts", "views")
+    )
+    seen = set()
+    for row in re.findall(r"^\| .* \|$", section, re.MULTILINE):
+        files = set(re.findall(r"\]\(\.\./\.\./tests/([\w/]+\.py) ", row))
+        texts = parts_of_scenes + "".join((ROOT / "tests" / file).read_text() for file in files)
+        words = set(re.findall(r"\w+", re.sub(r"\]\([^)]*\)", "", row)))
+        named = words.intersection(MEDIA_PLUGINS)
+        assert all(f'"{name}"' in texts for name in named), (row, named)
+        seen |= named
+    assert seen == set(MEDIA_PLUGINS), set(MEDIA_PLUGINS) - seen
+
+
 def test_the_page_says_who_takes_part():
     """Expected: docs/user/coverage.md has a row for every kind of emitter and sensor, with a dash exactly
     where the table of `scene_parts`, which the tests above rely on, says that it has no part.

@@ -1,0 +1,132 @@
+"""Renders of a scene with media that stop, go on, are replayed, edited, and report errors and features."""
+
+import json
+
+import media_parts as parts
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt.planning import budget
+from mitsuba_bdpt.run.snapshot import Snapshot
+
+# Sums of a pass are made by atomic additions, whose order differs from run to run.
+ROUNDING = {"rtol": 2e-4, "atol": 1e-6}
+
+# From here on there is a pilot.
+SPP = max(budget.LEAST_SAMPLES // parts.SIZE**2, 64)
+
+
+def misty():
+    """A foggy room with a cloud and a ball of coloured fog: each kind of medium."""
+    box = parts.box(
+        interior=parts.grid(np.random.default_rng(0).random((4, 4, 4)), parts.LOW, parts.EDGE),
+        exterior={"type": "ref", "id": "around"},
+    )
+    ball = parts.ball(
+        radius=0.2,
+        center=(0.4, -0.4, -0.2),
+        interior=parts.coloured(4.0),
+        exterior={"type": "ref", "id": "around"},
+    )
+    around = {"type": "ref", "id": "around"}
+    return mi.load_dict({"around": parts.fog(id="around"), **parts.foggy(around, box=box, ball=ball)})
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 16} | parameters)
+
+
+def stopped(integrator, target, after, **arguments) -> Snapshot:
+    """The snapshot of a render that is stopped after so many passes, through a file's bytes and back."""
+    reports = []
+
+    def on_pass(report):
+        reports.append(report)
+        if len(reports) == after:
+            integrator.cancel()
+
+    integrator.on_pass = on_pass
+    integrator.render(target, develop=False, **arguments)
+    return Snapshot.from_bytes(reports[-1].snapshot().to_bytes())
+
+
+@pytest.mark.parametrize("parameters", [{"skip": "none"}, {"variance": True, "aovs": "dd:depth"}], ids=str)
+def test_a_resumed_render_is_the_uninterrupted_one(parameters):
+    """Rationale: what a lane carries in media (channels, tracking, thinned vertices) belongs to no
+    snapshot, and must start anew the same. Expected: image, layers and counts, those of media included,
+    of a render that was stopped and went on in a new integrator are those of the render that never
+    stopped, up to the order of sums; and so are those of a render that replays its decisions.
+    """
+    target, whole = misty(), bdpt(**parameters)
+    expected = np.array(whole.render(target, seed=3, spp=SPP))
+    start = stopped(bdpt(**parameters), misty(), 2, seed=3, spp=SPP)
+    assert 0 < start.spp < SPP
+    replay = {"decisions": json.dumps(whole.statistics["decisions"])}
+    for more, begun in (({}, {"start": start}), (replay, {})):
+        again = bdpt(**parameters, **more)
+        image = np.array(again.render(target, seed=3, spp=SPP, **begun))
+        np.testing.assert_allclose(image, expected, **ROUNDING)
+        for name in ("rays", "connections", "passes", "decisions", "media"):
+            assert again.statistics[name] == whole.statistics[name], name
+    assert whole.statistics["rays"]["light"] or not parameters.get("skip")
+    assert bool(whole.statistics["decisions"]) == ("skip" not in parameters)
+
+
+def test_variance_and_target_error():
+    """Expected: the stated variances of pixels are those over 10 seeds, in the mean over the image within
+    a fifth (2,000 degrees of freedom, but of pixels that differ), and a render until an error ends at it.
+    """
+    target = misty()
+    images = [np.array(bdpt(variance=True).render(target, seed=seed, spp=64)) for seed in range(10)]
+    found = np.var([image[..., :3] for image in images], axis=0, ddof=1).mean()
+    stated = np.mean([image[..., 3:] for image in images])
+    assert stated == pytest.approx(found, rel=0.2)
+    integrator = bdpt(variance=True, target_error=0.05)
+    integrator.render(target, seed=2, spp=1 << 14, develop=False)
+    assert integrator.statistics["error"] <= 0.05 and sum(integrator.statistics["passes"]) < 1 << 14
+
+
+def test_features_are_those_of_aov():
+    """Expected: depth, position and albedo behind fog and null boundaries are what Mitsuba's ``aov``
+    gives with as many samples, to 2 % of their range in six pixels of seven (its samples are others,
+    which tells at edges), and the image beside them is that without.
+    """
+    aovs = "dd:depth,pp:position,aa:albedo,nn:sh_normal"
+    target = misty()
+    ours = np.array(bdpt(aovs=aovs).render(target, seed=1, spp=64))
+    plain = np.array(bdpt().render(target, seed=1, spp=64))
+    np.testing.assert_allclose(ours[..., :3], plain, **ROUNDING)
+    theirs = np.array(mi.load_dict({"type": "aov", "aovs": aovs}).render(target, seed=1, spp=64))
+    assert ours.shape[2] == 3 + theirs.shape[2]
+    close = np.abs(ours[..., 3:] - theirs) <= 0.02 * np.ptp(theirs, axis=(0, 1)) + 1e-6
+    assert close.mean((0, 1)).min() > 6 / 7
+    # Boundaries are seen, not what is behind.
+    bare = np.array(mi.load_dict({"type": "aov", "aovs": aovs}).render(mi.load_dict(parts.room()), spp=64))
+    nearer = ours[..., 3] < bare[..., 0] - 0.1
+    assert nearer.mean() > 0.1
+
+
+def test_an_edited_medium_is_asked_anew():
+    """Rationale: pilots and what a scene is like are remembered until something is edited. Expected:
+    after sigma_t of the ball has changed the pilot runs again, the image is that of a scene loaded with
+    the new number, and not the one before.
+    """
+
+    def ball(sigma):
+        return mi.load_dict(parts.room(light=parts.point(), ball=parts.ball(interior=parts.fog(sigma, 0.9))))
+
+    target, integrator = ball(4.0), bdpt()
+    before = np.array(integrator.render(target, seed=1, spp=SPP))
+    integrator.render(target, seed=2, spp=SPP)
+    assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}
+    parameters = mi.traverse(target)
+    (name,) = (name for name in parameters.keys() if name.endswith("sigma_t.value.value"))
+    parameters[name] = (
+        mi.Float(0.5) if isinstance(parameters[name], mi.Float) else type(parameters[name])(0.5)
+    )
+    parameters.update()
+    after = np.array(integrator.render(target, seed=1, spp=SPP))
+    assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 0}
+    anew = np.array(bdpt().render(ball(0.5), seed=1, spp=SPP))
+    np.testing.assert_allclose(after, anew, **ROUNDING)
+    assert np.abs(after - before).mean() > 0.05 * before.mean()
