@@ -621,6 +621,58 @@ MUTANTS = (
             "tests/images/test_media_identities.py::test_spots_in_fog[beam]",
         ),
     ),
+    Mutant(
+        "media: t = 0 has the colour of its start",
+        "transport/techniques.py",
+        "throughput = flight.without_collision(walk.edge, throughput, depth)",
+        "throughput = walk.throughput",
+        ("tests/images/test_media_known_answers.py::test_meter_in_fog[chromatic, absorbing-all]",),
+    ),
+    Mutant(
+        "media: light from infinity arrives before its flight ends",
+        "transport/techniques.py",
+        "return (length > 0) & before_end, depth",
+        "return length > 0, depth",
+        (
+            "tests/images/test_media_edges.py::test_light_from_infinity_hits_a_lens[null-sky]",
+            "tests/images/test_media_edges.py::test_light_from_infinity_hits_a_lens[mask-sun]",
+        ),
+    ),
+    Mutant(
+        "media: maximum decides before the ray",
+        "transport/contribution.py",
+        "if kernel.strategy_images or kernel.space is not None:",
+        "if kernel.strategy_images:",
+        ("tests/images/test_media_edges.py::test_maximum_in_fog[all]",),
+    ),
+    Mutant(
+        "media: the back of a shell is sampled from outside",
+        "emitters/area.py",
+        "~inside & beyond, 0, pdf_w)",
+        "~inside & beyond, pdf_w, pdf_w)",
+        ("tests/images/test_media_edges.py::test_a_glowing_shell_seen_from_outside",),
+    ),
+    Mutant(
+        "media: seldom chosen lamps are in one medium",
+        "scene/light_media.py",
+        "mixed.append(unknown or bool(",
+        "mixed.append(bool(",
+        ("tests/images/test_media_edges.py::test_a_lamp_that_is_seldom_chosen",),
+    ),
+    Mutant(
+        "media: grids without boundary go unnoticed",
+        "scene/light_media.py",
+        'if emitters.at_infinity else ""',
+        'if False else ""',
+        ("tests/images/test_media_edges.py::test_a_grid_without_boundary[sky]",),
+    ),
+    Mutant(
+        "media: shapes are not looked at one by one",
+        "scene/light_media.py",
+        "    if not bounds:\n",
+        "    if bounds:\n",
+        ("tests/images/test_media_edges.py::test_a_small_hole_is_found",),
+    ),
 )
 
 
