@@ -99,14 +99,18 @@ def mape(image, reference) -> float:
     return float(np.mean(np.abs(image - reference) / (np.abs(reference) + epsilon)))
 
 
+# Of the mean: negative values that rounding makes, as `volpath`'s in grids.
+ROUNDED = 1e-5
+
+
 def energy_in_black(image, reference) -> float:
     """Share of the image's energy where the reference is black: sum of x over those pixels / sum of x.
 
     Black are pixels in which all three channels of the reference are exactly 0. An image without energy has
-    none there either: 0.
+    none there either: 0. Negative values beyond rounding raise ``CommandError``.
     """
     image, reference = pair_of(image, reference)
-    if image.min() < 0:
+    if image.min() < -ROUNDED * image.mean():
         raise CommandError(f"image holds negative values down to {image.min():g}; energies must not cancel.")
     total = image.sum()
     black = (reference == 0).all(axis=-1)
