@@ -36,6 +36,7 @@ pictures: $(INSTALLED)
 	$(VENV)/bin/python scripts/equal_time.py veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
+	$(VENV)/bin/python scripts/equal_time.py fog_caustic --spp 64 -o docs/images/fog_caustic_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py veach_mis --spp 16 -o docs/images/veach_mis_heuristics.png \
 		-i "bdpt skip=none heuristic=uniform" "bdpt skip=none heuristic=maximum" \
 		"bdpt skip=none heuristic=power" "bdpt skip=none heuristic=balance"
