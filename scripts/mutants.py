@@ -657,7 +657,7 @@ MUTANTS = (
         "scene/light_media.py",
         "mixed.append(unknown or bool(",
         "mixed.append(bool(",
-        ("tests/images/test_media_edges.py::test_a_lamp_that_is_seldom_chosen",),
+        ("tests/images/test_media_edges.py::test_a_lamp_that_is_seldom_chosen[0.0001-True]",),
     ),
     Mutant(
         "media: grids without boundary go unnoticed",
