@@ -669,8 +669,8 @@ MUTANTS = (
     Mutant(
         "media: shapes are not looked at one by one",
         "scene/light_media.py",
-        "    if not bounds:\n",
-        "    if bounds:\n",
+        "        if share.max() > _TOLERATED_OF_SHAPE:",
+        "        if share.max() > 1:",
         ("tests/images/test_media_edges.py::test_a_small_hole_is_found",),
     ),
 )
