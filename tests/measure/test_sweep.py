@@ -214,7 +214,10 @@ def test_windows_cover_the_glass_and_show_the_same():
     """
     job = Job(REPOSITORY, REPOSITORY.scene("glass_caustics"), 64)
     scene = REPOSITORY.scene("glass_caustics").load(64)
-    windows = [making.Window(job, share) for share in making.Recipe.of(REPOSITORY, "glass_caustics").windows]
+    windows = [
+        making.Window(job, share, making.SAMPLER)
+        for share in making.Recipe.of(REPOSITORY, "glass_caustics").windows
+    ]
     inside = np.zeros((64, 64), bool)
     for window in windows:
         inside[window.slices] = True

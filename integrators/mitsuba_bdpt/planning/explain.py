@@ -71,7 +71,7 @@ def explain(
     missing = unreachable_paths(prepared, p, settings)
     lines += [f"lost: {words(lost)}" for lost in missing]
     if missing and prepared.space is not None:
-        lines.append("lost: how much that is is not estimated in scenes with media")
+        lines.append("lost light: its share of the image is not estimated in scenes with media")
     if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
