@@ -7,10 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.planning import budget
-from mitsuba_bdpt.run.snapshot import Snapshot
-
-# Sums of a pass are made by atomic additions, whose order differs from run to run.
-ROUNDING = {"rtol": 2e-4, "atol": 1e-6}
+from snapshots import ROUNDING, stopped
 
 # From here on there is a pilot.
 SPP = max(budget.LEAST_SAMPLES // parts.SIZE**2, 64)
@@ -34,20 +31,6 @@ def misty():
 
 def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 16} | parameters)
-
-
-def stopped(integrator, target, after, **arguments) -> Snapshot:
-    """The snapshot of a render that is stopped after so many passes, through a file's bytes and back."""
-    reports = []
-
-    def on_pass(report):
-        reports.append(report)
-        if len(reports) == after:
-            integrator.cancel()
-
-    integrator.on_pass = on_pass
-    integrator.render(target, develop=False, **arguments)
-    return Snapshot.from_bytes(reports[-1].snapshot().to_bytes())
 
 
 @pytest.mark.parametrize("parameters", [{"skip": "none"}, {"variance": True, "aovs": "dd:depth"}], ids=str)

@@ -9,9 +9,7 @@ import pytest
 from mitsuba_bdpt.planning import budget, choice
 from mitsuba_bdpt.run.schedule import REPLICATES, _replicates
 from mitsuba_bdpt.run.snapshot import Snapshot
-
-# Sums of a pass are made by atomic additions, whose order differs from run to run.
-ROUNDING = {"rtol": 2e-4, "atol": 1e-6}
+from snapshots import ROUNDING, stopped
 
 
 def scene(rfilter="box", size=16):
@@ -23,22 +21,6 @@ def scene(rfilter="box", size=16):
 
 def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 4} | parameters)
-
-
-def stopped(integrator, target, after: int | None, **arguments) -> Snapshot:
-    """The snapshot of a render that is stopped after so many passes, or that is whole, through a file's
-    bytes and back."""
-    reports = []
-
-    def on_pass(report):
-        reports.append(report)
-        if len(reports) == after:
-            integrator.cancel()
-
-    integrator.on_pass = on_pass
-    integrator.render(target, develop=False, **arguments)
-    integrator.on_pass = None
-    return Snapshot.from_bytes(reports[-1].snapshot().to_bytes())
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..media.media import media_of
 from . import endpoints, oracle
+from .scenes import has_media
 
 # Lobes of a delta BSDF are looked for with these numbers; a direction is the same up to this cosine, a vertex
 # is the same up to this part of the edge to it.
@@ -105,7 +105,7 @@ def rebuild(scene, emitters, path) -> Rebuilt:
     for i in range(1, len(path.p) - 1):
         if not path.shapes[i]:
             raise Lost(f"vertex {i} lies in a medium, where paths are not followed")
-    if media_of(scene, scene.sensors()):
+    if has_media(scene):
         raise Lost("the scene has media, through which edges are not followed")
     events, end = _follow(scene, path)
     hit = int(dr.reinterpret_array(mi.UInt32, end.emitter(scene))[0]) != 0

@@ -428,9 +428,8 @@ class Recorder(Observer):
         if not count:
             return []
         found = [(subpath.start[:, i], 0, False)]
-        found += [
-            (v.p[:, i], int(v.shape[i]), bool(v.delta[i])) for v in map(subpath.visits.__getitem__, places)
-        ]
+        visits = (subpath.visits[place] for place in places)
+        found += [(v.p[:, i], int(v.shape[i]), bool(v.delta[i])) for v in visits]
         if joined or count > 1:
             found[-1] = (*found[-1][:2], False)
         return found

@@ -43,15 +43,12 @@ class Media:
 
     def __init__(self, objects: list[mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
         self.objects = objects
-        for medium in objects:
-            _check(medium)
         homogeneous = [m.is_homogeneous() for m in objects]
         self.grids = not all(homogeneous)
         self.sensor = 1 + objects.index(sensor) if sensor is not None else 0
         self._ids = [_registry_id(m) for m in objects]
         self._numbers = _numbers(self._ids)
-        looks = [_Look(m) for m in objects]
-        self.looks = looks
+        self.looks = looks = [_Look(m) for m in objects]
         self.scatters = any(look.scatters for look in looks)
         self.gray = all(look.gray for look in looks)
         self.coloured_grids = any(look.coloured_grid for look in looks)
@@ -230,8 +227,11 @@ def _numbers(ids: list[int]) -> mi.UInt32:
     return mi.UInt32(numbers)
 
 
-def _check(medium: mi.Medium):
-    """Raise ``UnsupportedError`` if the extinction of a homogeneous medium depends on where it is asked."""
+def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray):
+    """Raise ``UnsupportedError`` if the extinction of a homogeneous medium depends on where it is asked.
+
+    ``majorant`` is its answer at ``mei`` (`probes`).
+    """
     if not medium.is_homogeneous():
         return
     extinction = children(medium).get("sigma_t")
@@ -241,15 +241,19 @@ def _check(medium: mi.Medium):
             "of which Mitsuba takes the value at the origin for flights; use a constant, or a medium of type "
             "heterogeneous"
         )
-    mei = probes(medium)
-    there = np.array(mi.Spectrum(medium.get_majorant(mei)))
-    mei.p = mi.Point3f(0)
-    if not np.allclose(there, np.array(mi.Spectrum(medium.get_majorant(mei))), rtol=1e-5, equal_nan=True):
+    at_origin = mi.MediumInteraction3f(mei)
+    at_origin.p = mi.Point3f(0)
+    if not np.allclose(majorant, _majorants(medium, at_origin), rtol=1e-5, equal_nan=True):
         raise UnsupportedError(
             f"medium {named(medium)} of type homogeneous has microflakes that vary in space, of which "
             "Mitsuba takes those at the origin for flights; use a constant S, or a medium of type "
             "heterogeneous"
         )
+
+
+def _majorants(medium: mi.Medium, mei: mi.MediumInteraction3f) -> np.ndarray:
+    """Majorants at `probes`: (channels, probes)."""
+    return np.array(mi.Spectrum(medium.get_majorant(mei)) + dr.zeros(mi.Spectrum, _PROBES))
 
 
 def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
@@ -273,9 +277,7 @@ def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
 
 def random_directions(rng, count: int) -> mi.Vector3f:
     """So many unit vectors, evenly spread over the sphere."""
-    z, phi = rng.uniform(-1, 1, count), rng.uniform(0, 2 * np.pi, count)
-    r = np.sqrt(1 - z * z)
-    return mi.Vector3f(r * np.cos(phi), r * np.sin(phi), z)
+    return mi.warp.square_to_uniform_sphere(mi.Point2f(rng.random((2, count))))
 
 
 def _volumes(owner) -> list[mi.Volume]:
@@ -333,12 +335,13 @@ class _Look:
     ``coloured_grid``; ``mean`` extinction, ``least`` (of the majorant) of all channels; ``strange`` what
     its numbers should not be, in words, or empty.
 
-    Raises ``UsageError`` if a homogeneous medium has numbers that are no medium's.
+    Raises ``UnsupportedError`` and ``UsageError``, see `_check` and `_strange`.
     """
 
     def __init__(self, medium: mi.Medium):
         mei, homogeneous = probes(medium), medium.is_homogeneous()
-        majorant = np.array(mi.Spectrum(medium.get_majorant(mei)) + dr.zeros(mi.Spectrum, _PROBES))
+        majorant = _majorants(medium, mei)
+        _check(medium, mei, majorant)
         sigma_s, _, sigma_t = (np.array(mi.Spectrum(s)) for s in medium.get_scattering_coefficients(mei))
         self.strange = _strange(medium, sigma_s, sigma_t)
         self.majorant, self.least = majorant.max(1), float(majorant.min())

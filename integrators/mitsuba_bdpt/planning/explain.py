@@ -22,9 +22,9 @@ _RESTS = {
 def words(lost: UnreachablePaths) -> str:
     """Paths that no strategy in use can make, in words."""
     starts = " or ".join(_STARTS[start] for start in lost.starts)
-    vertex, vertices = ("surface or scattering in a medium", "surfaces or scatterings in media")
-    if not lost.volumes:
-        vertex, vertices = "surface", "surfaces"
+    vertex, vertices = "surface", "surfaces"
+    if lost.volumes:
+        vertex, vertices = "surface or scattering in a medium", "surfaces or scatterings in media"
     rest = _RESTS[lost.rest].format(longest=lost.longest, vertex=vertex, vertices=vertices)
     return f"{starts}{rest} (needs {lost.needs})" if lost.needs else f"{starts}{rest}"
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.counters import MEDIA
+
 # Kinds of rays in the statistics, of what the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
-
-# What edges through media count, there.
-MEDIA = ("segments", "collisions")
 
 
 def rays(render) -> dict:

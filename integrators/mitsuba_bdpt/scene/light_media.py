@@ -127,7 +127,7 @@ def _outside(space: Space, found: np.ndarray) -> int:
     """
     if not found.all():
         return space.media.sensor
-    rays, _ = _lines(space, space.scene.bbox(), 0)
+    rays, _ = _lines(space, 0)
     number, met = (np.array(x) for x in boundaries.near_side(space, rays, mi.Bool(True)))
     return int(np.bincount(number[met]).argmax()) if met.any() else 0
 
@@ -180,7 +180,7 @@ def _contradiction_of_shapes(space: Space, outside: int) -> str:
         share = np.where(wrong > 2, wrong / np.maximum(crossings, 1), 0)  # of few crossings one tells nothing
         if share.max() > _TOLERATED_OF_SHAPE:
             return f"shape {named(bounds[int(share.argmax())])} and those around it {remedy}"
-    crossings, wrong = boundaries.disagreements(space, *_lines(space, space.scene.bbox(), outside))
+    crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
     crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
     if wrong <= _TOLERATED * crossings:
         return ""
@@ -216,8 +216,9 @@ def _contradiction_at_infinity(space: Space, outside: int) -> str:
     return ""
 
 
-def _lines(space: Space, box: mi.BoundingBox3f, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
-    """Random lines through a box, from outside of the scene, and the medium that they start in."""
+def _lines(space: Space, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
+    """Random lines through the scene, from outside, and the medium that they start in."""
+    box = space.scene.bbox()
     low, high = (np.array(x, dtype=np.float64)[:, None] for x in (box.min, box.max))
     return _through(space, low, high, _LINES, 1), dr.opaque(mi.UInt32, outside)
 

@@ -11,7 +11,7 @@ from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream
 from . import bsdf, mis, scattering
 from .contribution import Contribution, drop_non_finite, foreseen, roulette, size_of, worth_a_ray
-from .counters import Counters, counted_in_media, one
+from .counters import MEDIA, Counters, counted_in_media, one
 from .inputs import Kernel
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
@@ -81,15 +81,10 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
         sight = _sight(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
         visible = seen(kernel, c, sight)
         total = add(_as_drawn(kernel, z, y, c), visible, total)
-        crossed = crossed + _in_media(visible.counted)
+        crossed = crossed + Counters(**{name: getattr(visible.counted, name) for name in MEDIA})
         slot += 1
     counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
     return total, counted + crossed
-
-
-def _in_media(counted: Counters) -> Counters:
-    """Of ``counted`` what edges through media count."""
-    return Counters(segments=counted.segments, collisions=counted.collisions)
 
 
 def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> tuple[mi.Spectrum, Counters]:

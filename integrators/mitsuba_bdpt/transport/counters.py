@@ -59,6 +59,9 @@ class Counters:
         return total
 
 
+# What edges through media count.
+MEDIA = ("segments", "collisions")
+
 COUNTERS = tuple(field.name for field in fields(Counters))
 
 
@@ -68,8 +71,8 @@ def one(mask: mi.Bool) -> mi.UInt32:
 
 
 def counted_in_media(space: Space | None) -> list[str]:
-    """The names of what edges through media count."""
-    return [] if space is None else ["segments"] + ["collisions"] * space.media.grids
+    """The names of what edges through media count in this scene: collisions where there are grids."""
+    return [] if space is None else list(MEDIA if space.media.grids else MEDIA[:1])
 
 
 def counted_by_light(plan: Plan, space: Space | None) -> Counters:
