@@ -10,6 +10,29 @@ from .media import Space
 
 
 @dr.syntax
+def behind(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
+    """The number of the medium at the end of ``ray``, which starts in ``medium``, and whether it gets there.
+
+    Surfaces that let something pass straight on are passed.
+    """
+    o, left = mi.Point3f(ray.o), mi.Float(ray.maxt)
+    number = mi.UInt32(medium) + dr.zeros(mi.UInt32, dr.width(ray.o))
+    going, arrived = mi.Bool(True), mi.Bool(False)
+    while dr.hint(going, label="media up to the end of a ray", exclude=[space, ray, medium]):
+        segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
+        si = space.scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
+        hit = going & si.is_valid()
+        arrived |= going & ~hit
+        passed = hit & ~dr.all(space.null_transmission(si, hit) == 0)
+        crossed = passed & si.is_medium_transition()
+        number = dr.select(crossed, space.media.number(si.target_medium(ray.d)), number)
+        onwards = rays.passed(segment, si, space.shape_errors)
+        o, left = mi.Point3f(segment(onwards)), left - onwards
+        going = mi.Bool(passed)
+    return number, arrived
+
+
+@dr.syntax
 def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
     """The number of the medium before the first boundary that ``ray`` meets, and whether it meets one.
 

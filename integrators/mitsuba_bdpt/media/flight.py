@@ -104,8 +104,22 @@ def advance(space: Space, ray: mi.Ray3f, landing: Landing, word, active: mi.Bool
     Random numbers of tracking follow ``word``.
     """
     if not space.media.see_through and hidden is None:  # nothing to pass
-        return _segment(space.media, ray, landing, word, active)[1]
-    return _through_surfaces(space, ray, landing, word, active, hidden)
+        landing = _segment(space.media, ray, landing, word, active)[1]
+    else:
+        landing = _through_surfaces(space, ray, landing, word, active, hidden)
+    return _swallowed(space.media, ray, landing, active) if space.clipped else landing
+
+
+def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:
+    """``landing``, dark where it ends at the far plane, in a homogeneous medium that goes on behind it.
+
+    The surroundings are not seen through that without end, as in ``volpath``.
+    """
+    number = landing.edge.medium
+    endless = active & ~landing.collided & ~landing.pi.is_valid() & media.is_homogeneous(number)
+    dark = endless & (mi.Spectrum(media.extinction(number, ray.d, ray, endless)) > 0)
+    lit = type(landing.throughput)(dr.select(dark, 0, landing.throughput))
+    return replace(landing, throughput=lit)
 
 
 @dr.syntax

@@ -144,13 +144,15 @@ class Media:
 class Space:
     """What lies between vertices: the ``scene``, its ``media`` and the rounding errors of its shapes.
 
-    ``null_transmission(si, active)``: transmission of a surface straight on (``Spectrum``).
+    ``null_transmission(si, active)``: transmission of a surface straight on (``Spectrum``); ``clipped``: some
+    camera ray ends in a homogeneous medium at the far plane, behind which there are the surroundings.
     """
 
     scene: mi.Scene
     media: Media
     shape_errors: ShapeErrors
     null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Spectrum]
+    clipped: bool = False
 
 
 # Lobes other than passing straight on.

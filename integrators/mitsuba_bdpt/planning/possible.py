@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
+import mitsuba as mi
+import numpy as np
+
 from ..emitters.emitters import Emitters
 from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
@@ -133,7 +136,19 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     media = None if prepared.space is None else prepared.space.media
     if media is not None and (media.coloured_grids or (media.grids and not media.gray)):
         return "what a flight through a grid carries of each colour is known at its end, not at the sensor"
+    if media is not None and emitters.at_infinity and _reaches_behind(prepared, camera.sensor):
+        return "what lies behind the far plane meets light from infinity, but no camera ray"
     return _why_no_light(emitters, settings)
+
+
+def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
+    """Whether the scene's box reaches behind the far plane of a sensor that has one."""
+    if not isinstance(sensor, mi.ProjectiveCamera) or not prepared.surfaces:
+        return False
+    box, to_world = prepared.scene.bbox(), np.array(sensor.world_transform().matrix, dtype=np.float64)
+    corners = np.array([[*box.corner(i)] for i in range(8)], dtype=np.float64).reshape(8, 3)
+    forwards, origin = to_world.reshape(4, 4)[:3, 2:].T
+    return bool(((corners - origin) @ forwards / np.linalg.norm(forwards) > sensor.far_clip()).any())
 
 
 class Start(Enum):

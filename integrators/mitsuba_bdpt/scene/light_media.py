@@ -35,10 +35,10 @@ class LightMedia:
 
     ``outside`` is the number of the medium that surrounds the scene, see `_outside`;
     ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do;
-    ``hides_infinity``: light from infinity does not arrive.
+    ``hides_infinity``: light from infinity does not arrive. ``far`` see `medium_at_far_plane`.
     """
 
-    def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor):
+    def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int):
         self._space, self._emitters = space, emitters
         number, found = _around(space, sensor)
         self.outside = _outside(space, found)
@@ -48,6 +48,7 @@ class LightMedia:
             or _contradiction_of_sensor(space, sensor, number[found])
             or _contradiction_of_phases(space)
             or (_contradiction_at_infinity(space, self.outside) if emitters.at_infinity else "")
+            or _contradiction_at_far_plane(space, sensor, 0 if far == self.outside else far)
         )
         # Nothing arrives from infinity through a homogeneous medium without end.
         endless = space.media.objects[self.outside - 1] if self.outside else None
@@ -214,6 +215,34 @@ def _contradiction_at_infinity(space: Space, outside: int) -> str:
             "but not others: put a shape with a null BSDF around it"
         )
     return ""
+
+
+def medium_at_far_plane(space: Space, sensor: mi.Sensor) -> int:
+    """The number of the medium in which most camera rays end at the far plane, of those that end in one.
+
+    0 if none does, where nothing shines behind, and for sensors without far plane.
+    """
+    infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in space.scene.emitters())
+    if not infinite or not isinstance(sensor, mi.ProjectiveCamera):
+        return 0
+    u = np.random.default_rng(3).random((5, _OF_EMITTER))
+    film, aperture = mi.Point2f(u[2], u[3]), mi.Point2f(u[0], u[1])
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), mi.Float(u[4]), film, aperture)
+    number, arrived = (
+        np.array(x) for x in boundaries.behind(space, mi.Ray3f(ray), mi.UInt32(space.media.sensor))
+    )
+    clipped = arrived & (number > 0)
+    return int(np.bincount(number[clipped]).argmax()) if clipped.any() else 0
+
+
+def _contradiction_at_far_plane(space: Space, sensor: mi.Sensor, far: int) -> str:
+    """Why camera rays that end in the medium ``far`` are not light's ways from infinity; empty if it is 0."""
+    if not far:
+        return ""
+    return (
+        f"the far plane of sensor {named(sensor)} lies in the medium {named(space.media.objects[far - 1])}, "
+        "through the rest of which light from infinity has to come: raise far_clip"
+    )
 
 
 def _lines(space: Space, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -11,7 +13,7 @@ from ..media.media import Media, Space
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf
-from .light_media import LightMedia
+from .light_media import LightMedia, medium_at_far_plane
 
 
 class PreparedScene:
@@ -35,8 +37,10 @@ class PreparedScene:
         self.traits = bsdf.Traits.of(found)
         self.space = self.light_media = None
         if media := Media.of(scene, sensor, found):
-            self.space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
-            self.light_media = LightMedia(self.space, self.emitters, sensor)
+            space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
+            far = medium_at_far_plane(space, sensor)
+            self.space = replace(space, clipped=far > 0 and media.objects[far - 1].is_homogeneous())
+            self.light_media = LightMedia(self.space, self.emitters, sensor, far)
             delta &= ~int(mi.BSDFFlags.Null)  # which edges pass
         self.delta = any(b.flags() & delta for b in found)
 
