@@ -28,8 +28,8 @@ SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 
 
-def arguments(workers, output, *others):
-    command = ["render", str(SCENE), "-D", "resolution=32", "--spp", "256", "--parts", "8", "-o", str(output)]
+def arguments(workers, output, *others, scene=SCENE):
+    command = ["render", str(scene), "-D", "resolution=32", "--spp", "256", "--parts", "8", "-o", str(output)]
     return [*command, "--scheduler", workers.scheduler_address, *others]
 
 
@@ -49,20 +49,22 @@ def test_parts_cover_the_samples_with_seeds_of_their_own():
     assert len({seed for seed, _ in many} | {seed for seed, _ in neighbour}) == 1 << 13
 
 
-def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path):
+@pytest.mark.parametrize("name", ["cornell_box", "fog_lamp"])
+def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name):
     """Expected: the image is that of the same parts rendered here one after the other and joined; the pilot
     ran once, its decisions are in the statistics. Tolerance: rounding of atomic sums and of half precision.
     """
-    assert main(arguments(workers, tmp_path / "a.exr")) == 0
+    path = SCENE.with_stem(name)
+    assert main(arguments(workers, tmp_path / "a.exr", scene=path)) == 0
     pixels, statistics = image(tmp_path / "a.exr")
     assert sum(statistics["passes"]) == statistics["spp"] == 256
     (decided,) = statistics["decisions"]
     assert statistics["no_pilot"] == ""
-    assert main(arguments(workers, tmp_path / "short.exr", "--spp", "15")) == 0
+    assert main(arguments(workers, tmp_path / "short.exr", "--spp", "15", scene=path)) == 0
     assert "samples are too few" in image(tmp_path / "short.exr")[1]["no_pilot"]
-    scene = mi.load_file(str(SCENE), resolution=32)
+    scene = mi.load_file(str(path), resolution=32)
     options = Namespace(
-        scene=SCENE,
+        scene=path,
         defines=[("resolution", "32")],
         properties=[],
         variant=mi.variant(),
