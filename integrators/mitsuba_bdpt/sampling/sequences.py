@@ -9,6 +9,9 @@ import mitsuba as mi
 # images, after changes of the decision, those that follow the other one.
 PILOT, CHANGED = 1 << 16, 1 << 17
 
+# Photons of the passes of an image, or replicate, have the sequences that follow this, passes times so many.
+PHOTONS = 1 << 24
+
 
 def sequence_seed(seed, number: int):
     """Seed of the sequence ``number`` of a render of ``seed`` (``UInt32`` both)."""
