@@ -205,5 +205,7 @@ def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> t
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
         lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))
+    if settings.merging and emitters.traced:  # makes what has a vertex where it may be done
+        lost = [paths for paths in lost if paths.rest in (Rest.SENSOR, Rest.LONG)]
     volumes = prepared.space is not None and prepared.space.media.scatters
     return tuple(replace(paths, volumes=volumes) for paths in lost)

@@ -23,7 +23,7 @@ from ..planning.choice import Prediction
 from ..planning.decision import MOST_ROULETTE
 from ..planning.findings import Findings
 from ..planning.planner import Planner
-from ..properties import check_film, check_not_frozen, check_scene, check_variant, integer
+from ..properties import check_film, check_merging, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis, photons
@@ -64,11 +64,11 @@ class Render:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
         check_variant()
         check_not_frozen()
-        check_scene(scene, sensor)
         colour = check_film(sensor, settings)
         self.meter = Meter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
+        check_merging(sensor, settings, self.prepared.space is not None)
         self.findings = Findings(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings)
         if not isinstance(seed, mi.UInt32):
@@ -207,7 +207,7 @@ class Render:
         """Trace one pass, a launch for each of its batches."""
         first = not self.passes and self.planner.threshold is None
         if self.footprints is not None:
-            self.kernel.merging = self._photons(step)
+            self.kernel.merging = self._photons(step, self.footprints)
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()
@@ -221,15 +221,21 @@ class Render:
         if first and self.plan.roulette:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
 
-    def _photons(self, step: Step) -> Merging:
+    def _radius_in_pixels(self, done: int) -> float:
+        """Of the pass after ``done`` others of the same image, or replicate."""
+        return self.settings.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
+
+    def _photons(self, step: Step, footprints: Footprints) -> Merging:
         """The photons of a pass, whose radius follows from the passes done of the same image or replicate."""
         done = passes_since(self.passes, step.done)
-        factor = self.settings.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
+        factor = self._radius_in_pixels(done)
         count = photons_of(step.size * int(self.prepared.camera.region.size.prod()))
-        merging = Merging(self.footprints.radius(factor), dr.opaque(mi.Float, count))
+        merging = Merging(footprints.radius(factor), dr.opaque(mi.Float, count))
         points = self.points.of_photons(step, done, self.planner.changes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-            return photons.trace(self.kernel, merging, points, count)
+            merging, counts = photons.trace(self.kernel, merging, points, count)
+        self.meter.launched(counts)
+        return merging
 
     def _is_exact_enough(self) -> bool:
         """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""

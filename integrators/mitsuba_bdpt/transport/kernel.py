@@ -310,7 +310,7 @@ def _splat(kernel: Kernel, sink, c, shared) -> Counters:
 def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
     walked = Counters.zeros("camera", *counted_in_media(kernel.space))
-    counters = walked + counted_by_camera(kernel.plan, kernel.space)
+    counters = walked + _camera_counters(kernel)
     served = mi.UInt32(0)
     while dr.hint(
         served < kernel.camera_paths_per_light_path,
@@ -322,6 +322,11 @@ def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     return counters
 
 
+def _camera_counters(kernel: Kernel) -> Counters:
+    counters = counted_by_camera(kernel.plan, kernel.space)
+    return counters if kernel.merging is None else counters + Counters.zeros("merges")
+
+
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and join it with the lane's light subpath."""
     sample = _camera_sample(kernel, lane, slot, active)
@@ -329,7 +334,7 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     walk = _camera_walk(kernel, sample, active)
     side = _camera_side(kernel, sink, sample, lane.shared, walk)
     visit = _camera_visit(kernel, sink, lane, sample)
-    state = sink.begin(), counted_by_camera(kernel.plan, kernel.space)
+    state = sink.begin(), _camera_counters(kernel)
     (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
     counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
     counters += walk.counted(active)
@@ -396,21 +401,26 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
         c = contribution.drop_non_finite(c)
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
-    def merged(z, walk, total, lost):
+    def merge(z, total, lost, merges):
+        c = merging.merge(kernel, z, sample.stream)
+        return *add(c, total, lost), merges + one(c.active)
+
+    def merged(z, walk, total, counted):
         # A branch of its own: few lanes are on an isolated path.
         return dr.if_stmt(
-            (z, total, lost),
+            (z, total, *counted),
             merging.possible(kernel, z, walk),
-            lambda z, total, lost: add(merging.merge(kernel, z, sample.stream), total, lost),
-            lambda z, total, lost: (total, lost),
+            merge,
+            lambda z, total, lost, merges: (total, lost, merges),
             label="merges",
         )
 
     def visit(z, state, walk):
         total, counters = state
         if kernel.merging is not None:
-            total, lost = merged(z, walk, total, counters.non_finite)
-            counters = replace(counters, non_finite=lost)
+            counted = counters.non_finite, counters.merges
+            total, lost, merges = merged(z, walk, total, counted)
+            counters = replace(counters, non_finite=lost, merges=merges)
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
             total, lost = dr.if_stmt(

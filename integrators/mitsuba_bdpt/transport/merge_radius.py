@@ -18,8 +18,8 @@ _LOWEST, _HIGHEST = 1 / 8, 8
 # Without pixels to measure (meters, a sensor of one's own, nothing in view): of the scene's diagonal.
 _OF_DIAGONAL = 1 / 512
 
-# Radii of passes: that of the i-th over the first is i^((alpha - 1) / 2), with this alpha (C. Knaus, M. Zwicker,
-# "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
+# Radii of passes: that of the i-th over the first is i^((alpha - 1) / 2), with this alpha (C. Knaus and
+# M. Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
 SHRINKING = 2 / 3
 
 # Most change of the radius per distance, see `Grid` in `merging`.
@@ -58,7 +58,9 @@ class Footprints:
         """The radius that is ``factor`` pixels."""
         angle = min(self.angle * factor, _STEEPEST)
         low, high = self.median * factor * _LOWEST, self.median * factor * _HIGHEST
-        radius = Radius(mi.Point3f(*self.centre), *(mi.Float(x) for x in (self.base * factor, angle, low, high)))
+        radius = Radius(
+            mi.Point3f(*self.centre), *(mi.Float(x) for x in (self.base * factor, angle, low, high))
+        )
         dr.make_opaque(radius)
         return radius
 

@@ -3,9 +3,9 @@
 Source: Georgiev 2012, see `mis`; of its vertex merging what no connection can do. An edge is *joined* if a
 strategy in use makes paths by connecting its ends: neither is a delta event, and their class has a
 coefficient (the edge to a point of an emitter by next-event estimation, to the sensor by t = 1, others by
-inner connections). A path is *isolated* if no edge of it is joined: lamp, glass, wall, glass, camera. Only s = 0
-and t = 0 make those, and merging: the light side and the camera side of the path are traced, each up to the
-same vertex whose event is not delta, and a photon that is near enough counts as if it were there.
+inner connections). A path is *isolated* if no edge of it is joined: lamp, glass, wall, glass, camera. Only
+s = 0 and t = 0 make those, and merging: the light side and the camera side of the path are traced, each up to
+the same vertex, whose event is not delta, and a photon that is near enough counts as if it were there.
 
 With n photons' subpaths, discs of radius r(x) about camera vertices, area measure, p-> from the light's side
 and p<- from the camera's::
@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
-from . import bsdf, mis
+from . import bsdf
 from .contribution import Contribution, size_of
 from .inputs import Kernel
 from .merge_radius import Radius
@@ -168,7 +168,7 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32):
         near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # others share its bucket
         near &= _is_near(photon, z, r) & (photon.edges <= most)
         size = dr.select(near, size_of(photon.flux), 0)
-        before, total = total, total + size
+        total += size
         u, after = sequential(word)
         take = tried & (u * total < size)
         word = dr.select(tried, after, word)

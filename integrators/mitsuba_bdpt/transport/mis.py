@@ -66,8 +66,10 @@ class Partial:
 
 @dataclass
 class Merge:
-    """A merge at a vertex: ``eta``, the number of photons times the area of its disc; ``isolated``: the path
-    up to the event there has no edge that a strategy in use joins.
+    """A merge at a vertex.
+
+    ``eta``: number of photons' subpaths times the area of the disc; ``isolated``: the path up to the event
+    there has no edge that a strategy in use joins.
     """
 
     eta: mi.Float

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..sampling.points import Points
 from . import kernel as kernels
+from .counters import Counters, one
 from .inputs import Kernel
 from .merging import BUCKET_BITS, Merging, Photon, Photons, bucket_of, cell_at, level_of
 from .observer import Observer
@@ -21,24 +22,23 @@ _CAPACITY = 0.5
 _EDGES_BITS, _LANE_BITS = 12, 32
 
 
-def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> Merging:
+def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
     """``merging`` with the photons of ``count`` light subpaths, which these ``points`` make.
 
-    Traced again if they are more than there was memory for: none is dropped.
+    Also `Counters.summed`. Traced again if they are more than there was memory for: none is dropped.
     """
     kernel = kernel.bound(points, 1.0, Observer())
     kernel.merging = merging
     capacity = int(count * _CAPACITY)
     while True:
-        photons, found = _traced(kernel, count, capacity)
+        photons, found, counters = _traced(kernel, count, capacity)
         if found <= capacity:
-            break
+            return replace(merging, photons=_sorted(merging, photons, found)), counters
         capacity = found
-    return replace(merging, photons=_sorted(merging, photons, found))
 
 
-def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int]:
-    """Photons in the order of their arrival, and how many there are, maybe more than the ``capacity``."""
+def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.UInt64]:
+    """Photons in the order of their arrival, how many there are, maybe more than the ``capacity``; counts."""
     out = dr.zeros(Photon, capacity)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
@@ -53,17 +53,20 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int]:
         last_edge=kernel.max_depth,
     )
 
-    def visit(y, state, walk):
+    def visit(y, counters, walk):
         keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
         older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
         photon = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
         place = dr.scatter_inc(kept, mi.UInt32(0), keep)
         dr.scatter(out, photon, place, keep & (place < most))
-        return state
+        return counters + Counters(photons=one(keep))
 
-    random_walk(kernel, side, walk, stream, visit, ())
-    dr.eval(kept, out)
-    return out, int(kept[0])
+    begun = walk.active
+    counters, walk = random_walk(kernel, side, walk, stream, visit, Counters.zeros("photons"))
+    counters += Counters(photon=dr.select(begun, walk.traced(), 0), non_finite=one(walk.broken))
+    counts = counters.summed()
+    dr.eval(kept, out, counts)
+    return out, int(kept[0]), counts
 
 
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:

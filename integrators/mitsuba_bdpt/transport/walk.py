@@ -370,8 +370,9 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
-    if side.isolated:
-        active &= merge.isolated
+    isolated = None if merge is None else merge.isolated
+    if side.isolated and isolated is not None:
+        active &= isolated
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
@@ -394,7 +395,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         seen=seen,
         broken=broken,
         active=active,
-        isolated=None if merge is None else merge.isolated,
+        isolated=isolated,
     )
     if passes is not None:
         after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
