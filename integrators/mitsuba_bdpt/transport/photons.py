@@ -29,7 +29,7 @@ def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple
     """
     kernel = kernel.bound(points, 1.0, Observer())
     kernel.merging = merging
-    capacity = int(count * _CAPACITY)
+    capacity = max(int(count * _CAPACITY), 1)
     while True:
         photons, found, counters = _traced(kernel, count, capacity)
         if found <= capacity:
@@ -71,14 +71,15 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.
 
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
     """The first ``count`` by bucket, subpath and edge, an order that does not depend on threads."""
-    found = dr.gather(Photon, photons, dr.arange(mi.UInt32, count))
+    index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
+    found = dr.gather(Photon, photons, index)
     radius = merging.radius
     cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)))
     bucket = bucket_of(cell)
     key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
     order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
-    dr.scatter_add(counts, mi.UInt32(1), bucket + 1)
+    dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
     starts = dr.cumsum(counts)
     result = Photons(dr.gather(Photon, found, order), dr.gather(mi.UInt64, cell, order), starts)
     dr.eval(result)
