@@ -4,6 +4,8 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy joins two neighbours of that path; point lamps are found by merging alone.
 """
 
+from types import SimpleNamespace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -11,10 +13,9 @@ import views
 import welch as st
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import photons
+from mitsuba_bdpt.transport import merging, photons
 from mitsuba_bdpt.transport.inputs import Kernel
 from mitsuba_bdpt.transport.merge_radius import Footprints
-from mitsuba_bdpt.transport.merging import Merging
 from snapshots import ROUNDING, stopped
 
 import drjit as dr  # isort: skip
@@ -201,6 +202,18 @@ def test_large_lamps_look_as_without(case, parameters):
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
+def test_a_lens_and_a_point_lamp():
+    """Rationale: a wide lens is hit by light subpaths, t = 0, which makes the paths that merging makes.
+    Expected: the same tiles as by t = 0 alone, in discs of half a pixel.
+    """
+    scene = under_glass(point(), kind="thinlens")
+    scene["sensor"] |= {"aperture_radius": 0.8}
+    scene = mi.load_dict(scene)
+    a = images(scene, 512, 8, merging=True, merging_radius=0.5, skip="none")
+    b = images(scene, 512, 8, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
+
+
 @pytest.mark.parametrize("heuristic", ["power", "maximum", "uniform"])
 def test_heuristics(heuristic):
     """Expected: the same tiles as with the balance heuristic without merging."""
@@ -231,8 +244,22 @@ def test_other_paths_are_what_they_were():
     that of the same seed without merging, to the rounding of sums.
     """
     scene = mi.load_dict(under_glass(ball(), plate=matte(0.3)))
-    a, b = (images(scene, 16, 1, merging=merging) for merging in (True, False))
+    a, b = (images(scene, 16, 1, merging=merges) for merges in (True, False))
     np.testing.assert_allclose(a, b, **ROUNDING)
+
+
+def test_joined_paths_are_not_merged():
+    """Rationale: one joined edge is enough. A wall above the plate, lit by the floor below it through the
+    glass: t = 1 joins it with the camera. Expected: the image of the same seed without merging.
+    """
+    to_world = transform().translate([-2, 0, 2]).rotate([0, 1, 0], 90).scale(1.2)
+    wall = {"type": "rectangle", "to_world": to_world, "bsdf": matte()}
+    scene = under_glass(point(), wall=wall)
+    scene["sensor"] = views.camera(origin=(1, 0, 2), target=(-2, 0, 2), fov=35, size=SIZE)
+    scene = mi.load_dict(scene)
+    a, b = (images(scene, 64, 1, max_depth=8, merging=merges) for merges in (True, False))
+    np.testing.assert_allclose(a, b, **ROUNDING)
+    assert a.min() > 0
 
 
 def test_nothing_leaks_through_a_thin_wall():
@@ -254,11 +281,11 @@ def traced(count=1 << 14):
     render = rendering.Render(scene, scene.sensors()[0], method.settings, 0, 4)
     kernel: Kernel = render.kernel
     radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
-    merging = Merging(radius, dr.opaque(mi.Float, count))
-    merging, counts = photons.trace(kernel, merging, Points("sobol", mi.UInt32(1)), count)
-    found = merging.photons.found
+    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count))
+    of_pass, counts = photons.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
+    found = of_pass.photons.found
     arrays = [np.array(getattr(found, name)) for name in ("p", "d", "n", "flux", "older", "edges", "lane")]
-    return arrays, np.array(merging.photons.starts), counts.numpy()
+    return arrays, np.array(of_pass.photons.starts), counts.numpy()
 
 
 def test_photons_are_in_the_same_order_on_any_number_of_threads():
@@ -277,6 +304,27 @@ def test_photons_are_in_the_same_order_on_any_number_of_threads():
                 np.testing.assert_array_equal(a, b)
     finally:
         dr.set_thread_count(before)
+
+
+def test_cells_may_share_a_bucket(monkeypatch):
+    """Expected: with four buckets, in which all cells share, the image of the same photons; under a point
+    lamp on a matte floor it does not depend on which photon of a disc is drawn.
+    """
+    scene = mi.load_dict(under_glass(point()))
+    expected = images(scene, 16, 1, merging=True)
+    for module in (photons, merging):
+        monkeypatch.setattr(module, "BUCKET_BITS", 2)
+    np.testing.assert_allclose(images(scene, 16, 1, merging=True), expected, **ROUNDING)
+
+
+def test_which_photons_are_near():
+    """Expected: those in the disc, in a flat cylinder about it, whose normals agree to 37 degrees."""
+    p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0], 0, [0, 0, 0, 0.24, 0.26, 0, 0])
+    n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51)])
+    photon = merging.Photon(p, None, n, None, None, None, None)
+    z = SimpleNamespace(si=SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1)))
+    found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
+    assert found == [True, True, False, True, False, True, False]
 
 
 def test_no_photon_is_dropped(monkeypatch):
@@ -317,12 +365,12 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
 def test_what_a_render_says():
     """Expected: `explain` and the statistics say that the render is not unbiased, and nothing is lost."""
     scene = mi.load_dict(under_glass(point()))
-    plain, merging = (mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": m}) for m in (False, True))
+    plain, merged = (mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": m}) for m in (False, True))
     assert "lost: delta emitter" in plain.explain(scene)
-    text = merging.explain(scene)
+    text = merged.explain(scene)
     assert "lost:" not in text and "consistent, not unbiased" in text
-    mi.render(scene, integrator=merging, spp=4)
-    found = merging.statistics
+    mi.render(scene, integrator=merged, spp=4)
+    found = merged.statistics
     assert not found["unbiased"] and found["merging"]["photons"] and found["merging"]["merges"]
     assert found["rays"]["photon"] and found["lost_light"] == {}
     mi.render(scene, integrator=plain, spp=4)
