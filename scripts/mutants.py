@@ -266,7 +266,7 @@ MUTANTS = (
     Mutant(
         "emission: start of a light subpath lacks its density",
         "transport/kernel.py",
-        "partial = mis.Partial(h.start(inverse_pdf), h.present(hit))",
+        "partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))",
         "partial = mis.Partial(h.start(dr.rcp(e.pdf_second)), h.present(hit))",
         ("tests/transport/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-n1c1]",),
     ),

@@ -241,9 +241,11 @@ def test_what_is_not_connected_is_merged():
 
 def test_other_paths_are_what_they_were():
     """Rationale: paths that some strategy joins weigh what they weighed. Expected: without glass the image is
-    that of the same seed without merging, to the rounding of sums.
+    that of the same seed without merging, to the rounding of sums; a mirror out of sight is there, so that
+    photons are looked for.
     """
-    scene = mi.load_dict(under_glass(ball(), plate=matte(0.3)))
+    mirror = {"type": "sphere", "center": [0, 0, 9], "radius": 0.1, "bsdf": {"type": "conductor"}}
+    scene = mi.load_dict(under_glass(ball(), plate=matte(0.3), mirror=mirror))
     a, b = (images(scene, 16, 1, merging=merges) for merges in (True, False))
     np.testing.assert_allclose(a, b, **ROUNDING)
 
@@ -269,6 +271,56 @@ def test_nothing_leaks_through_a_thin_wall():
     scene["below"] = {"type": "cube", "to_world": below, "bsdf": glass()}
     scene["floor"]["bsdf"] = {"type": "twosided", "bsdf": matte()}
     assert not images(scene, 64, 2, merging=True, merging_radius=2.0).any()
+
+
+CHANGES = {
+    "crop window": {"film": {"crop_width": 8, "crop_height": 4, "crop_offset_x": 4, "crop_offset_y": 6}},
+    "border": {"film": {"sample_border": True, "rfilter": {"type": "gaussian"}}},
+    "hidden lamp": {"bdpt": {"hide_emitters": True}},
+    "features": {"bdpt": {"aovs": "dd:depth"}},
+    "instance": {},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_makes_no_difference(change):
+    """Expected: the same tiles of the floor as without the change (in the window of pixels that both have);
+    the instance is of the plate.
+    """
+    more = CHANGES[change]
+    plain, changed = under_glass(point()), under_glass(point())
+    changed["sensor"]["film"] |= more.get("film", {})
+    if change == "instance":
+        plate = changed.pop("plate")
+        changed["group"] = {
+            "type": "shapegroup",
+            "plate": plate | {"to_world": transform().scale([4, 4, 0.1])},
+        }
+        to_world = transform().translate([0, 0, 0.5])
+        changed["again"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
+    a = images(plain, 256, 8, merging=True)
+    b = images(changed, 256, 8, first=100, merging=True, **more.get("bdpt", {}))
+    if change == "crop window":
+        a = a[:, 6:10, 4:12]
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=2)
+
+
+def test_sensors_without_pixels():
+    """Rationale: a meter has no pixels by which to measure a disc. It faces the floor below the plate.
+    Expected: without light subpaths merging finds what t = 1 finds with them.
+    """
+    scene = under_glass(point())
+    del scene["sensor"]
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    film |= {"pixel_format": "rgb", "component_format": "float32"}
+    meter = {"type": "irradiancemeter", "film": film}
+    to_world = transform().translate([0.5, 0, 0.2]).rotate([1, 0, 0], 180).scale(0.2)
+    scene["paper"] = {"type": "rectangle", "to_world": to_world, "bsdf": matte(), "sensor": meter}
+    scene = mi.load_dict(scene)
+    a = images(scene, 1 << 14, 8, max_depth=4, merging=True, light_paths=0)
+    b = images(scene, 1 << 14, 8, first=100, max_depth=4)
+    assert b.mean() > 0.01
+    st.assert_agree(st.compare_images(a.reshape(8, 1), b.reshape(8, 1)))
 
 
 # -- photons -----------------------------------------------------------------------------------------------
@@ -376,6 +428,15 @@ def test_what_a_render_says():
     mi.render(scene, integrator=plain, spp=4)
     assert plain.statistics["unbiased"] and "merging" not in plain.statistics
     assert "photon" not in plain.statistics["rays"]
+
+
+def test_what_needs_no_merging():
+    """Expected: without delta surfaces no photon is traced, the render is unbiased, and `explain` says so."""
+    scene = mi.load_dict(under_glass(ball(), plate=matte()))
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    assert "skipped (impossible): merging: without delta surfaces" in method.explain(scene)
+    mi.render(scene, integrator=method, spp=4)
+    assert method.statistics["unbiased"] and not method.statistics["rays"]["photon"]
 
 
 def test_what_is_refused():

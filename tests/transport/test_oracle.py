@@ -568,6 +568,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         shape_errors=Flat(),
         space=None,
         light_media=None,
+        merging=None,
         sensor_medium=None,
         scatters=True,
     )

@@ -64,7 +64,7 @@ def explain(
         else f"heuristic {settings.heuristic}, no light subpaths"
     ]
     lines += [f"used: {name}" for name in used]
-    if settings.merging:
+    if p.merging:
         lines.append(
             "used: merging of vertices on isolated paths, of which no strategy in use joins two neighbours "
             "(the render is consistent, not unbiased)"

@@ -76,7 +76,7 @@ class Render:
         seed = mi.UInt32(seed)
         dr.make_opaque(seed)
         self.points = PassPoints(settings, sensor, seed)
-        self.footprints = Footprints.of(scene, sensor) if settings.merging else None
+        self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
         border = self.prepared.camera.region.border
         depth, variance = settings.strategy_depth, settings.variance

@@ -40,7 +40,7 @@ def statistics(render) -> dict:
         "connections": connections,
         **({"media": {n: counts[n] for n in MEDIA}} if render.prepared.space is not None else {}),
         **({"merging": {n: counts[n] for n in MERGING}} if render.settings.merging else {}),
-        "unbiased": not render.settings.merging,
+        "unbiased": not render.plan.merging,
         "skipped": list(render.plan.skipped),
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,

@@ -67,23 +67,20 @@ class Footprints:
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> Footprints:
         """Measured by camera rays and their differentials, where the sensor has some."""
-        grid = (np.arange(_PROBES**2) + 0.5) / _PROBES
-        film = mi.Point2f((grid % 1).astype(np.float32), (np.floor(grid) + 0.5) / _PROBES)
+        grid = (np.arange(_PROBES) + 0.5) / _PROBES
+        film = mi.Point2f(np.tile(grid, _PROBES), np.repeat(grid, _PROBES))
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))
         si = scene.ray_intersect(mi.Ray3f(ray))
-        o, d, o_x, d_x, t = (np.atleast_2d(np.array(v).T) for v in (ray.o, ray.d, ray.o_x, ray.d_x, si.t))
-        found = np.isfinite(t[0] if t.shape[0] == 1 else t[:, 0])
+        found = np.isfinite(np.array(si.t))
         if not ray.has_differentials or not found.any():
             return Footprints._without_pixels(scene)
-        o, o_x = (np.broadcast_to(v, d.shape) for v in (o, o_x))
-        centre = np.median(o, axis=0)
-        base = float(np.median(np.linalg.norm(o_x - o, axis=1)))
-        angle = float(np.median(np.linalg.norm(d_x - d, axis=1)))
-        distance = np.median(t.ravel()[found])
-        median = base + angle * float(distance)
-        if np.abs(o - centre).max() > median * 4 and angle > 0:  # rays from several places
-            base, angle = median, 0.0
-        return Footprints(tuple(map(float, centre)), base, angle, median)
+        spread = dr.norm(ray.d_x - ray.d)
+        size = np.array(dr.norm(ray.o_x - ray.o + (ray.d_x - ray.d) * si.t))
+        median, angle = float(np.median(size[found])), float(np.median(np.array(spread)))
+        if not isinstance(sensor, mi.ProjectiveCamera) or angle == 0:  # of one size, or from several places
+            return Footprints((0.0, 0.0, 0.0), median, 0.0, median)
+        centre = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+        return Footprints(tuple(centre.tolist()), 0.0, angle, median)
 
     @staticmethod
     def _without_pixels(scene: mi.Scene) -> Footprints:
