@@ -214,6 +214,18 @@ def test_a_lens_and_a_point_lamp():
     st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
 
 
+def test_paths_longer_than_stored():
+    """Rationale: t = 0 makes no path of more than ``stored_vertices`` edges, merging does. Expected: with 1
+    the same tiles as without merging and limits.
+    """
+    scene = under_glass(ball(), kind="thinlens")
+    scene["sensor"] |= {"aperture_radius": 0.8}
+    scene = mi.load_dict(scene)
+    a = images(scene, 256, 8, merging=True, merging_radius=0.5, skip="none", stored_vertices=1)
+    b = images(scene, 256, 8, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
 @pytest.mark.parametrize("heuristic", ["power", "maximum", "uniform"])
 def test_heuristics(heuristic):
     """Expected: the same tiles as with the balance heuristic without merging."""

@@ -35,9 +35,10 @@ class PassPoints:
 
     def of_photons(self, step: Step, done: int, changes: int) -> Points:
         """The points of the photons of a pass after ``done`` others of the same image, or replicate."""
-        number = PHOTONS * (done + 1) + step.replicate + (CHANGED + changes if changes else 0)
-        kind = "independent" if self._kind == "independent" else "sobol"
-        return Points(kind, sequence_seed(self.seed, number % (1 << 32)))
+        seed = sequence_seed(self.seed, PHOTONS + done)
+        if number := step.replicate + (CHANGED + changes if changes else 0):
+            seed = sequence_seed(seed, number)
+        return Points("independent" if self._kind == "independent" else "sobol", seed)
 
     def _of_sampler(self, step: Step, batch: Batch, seed) -> Points:
         """One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do."""

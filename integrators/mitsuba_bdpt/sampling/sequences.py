@@ -9,8 +9,8 @@ import mitsuba as mi
 # images, after changes of the decision, those that follow the other one.
 PILOT, CHANGED = 1 << 16, 1 << 17
 
-# Photons of the passes of an image, or replicate, have the sequences that follow this, passes times so many.
-PHOTONS = 1 << 24
+# Photons have the sequence that follows this by the number of passes done, or one that follows from it.
+PHOTONS = 1 << 18
 
 
 def sequence_seed(seed, number: int):

@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
-from . import bsdf
+from . import bsdf, mis
 from .contribution import Contribution, size_of
 from .inputs import Kernel
 from .merge_radius import Radius
@@ -135,7 +135,9 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     value = z.throughput * f.value * estimate
     active &= ~bsdf.is_zero(value)
     light_side = h.scale(photon.older, f.pdf_fwd_w)
-    camera_side = h.scale(h.combine(z.partial.d_vc, z.partial.d_vm), f.pdf_rev_w)
+    # Of longer paths t = 0, the oldest alternative of the camera's side, makes none.
+    older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)
+    camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
     weight, shares = h.weigh(h.start(eta), light_side, camera_side)
     return Contribution(value, weight, photon.edges + 1, z.edges, active, shares, "merge")
 

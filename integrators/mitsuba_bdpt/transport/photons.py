@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points
+from . import bsdf
 from . import kernel as kernels
 from .counters import Counters, one
 from .inputs import Kernel
@@ -28,7 +29,7 @@ def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple
     Also `Counters.summed`. Traced again if they are more than there was memory for: none is dropped.
     """
     kernel = kernel.bound(points, 1.0, Observer())
-    kernel.merging = merging
+    kernel.merging, kernel.last_light = merging, kernel.max_depth
     capacity = max(int(count * _CAPACITY), 1)
     while True:
         photons, found, counters = _traced(kernel, count, capacity)
@@ -46,15 +47,13 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.
     shared = kernels.shared_by_lane(kernel, stream)
     e = kernels.emission(kernel, stream, shared)
     walk = kernels.light_walk(kernel, e, stream, shared, True)
-    side = replace(
-        kernels.light_side(kernel, e, stream, shared, walk),
-        join=None,
-        isolated=True,
-        last_edge=kernel.max_depth,
-    )
+    side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, isolated=True)
 
     def visit(y, counters, walk):
         keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
+        keep &= bsdf.is_finite(
+            y.throughput
+        )  # else all that are drawn with it would be NaN; the walk counts it
         older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
         photon = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
         place = dr.scatter_inc(kept, mi.UInt32(0), keep)
