@@ -214,6 +214,11 @@ def _check_together(settings: Settings):
             "decisions together with light_paths, connections, skip or strategy_images is "
             "contradictory; leave out one or the other"
         )
+    if settings.merging and settings.strategy_images:
+        raise UsageError(
+            "merging together with strategy_images is not possible: merges belong to no strategy (s, t); "
+            "leave out one of them"
+        )
     _check_layers(settings)
     if settings.target_error and not settings.variance:
         raise UsageError(
@@ -256,8 +261,25 @@ def check_not_frozen():
         )
 
 
-def check_scene(scene, sensor):
-    """Raise ``UnsupportedError`` for what the method cannot render."""
+def check_merging(sensor, settings: Settings, media: bool):
+    """Raise ``UnsupportedError`` where vertices cannot be merged; ``media``: whether the scene has some."""
+    if not settings.merging:
+        return
+    variant = mi.variant() or ""
+    if mi.is_spectral:
+        raise UnsupportedError(
+            f"merging in the variant {variant} is not supported: photons and camera subpaths have "
+            f"different wavelengths; use {variant.replace('spectral', 'rgb')}, or leave out merging"
+        )
+    if sensor.shutter_open_time() > 0:
+        raise UnsupportedError(
+            f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "
+            "subpaths have different times; set shutter_close to shutter_open, or leave out merging"
+        )
+    if media:
+        raise UnsupportedError(
+            "merging in scenes with participating media is not supported; leave out merging"
+        )
 
 
 def check_film(sensor, settings: Settings):

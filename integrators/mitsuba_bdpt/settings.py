@@ -127,6 +127,21 @@ class Settings:
         ``sampler``: the scene's sampler for a path's first draws. ``independent``: random numbers.""",
         choices=POINTS,
     )
+    merging: bool = _parameter(
+        False,
+        "true or false",
+        """Merge vertices of paths on which no two neighbours can be joined (lamp, glass, wall, glass, camera)
+        with photons near them. Such light, which is fireflies or missing otherwise, comes out smooth. The
+        render is then consistent, not unbiased: it blurs these paths by about a pixel, less from pass to
+        pass.""",
+    )
+    merging_radius: float = _parameter(
+        1.0,
+        "a radius in pixels, greater than 0",
+        """Radius of the first pass within which ``merging`` takes photons, in pixels as they are seen
+        directly.""",
+        low=1e-3,
+    )
     decisions: tuple[Any, ...] | None = _converted(
         "",
         None,

@@ -36,6 +36,8 @@ SENSIBLE = {
     "max_depth": (-1, 0, 1, 2, 5, 9),
     "rr_depth": (1, 3, 100),
     "hide_emitters": (False, True),
+    "merging": (False, True),
+    "merging_radius": (0.1, 1.0, 4.0),
     "light_paths": ("auto", 0, 1, "1/2", 0.25, "1/16"),
     "stored_vertices": (1, 2, 64),
     "strategy_images": (False, True),

@@ -5,7 +5,7 @@ What tests/transport/test_oracle.py and the stress cases share; the truth is in 
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -70,16 +70,22 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
     )
 
 
-def recursion(paths: Paths, kappa: Coefficients, name: str) -> np.ndarray:
-    """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use."""
+def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndarray:
+    """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use.
+
+    With ``eta``, see `oracle.log_merges`, those of the k - 1 merges follow.
+    """
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
     kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
-    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name))
+    discs = None if eta is None else [mi.Float(x) for x in eta.astype(np.float32).T]
+    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name), discs)
     weights = {0: chain.hit(), 1: chain.endpoints() if paths.k == 1 else chain.next_event()}
     if paths.k > 1:
         weights |= {s: chain.inner(s) for s in range(2, paths.k)} | {paths.k: chain.splat()}
     weights[paths.k + 1] = chain.arrive()
-    return columns([weights[s] for s in range(paths.k + 2)], len(paths.kind))
+    if eta is not None:
+        weights |= {paths.k + 1 + m: chain.merge(m) for m in range(1, paths.k)}
+    return columns([weights[s] for s in range(len(weights))], len(paths.kind))
 
 
 @dataclass
@@ -148,15 +154,19 @@ class Recursion:
     In the order of calls of ``walk.py`` and ``techniques.py``.
     """
 
-    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic):
-        self.path, self.kappa, self.h = path, kappa, heuristic
+    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, eta=None):
+        self.path, self.kappa, self.h, self.eta = path, kappa, heuristic, eta
+        self._no_merges = 0 if eta is None else heuristic.zero()
         self.arrival = dr.select(path.lens, kappa.arrival, mi.Float(0))
         self.light, self._last = self._along_light()
         self.camera = self._along_camera()
 
     # -- subpaths -----------------------------------------------------------------------------
 
-    def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, is_delta):
+    def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, i, isolated):
+        is_delta = self.path.delta[i]
+        isolated &= is_delta | ~mis.is_joined(partial, coefficient)
+        merge = None if self.eta is None else mis.Merge(self.eta[i], isolated)
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
             pdf_fwd_w=dr.select(is_delta, 0, pdf_fwd_w),
@@ -164,35 +174,40 @@ class Recursion:
             cos_out=cos_out,
             delta=is_delta,
         )
-        return mis.scatter(self.h, partial, coefficient, step)
+        return mis.scatter(self.h, partial, coefficient, step, merge), isolated
 
     def _along_light(self):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
 
-        As in kernel._light_walk, walk._vertex and _leave.
+        As in kernel.light_walk, walk._vertex and _leave.
         """
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * x.second)
         start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))
-        partial = mis.Partial(h.start(inverse), start)
+        partial = mis.Partial(h.start(inverse), start, self._no_merges)
+        isolated = mi.Bool(True)
         at_point = dr.select(x.position, x.direct * x.dist2[0], x.direct)
         complete = dr.select(x.area, x.direct * x.cos_light[0], at_point)
         found = [None]
         for e in range(1, x.k):
             if e == 1:
-                partial = mis.Partial(h.scale(partial.d_vcm, complete), partial.d_vc)
+                partial = replace(partial, d_vcm=h.scale(partial.d_vcm, complete))
             dist2 = 1 if e == 1 else x.dist2[e - 1]
             partial = mis.to_area(h, partial, dist2, x.cos_camera[e - 1], x.transmittance[e - 1])
             found.append(partial)
             densities = x.to_camera[e], x.to_light[e]
-            partial = self._fold(partial, self._of_light(e), *densities, x.cos_light[e], x.delta[e])
+            partial, isolated = self._fold(
+                partial, self._of_light(e), *densities, x.cos_light[e], e, isolated
+            )
         return found, partial
 
     def _along_camera(self):
         """Camera subpath: the partial sums at z_e = x_{k-e}."""
         x, h, k = self.path, self.h, self.path.k
         from_lens = h.start(x.cos_camera[k - 1] / (x.lens_pdf * x.sensor_pdf))
-        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), h.scale(from_lens, self.arrival))
+        arrival = h.scale(from_lens, self.arrival)
+        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), arrival, self._no_merges)
+        isolated = mi.Bool(True)
         found = [None]
         for e in range(1, k + 1):
             i = k - e
@@ -203,7 +218,9 @@ class Recursion:
             found.append(partial)
             if e < k:
                 densities = x.to_light[i], x.to_camera[i]
-                partial = self._fold(partial, self._of_camera(e), *densities, x.cos_camera[i - 1], x.delta[i])
+                partial, isolated = self._fold(
+                    partial, self._of_camera(e), *densities, x.cos_camera[i - 1], i, isolated
+                )
         return found
 
     def _of_light(self, e):
@@ -220,11 +237,21 @@ class Recursion:
         if mis.is_absent(kappa.arrival):
             return mi.Float(0)
         if k == 1:
-            before = mis.Partial(h.scale(before.d_vcm, x.first), before.d_vc)
+            before = replace(before, d_vcm=h.scale(before.d_vcm, x.first))
         arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1], x.transmittance[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
+        if self.eta is not None:
+            merges = h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf)
+            light_side = h.combine(light_side, dr.select(mis.is_joined(arrived, newest), 0, merges))
         return h.weight(kappa.arrival, light_side, mi.Float(0))
+
+    def merge(self, m):
+        """Both subpaths up to x_m (merging.merge)."""
+        x, h, light, camera = self.path, self.h, self.light[m], self.camera[self.path.k - m]
+        light_side = h.scale(h.combine(light.d_vc, light.d_vm), x.to_light[m])
+        camera_side = h.scale(h.combine(camera.d_vc, camera.d_vm), x.to_camera[m])
+        return h.weight(h.start(self.eta[m]), light_side, camera_side)
 
     def hit(self):
         """s = 0 (techniques.hit_emitter)."""
@@ -232,6 +259,9 @@ class Recursion:
         connected = dr.select(x.area, x.direct * x.cos_light[0] / x.dist2[0], x.direct)
         newest = self.kappa.endpoints * x.first if x.k == 1 else connected
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
+        if self.eta is not None:
+            merges = h.scale(last.d_vm, x.first * x.second)
+            camera_side = h.combine(camera_side, dr.select(mis.is_joined(last, newest), 0, merges))
         return h.weight(1, mi.Float(0), camera_side)
 
     def _joined(self, kappa, light_side, camera_side, edge):

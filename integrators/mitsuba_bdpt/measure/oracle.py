@@ -179,16 +179,35 @@ def log_densities(paths: Paths) -> np.ndarray:
     return p
 
 
+def log_merges(paths: Paths, eta: np.ndarray) -> np.ndarray:
+    """log n p of merging at x_1 ... x_{k-1}, shape (n, k - 1), on isolated paths; -inf at delta events.
+
+    Both subpaths make x_m, and the photon has to be in the disc: ``eta`` (n, k + 1) is the number of photons'
+    subpaths times its area.
+    """
+    light, camera, _ = log_steps(paths)
+    p = np.empty((len(paths.kind), max(paths.k - 1, 0)))
+    for m in range(1, paths.k):
+        p[:, m - 1] = np.log(eta[:, m]) + light[:, : m + 1].sum(1) + camera[:, m:].sum(1)
+        p[paths.delta[:, m], m - 1] = -np.inf
+    return p
+
+
 class Explicit:
     """All strategies of ``paths`` under ``coefficients``.
 
-    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite.
+    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite. With ``eta``, see `log_merges`, the
+    merges are further columns; they make paths that no strategy with s and t >= 1 in use makes.
     """
 
-    def __init__(self, paths: Paths, coefficients: Coefficients):
+    def __init__(self, paths: Paths, coefficients: Coefficients, eta: np.ndarray | None = None):
         kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
         with np.errstate(divide="ignore"):
             self.size = log_densities(paths) + np.log(kappa)
+        if eta is not None:
+            isolated = ~np.isfinite(self.size[:, 1 : paths.k + 1]).any(1)
+            merges = np.where(isolated[:, None], log_merges(paths, eta), -np.inf)
+            self.size = np.concatenate([self.size, merges], axis=1)
         self.used = np.isfinite(self.size)
         best = self.size.max(1, keepdims=True, initial=-1e300)
         self._ratio = np.where(self.used, np.exp(np.minimum(self.size - best, 0)), 0)
@@ -208,7 +227,7 @@ class Explicit:
         return ((self._ratio < 1 - 5e-5) & (self._ratio > 1 - 2e-4)).any(1)
 
     def weights(self, heuristic: str):
-        """Weights (n, k + 2), zero where a strategy is not in use."""
+        """Weights in the shape of ``size``, zero where a strategy is not in use."""
         ratio = self._ratio
         if heuristic == "balance":
             part = ratio

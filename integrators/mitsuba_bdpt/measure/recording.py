@@ -147,11 +147,13 @@ def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it, largest first.
 
     They are all samples larger than ``least`` (of the image's shape) in one of the colours. Raises
-    ``CommandError`` for a film of other colours.
+    ``CommandError`` for a film of other colours, and for `merging`.
     """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise CommandError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
+    if integrator.settings.merging:
+        raise CommandError("merging=true: paths that are merged are not looked at; leave out merging")
     outliers = []
 
     def trace(traced, image, batch, points, of):

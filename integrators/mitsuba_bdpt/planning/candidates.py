@@ -21,8 +21,11 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
     """
 
     def lost_without_arrival(plan: Plan) -> tuple[UnreachablePaths, ...]:
-        """A small lens is a poor finder of what t = 0 alone finds: it does not stand for connections."""
-        return unreachable_paths(prepared, replace(plan, arrival=False), settings)
+        """A small lens is a poor finder of what t = 0 alone finds: it does not stand for connections.
+
+        Nor does merging, which is not unbiased.
+        """
+        return unreachable_paths(prepared, replace(plan, arrival=False, merging=False), settings)
 
     found: list[Configuration] = []
     lost = lost_without_arrival(full)

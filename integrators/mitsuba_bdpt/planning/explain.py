@@ -64,6 +64,11 @@ def explain(
         else f"heuristic {settings.heuristic}, no light subpaths"
     ]
     lines += [f"used: {name}" for name in used]
+    if p.merging:
+        lines.append(
+            "used: merging of vertices on isolated paths, of which no strategy in use joins two neighbours "
+            "(the render is consistent, not unbiased)"
+        )
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:

@@ -39,6 +39,8 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     endpoints = skip("(1,1)", "impossible", why) if why else True
     why = _why_not_arrival(prepared, settings)
     arrival = skip("t=0", "impossible", why) if why else True
+    why = _why_not_merging(emitters, prepared.delta, bool(direct)) if settings.merging else ""
+    merging = skip("merging", "impossible", why) if why else settings.merging
     for name, why in emitters.left_out:
         skip(name, "impossible", why)
 
@@ -70,6 +72,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         roulette=settings.skip != "none" and not settings.strategy_images,
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
+        merging=merging,
     )
 
 
@@ -141,6 +144,15 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
+def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
+    """Why no vertex can be merged; empty if some may be. ``delta``: some BSDF has such a lobe."""
+    if not emitters.traced:
+        return _UNTRACED
+    if direct and not (delta or emitters.beams):
+        return "without delta surfaces next-event estimation joins all that light meets first"
+    return ""
+
+
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
     """Whether the scene's box reaches behind the far plane of a sensor that has one."""
     if not isinstance(sensor, mi.ProjectiveCamera) or not prepared.surfaces:
@@ -205,5 +217,7 @@ def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> t
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
         lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))
+    if p.merging:  # makes what has a vertex where it may be done
+        lost = [paths for paths in lost if paths.rest in (Rest.SENSOR, Rest.LONG)]
     volumes = prepared.space is not None and prepared.space.media.scatters
     return tuple(replace(paths, volumes=volumes) for paths in lost)

@@ -23,6 +23,10 @@ def log(statistics: dict):
         f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
         f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
     )
+    if not statistics["unbiased"]:
+        mi.Log(
+            mi.LogLevel.Info, f"bdpt: merging: consistent, not unbiased; {json.dumps(statistics['merging'])}"
+        )
     if statistics["no_pilot"]:
         mi.Log(mi.LogLevel.Info, f"bdpt: no pilot: {statistics['no_pilot']}")
     for made in statistics["decisions"]:

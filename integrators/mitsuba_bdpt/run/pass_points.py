@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points
-from ..sampling.sequences import CHANGED, sequence_seed
+from ..sampling.sequences import CHANGED, PHOTONS, sequence_seed
 from ..settings import Settings
 from ..transport.batch import Batch
 from .schedule import Step
@@ -32,6 +32,13 @@ class PassPoints:
         if number:
             seed = sequence_seed(self.seed, number)
         return self._of_sampler(step, batch, seed) if self._kind == "sampler" else Points(self._kind, seed)
+
+    def of_photons(self, step: Step, done: int, changes: int) -> Points:
+        """The points of the photons of a pass after ``done`` others of the same image, or replicate."""
+        seed = sequence_seed(self.seed, PHOTONS + done)
+        if number := step.replicate + (CHANGED + changes if changes else 0):
+            seed = sequence_seed(seed, number)
+        return Points("independent" if self._kind == "independent" else "sobol", seed)
 
     def _of_sampler(self, step: Step, batch: Batch, seed) -> Points:
         """One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do."""

@@ -23,16 +23,18 @@ from ..planning.choice import Prediction
 from ..planning.decision import MOST_ROULETTE
 from ..planning.findings import Findings
 from ..planning.planner import Planner
-from ..properties import check_film, check_not_frozen, check_scene, check_variant, integer
+from ..properties import check_film, check_merging, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport import mis
+from ..transport import mis, photons
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
+from ..transport.merge_radius import SHRINKING, Footprints
+from ..transport.merging import Merging
 from ..transport.plan import Plan
 from .pass_points import PassPoints
 from .progress import Progress
-from .schedule import REPLICATES, Step, batches, schedule
+from .schedule import REPLICATES, Step, batches, passes_since, photons_of, schedule
 from .snapshot import Snapshot, identity
 from .statistics import rays
 from .work import Meter
@@ -62,11 +64,11 @@ class Render:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
         check_variant()
         check_not_frozen()
-        check_scene(scene, sensor)
         colour = check_film(sensor, settings)
         self.meter = Meter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
+        check_merging(sensor, settings, self.prepared.space is not None)
         self.findings = Findings(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings)
         if not isinstance(seed, mi.UInt32):
@@ -74,6 +76,7 @@ class Render:
         seed = mi.UInt32(seed)
         dr.make_opaque(seed)
         self.points = PassPoints(settings, sensor, seed)
+        self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
         border = self.prepared.camera.region.border
         depth, variance = settings.strategy_depth, settings.variance
@@ -203,6 +206,8 @@ class Render:
     def _pass(self, step: Step):
         """Trace one pass, a launch for each of its batches."""
         first = not self.passes and self.planner.threshold is None
+        if self.footprints is not None:
+            self.kernel.merging = self._photons(step, self.footprints)
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()
@@ -215,6 +220,22 @@ class Render:
         self.accumulator.close_pass(step.size)
         if first and self.plan.roulette:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
+
+    def _radius_in_pixels(self, done: int) -> float:
+        """Of the pass after ``done`` others of the same image, or replicate."""
+        return self.settings.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
+
+    def _photons(self, step: Step, footprints: Footprints) -> Merging:
+        """The photons of a pass, whose radius follows from the passes done of the same image or replicate."""
+        done = passes_since(self.passes, step.done)
+        factor = self._radius_in_pixels(done)
+        count = photons_of(step.size * int(self.prepared.camera.region.size.prod()))
+        merging = Merging(footprints.radius(factor), dr.opaque(mi.Float, count))
+        points = self.points.of_photons(step, done, self.planner.changes)
+        with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
+            merging, counts = photons.trace(self.kernel, merging, points, count)
+        self.meter.launched(counts)
+        return merging
 
     def _is_exact_enough(self) -> bool:
         """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""

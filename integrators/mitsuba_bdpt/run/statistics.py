@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.counters import MEDIA
+from ..transport.counters import MEDIA, MERGING
 
 # Kinds of rays in the statistics, of what the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
@@ -15,6 +15,8 @@ def rays(render) -> dict:
     """Rays of a `Render` so far, by kind."""
     counts = render.meter.work.counts
     found = {name: counts[name] for name in RAYS}
+    if render.settings.merging:
+        found["photon"] = counts["photon"]
     if render.accumulator.features is not None:  # one per camera sample
         pixels = int(render.prepared.camera.region.size.prod())
         found["features"] = sum(render.accumulator.passes) * pixels
@@ -37,6 +39,8 @@ def statistics(render) -> dict:
         "rays": rays(render),
         "connections": connections,
         **({"media": {n: counts[n] for n in MEDIA}} if render.prepared.space is not None else {}),
+        **({"merging": {n: counts[n] for n in MERGING}} if render.settings.merging else {}),
+        "unbiased": not render.plan.merging,
         "skipped": list(render.plan.skipped),
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,

@@ -9,6 +9,9 @@ import mitsuba as mi
 # images, after changes of the decision, those that follow the other one.
 PILOT, CHANGED = 1 << 16, 1 << 17
 
+# Photons have the sequence that follows this by the number of passes done, or one that follows from it.
+PHOTONS = 1 << 18
+
 
 def sequence_seed(seed, number: int):
     """Seed of the sequence ``number`` of a render of ``seed`` (``UInt32`` both)."""

@@ -21,6 +21,8 @@ class Counters:
     finite: contributions (those of s = 1 and t <= 1 if they are visible, inner ones before it is known),
     subpaths that end for want of a finite throughput, colours, features. In scenes with media ``segments``
     of edges, those of joins included, each with a ray of its own, and tentative ``collisions`` in grids.
+    With merging closest hits of photons' subpaths (``photon``), the ``photons`` kept, and the ``merges``:
+    camera vertices near to some.
 
     Records are added up, never changed: Dr.Jit's loops would not see it.
     """
@@ -36,6 +38,9 @@ class Counters:
     non_finite: mi.UInt32 | None = None
     segments: mi.UInt32 | None = None
     collisions: mi.UInt32 | None = None
+    photon: mi.UInt32 | None = None
+    photons: mi.UInt32 | None = None
+    merges: mi.UInt32 | None = None
 
     @staticmethod
     def zeros(*names: str) -> Counters:
@@ -61,6 +66,9 @@ class Counters:
 
 # What edges through media count.
 MEDIA = ("segments", "collisions")
+
+# What merging counts, beside its rays.
+MERGING = ("photons", "merges")
 
 COUNTERS = tuple(field.name for field in fields(Counters))
 

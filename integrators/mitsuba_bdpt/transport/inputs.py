@@ -81,6 +81,8 @@ class Kernel:
         self.camera_paths_per_light_path = u32(plan.camera_paths_per_light_path)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
+        # The photons of a pass, a `merging.Photons`; None where vertices are not merged.
+        self.merging = None
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch, with the batch's ``points``.

@@ -8,12 +8,12 @@ size. (With ``points=sampler`` the random numbers of a pass do, and in a pilot w
 What a lane does. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
 k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
-    time, wavelengths <- drawn for all subpaths of the lane                 _shared
+    time, wavelengths <- drawn for all subpaths of the lane                 shared_by_lane
 
     # The light subpath                                                     _light_subpath
-    y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   _emission
+    y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   emission
     (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
-    the first edge <- a ray; it ends here for want of a throughput          _light_walk
+    the first edge <- a ray; it ends here for want of a throughput          light_walk
     d_vcm <- 1 / densities of y_0 and direction (eq. 31)
     d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
     for y in y_1, y_2, ... up to where the subpath misses or ends:          walk.random_walk
@@ -94,7 +94,7 @@ from ..geometry import rays
 from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
-from . import bsdf, contribution, mis, stored_vertices, techniques
+from . import bsdf, contribution, merging, mis, stored_vertices, techniques
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Shared
@@ -179,7 +179,7 @@ def _count_light(batch: Batch, sharing: Sharing) -> float:
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     """The lanes of these numbers with their light subpaths, which are traced."""
     stream = kernel.points.stream("light", place.index(index), index)
-    shared = _shared(kernel, stream)
+    shared = shared_by_lane(kernel, stream)
     path = stored_vertices.allocate_light_path(kernel, dr.width(index))
     counters = Counters()
     if kernel.plan.light:
@@ -187,7 +187,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     return Lane(place, shared, path), counters
 
 
-def _shared(kernel: Kernel, stream) -> Shared:
+def shared_by_lane(kernel: Kernel, stream) -> Shared:
     sensor, points = kernel.camera.sensor, kernel.points
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -206,7 +206,7 @@ def _shared(kernel: Kernel, stream) -> Shared:
 def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_vertices.LightPath, Counters]:
     """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections."""
     plan = kernel.plan
-    e = _emission(kernel, stream, shared)
+    e = emission(kernel, stream, shared)
     counters = Counters()
     if plan.endpoints:
         c = techniques.join_endpoints(kernel, e, stream, mi.Bool(True))
@@ -226,15 +226,15 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_v
         # No purpose is left to name this number (`points`); that of vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=stored_vertices.Thinning.begin(u))
-    walk = _light_walk(kernel, e, stream, shared)
-    active, side = walk.active, _light_side(kernel, e, stream, shared, walk)
+    walk = light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 makes isolated paths
+    active, side = walk.active, light_side(kernel, e, stream, shared, walk)
     state = path, counted_by_light(plan, kernel.space)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters += counted + walk.counted(active)
     return path, counters + Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
 
 
-def _emission(kernel: Kernel, stream, shared):
+def emission(kernel: Kernel, stream, shared):
     """y_0 and the first direction, an `emitters.Emission`."""
     points = kernel.points
     e = kernel.emitters.sample_emission(
@@ -249,8 +249,8 @@ def _emission(kernel: Kernel, stream, shared):
     return e
 
 
-def _light_walk(kernel: Kernel, e, stream, shared) -> Walk:
-    """A light subpath on its first edge."""
+def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
+    """A light subpath on its first edge; ``merges``: whether it asks for those of its vertices."""
     h = kernel.heuristic
     active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
@@ -260,12 +260,17 @@ def _light_walk(kernel: Kernel, e, stream, shared) -> Walk:
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     # s = 0 is an older alternative, that of making y_0 by a hit.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
-    partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
+    partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))
     edge = None
     if kernel.space is not None:
         edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
     return replace(walk, broken=broken)
+
+
+def _no_merges(kernel: Kernel, asked: bool):
+    """``d_vm`` of a subpath that begins; the number 0 where it is not ``asked`` for."""
+    return kernel.heuristic.zero() if asked and kernel.merging is not None else 0
 
 
 def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
@@ -279,7 +284,7 @@ def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
     return flight.Edge.begin(kernel.space.media, medium, ray.maxt, u, u_channel)
 
 
-def _light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
+def light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
     return Side(
         "light",
         shared,
@@ -305,7 +310,7 @@ def _splat(kernel: Kernel, sink, c, shared) -> Counters:
 def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
     walked = Counters.zeros("camera", *counted_in_media(kernel.space))
-    counters = walked + counted_by_camera(kernel.plan, kernel.space)
+    counters = walked + _camera_counters(kernel)
     served = mi.UInt32(0)
     while dr.hint(
         served < kernel.camera_paths_per_light_path,
@@ -317,6 +322,11 @@ def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     return counters
 
 
+def _camera_counters(kernel: Kernel) -> Counters:
+    counters = counted_by_camera(kernel.plan, kernel.space)
+    return counters if kernel.merging is None else counters + Counters.zeros("merges")
+
+
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and join it with the lane's light subpath."""
     sample = _camera_sample(kernel, lane, slot, active)
@@ -324,7 +334,7 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     walk = _camera_walk(kernel, sample, active)
     side = _camera_side(kernel, sink, sample, lane.shared, walk)
     visit = _camera_visit(kernel, sink, lane, sample)
-    state = sink.begin(), counted_by_camera(kernel.plan, kernel.space)
+    state = sink.begin(), _camera_counters(kernel)
     (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
     counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
     counters += walk.counted(active)
@@ -363,7 +373,7 @@ def _first_partial(kernel: Kernel, start):
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
         arrival = h.present(arrival)
-    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
+    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival, _no_merges(kernel, True))
 
 
 def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Side:
@@ -387,18 +397,36 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
     """What is done at each vertex of a camera subpath: the strategies with t >= 2."""
     plan, start, shared = kernel.plan, sample.start, lane.shared
 
-    def add_hit(z, total, lost):
-        c = contribution.drop_non_finite(techniques.hit_emitter(kernel, z))
+    def add(c, total, lost):
+        c = contribution.drop_non_finite(c)
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
-    def visit(z, state, _):
+    def merge(z, total, lost, merges):
+        c = merging.merge(kernel, z, sample.stream)
+        return *add(c, total, lost), merges + one(c.active)
+
+    def merged(z, walk, total, counted):
+        # A branch of its own: few lanes are on an isolated path.
+        return dr.if_stmt(
+            (z, total, *counted),
+            merging.possible(kernel, z, walk),
+            merge,
+            lambda z, total, lost, merges: (total, lost, merges),
+            label="merges",
+        )
+
+    def visit(z, state, walk):
         total, counters = state
+        if kernel.merging is not None:
+            counted = counters.non_finite, counters.merges
+            total, lost, merges = merged(z, walk, total, counted)
+            counters = replace(counters, non_finite=lost, merges=merges)
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
             total, lost = dr.if_stmt(
                 (z, total, counters.non_finite),
                 techniques.sees_emitter(kernel, z),
-                add_hit,
+                lambda z, total, lost: add(techniques.hit_emitter(kernel, z), total, lost),
                 lambda z, total, lost: (total, lost),
                 label="s = 0",
             )

@@ -5,13 +5,17 @@
 """Multiple importance sampling of all strategies (s, t) by recursive partial sums.
 
 Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland
-University, 2012, without merging; equation numbers below are the report's. Each subpath carries
+University, 2012; equation numbers below are the report's. Each subpath carries
 two floats, ``d_vcm`` and ``d_vc``, from which the weight of any strategy follows at once:
 
 * ``d_vcm`` stands for the *newest* alternative strategy: the one that makes the subpath's last
   vertex from the other side. It has to be multiplied by the density with which that happens.
 * ``d_vc`` stands for all older alternatives. It has to be multiplied by that same density and by
   the reverse density (solid angle) of the vertex before the last.
+
+Where vertices of isolated paths are merged (see `merging`) a third float, ``d_vm``, stands for the merges at
+older vertices, and is used like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies
+share one scale. ``d_vc`` has no eta in it: paths that are not isolated weigh what they weigh without merging.
 
 What differs from the report: (1) each strategy class has a coefficient kappa with which it enters
 every weight, w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know yet which class its
@@ -57,6 +61,24 @@ class Partial:
 
     d_vcm: mi.Float | mi.Vector4f | int
     d_vc: mi.Float | mi.Vector4f | int
+    d_vm: mi.Float | mi.Vector4f | int = 0
+
+
+@dataclass
+class Merge:
+    """A merge at a vertex.
+
+    ``eta``: number of photons' subpaths times the area of the disc; ``isolated``: the path up to the event
+    there has no edge that a strategy in use joins.
+    """
+
+    eta: mi.Float
+    isolated: mi.Bool
+
+
+def is_joined(partial: Partial, coefficient: Coefficient):
+    """Mask: a strategy in use, of this ``coefficient``, joins the edge to the vertex of ``partial``."""
+    return mi.Bool(False) if is_absent(coefficient) else (partial.d_vcm > 0) & (coefficient > 0)
 
 
 def is_absent(x: PartialSum) -> bool:
@@ -197,14 +219,18 @@ def to_area(
     return Partial(
         d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),
         d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
+        d_vm=heuristic.scale(partial.d_vm, dr.rcp(cos)),
     )
 
 
-def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step) -> Partial:
+def scatter(
+    heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step, merge: Merge | None = None
+) -> Partial:
     """Fold the newest alternative and take a sampled direction (eqs. 34, 35; delta events 53, 54).
 
     ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
-    ``pdf_fwd_w`` and ``pdf_rev_w`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``.
+    ``pdf_fwd_w`` and ``pdf_rev_w`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``; ``merge``
+    the one at this vertex, None where there are none.
     """
     older = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),
@@ -225,7 +251,22 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, st
     return Partial(
         d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
         d_vc=kept,
+        d_vm=0 if merge is None else _scattered_merges(heuristic, partial, step, merge),
     )
+
+
+def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
+    """``d_vm`` after an event: the merges before it, and that at this vertex, which joins no delta event."""
+    merges = heuristic.combine(
+        heuristic.scale(partial.d_vm, step.pdf_rev_w),
+        heuristic.start(merge.eta),
+    )
+    kept = dr.select(
+        step.delta,
+        heuristic.scale(partial.d_vm, step.cos_out),
+        heuristic.scale(merges, step.cos_out / step.pdf_fwd_w),
+    )
+    return dr.select(merge.isolated, kept, 0)
 
 
 def alternatives(

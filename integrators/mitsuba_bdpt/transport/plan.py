@@ -14,7 +14,7 @@ class Plan:
     ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t<=1 over its count;
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
-    left out.
+    left out. ``merging``: whether vertices of isolated paths are merged.
     """
 
     hit: bool
@@ -29,6 +29,7 @@ class Plan:
     roulette: bool
     hide_emitters: bool
     skipped: tuple[dict[str, str], ...] = ()
+    merging: bool = False
 
     @property
     def light(self) -> bool:

@@ -61,6 +61,10 @@ def hit_emitter(kernel: Kernel, z: Vertex) -> Contribution:
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
     )
+    if kernel.merging is not None:  # on paths whose last edge is not joined either
+        merges = h.scale(z.partial.d_vm, pdf_first * pdf_second)
+        joined = mis.is_joined(z.partial, newest)
+        camera_side = h.combine(camera_side, dr.select(joined, 0, merges))
     weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
     value = _known(z.throughput * radiance, pdf_connect, pdf_first, pdf_second)
     return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
@@ -233,11 +237,14 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
 
     # (1,1) makes y_0 by emission, not by next-event estimation from z_0, and cannot make that of a beam.
     completing = dr.select(emission.beam, 0, emission.pdf_first)
-    before = mis.Partial(h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)), walk.partial.d_vc)
+    before = replace(walk.partial, d_vcm=h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)))
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
+    if walk.isolated is not None:  # merges, on paths whose last edge is not joined either
+        merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
+        light_side = h.combine(light_side, dr.select(mis.is_joined(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= worth_a_ray(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:

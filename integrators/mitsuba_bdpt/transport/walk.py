@@ -34,7 +34,8 @@ class Walk:
     measure before that edge; ``eta`` product of relative indices of refraction (1 where nothing
     refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
     happened; ``broken``: it ended for want of a finite throughput or shading frame; ``edge`` what it carries
-    along an edge in scenes with media, else None.
+    along an edge in scenes with media, else None; ``isolated``: none of its edges is joined by a strategy in
+    use, see `merging` (None where vertices are not merged).
 
     What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
     """
@@ -51,6 +52,7 @@ class Walk:
     broken: mi.Bool
     active: mi.Bool
     edge: Any = None  # a `flight.Edge`
+    isolated: mi.Bool | None = None
 
     @staticmethod
     def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
@@ -68,6 +70,7 @@ class Walk:
             broken=mi.Bool(False),
             active=active,
             edge=edge,
+            isolated=None if mis.is_absent(partial.d_vm) else mi.Bool(True),
         )
 
     @property
@@ -165,6 +168,7 @@ class Side:
     happened. ``parallel``: the first edge has one direction, its density is one across it. ``join``: called
     with each vertex, returns the endpoint of the other side with which it is to be joined (`emitters.Direct`,
     or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no strategy does so.
+    ``isolated``: the subpath ends as soon as it is not, see `Walk`.
     """
 
     name: str
@@ -177,6 +181,7 @@ class Side:
     alpha: bool = False
     parallel: bool = False
     join: Callable[[Vertex], tuple[Direct | CameraJoin, bsdf.Target]] | None = None
+    isolated: bool = False
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
@@ -254,7 +259,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         pdf_connect = dr.select(first, side.complete(si, first), 1)
         # No weight follows from such a density.
         throughput = dr.select(dr.isfinite(pdf_connect), throughput, dr.nan)
-        partial = mis.Partial(h.scale(partial.d_vcm, pdf_connect), partial.d_vc)
+        partial = replace(partial, d_vcm=h.scale(partial.d_vcm, pdf_connect))
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
     if side.parallel:
         dist2 = dr.select(walk.edges == 1, 1, dist2)
@@ -264,7 +269,11 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     d_vcm = partial.d_vcm
     if tr is not None:  # the surroundings are a strategy's other end too
         d_vcm = h.scale(d_vcm, dr.rcp(tr))
-    partial = mis.Partial(choose(hit, in_area.d_vcm, d_vcm), choose(hit, in_area.d_vc, partial.d_vc))
+    partial = mis.Partial(
+        choose(hit, in_area.d_vcm, d_vcm),
+        choose(hit, in_area.d_vc, partial.d_vc),
+        choose(hit, in_area.d_vm, partial.d_vm),
+    )
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
@@ -352,7 +361,8 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     if side.adjoint:
         first = where_lit(kernel, first, is_lit(kernel, vertex))
     coefficient = newest_coefficient(kernel, first, walk.edges)
-    partial = mis.scatter(h, vertex.partial, coefficient, step)
+    merge = _merge(kernel, walk, vertex, coefficient, step)
+    partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
 
     throughput = vertex.throughput * step.weight
     eta = walk.eta * step.eta if kernel.refracts else 1
@@ -360,6 +370,9 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
+    isolated = None if merge is None else merge.isolated
+    if side.isolated and isolated is not None:
+        active &= isolated
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
@@ -382,10 +395,28 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         seen=seen,
         broken=broken,
         active=active,
+        isolated=isolated,
     )
     if passes is not None:
         after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
     return _traced(kernel, after, ray, passes)
+
+
+def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
+    """The `mis.Merge` at ``vertex``; ``coefficient`` of the class that joins the edge to it."""
+    if walk.isolated is None:
+        return None
+    isolated = walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
+    return mis.Merge(kernel.merging.eta(vertex.si.p), isolated)
+
+
+def may_merge(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
+    """Mask: at ``vertex`` the path so far is isolated, the edge to it included, and its event not delta.
+
+    ``first`` as of `newest_coefficient`; ``walk`` as it was before it arrived.
+    """
+    joined = mis.is_joined(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
+    return vertex.hit & walk.isolated & vertex.connectible() & ~joined
 
 
 def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:

@@ -1,0 +1,85 @@
+"""Tracing the photons of a pass: light subpaths as far as their paths are isolated, kept in memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..sampling.points import Points
+from . import bsdf
+from . import kernel as kernels
+from .counters import Counters, one
+from .inputs import Kernel
+from .merging import BUCKET_BITS, Merging, Photon, Photons, bucket_of, cell_at, level_of
+from .observer import Observer
+from .walk import may_merge, random_walk
+
+# Photons that memory is taken for at first, over the number of subpaths: few subpaths have more.
+_CAPACITY = 0.5
+
+# Bits of a path's edges, and of the number of its subpath, in the key by which photons are sorted.
+_EDGES_BITS, _LANE_BITS = 12, 32
+
+
+def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
+    """``merging`` with the photons of ``count`` light subpaths, which these ``points`` make.
+
+    Also `Counters.summed`. Traced again if they are more than there was memory for: none is dropped.
+    """
+    kernel = kernel.bound(points, 1.0, Observer())
+    kernel.merging, kernel.last_light = merging, kernel.max_depth
+    capacity = max(int(count * _CAPACITY), 1)
+    while True:
+        photons, found, counters = _traced(kernel, count, capacity)
+        if found <= capacity:
+            return replace(merging, photons=_sorted(merging, photons, found)), counters
+        capacity = found
+
+
+def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.UInt64]:
+    """Photons in the order of their arrival, how many there are, maybe more than the ``capacity``; counts."""
+    out = dr.zeros(Photon, capacity)
+    kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
+    lanes = dr.arange(mi.UInt32, count)
+    stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
+    shared = kernels.shared_by_lane(kernel, stream)
+    e = kernels.emission(kernel, stream, shared)
+    walk = kernels.light_walk(kernel, e, stream, shared, True)
+    side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, isolated=True)
+
+    def visit(y, counters, walk):
+        keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
+        keep &= bsdf.is_finite(
+            y.throughput
+        )  # else all that are drawn with it would be NaN; the walk counts it
+        older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
+        photon = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
+        place = dr.scatter_inc(kept, mi.UInt32(0), keep)
+        dr.scatter(out, photon, place, keep & (place < most))
+        return counters + Counters(photons=one(keep))
+
+    begun = walk.active
+    counters, walk = random_walk(kernel, side, walk, stream, visit, Counters.zeros("photons"))
+    counters += Counters(photon=dr.select(begun, walk.traced(), 0), non_finite=one(walk.broken))
+    counts = counters.summed()
+    dr.eval(kept, out, counts)
+    return out, int(kept[0]), counts
+
+
+def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
+    """The first ``count`` by bucket, subpath and edge, an order that does not depend on threads."""
+    index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
+    found = dr.gather(Photon, photons, index)
+    radius = merging.radius
+    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)))
+    bucket = bucket_of(cell)
+    key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
+    order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))
+    counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
+    dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
+    starts = dr.cumsum(counts)
+    result = Photons(dr.gather(Photon, found, order), dr.gather(mi.UInt64, cell, order), starts)
+    dr.eval(result)
+    return result

@@ -1,0 +1,469 @@
+"""Merged vertices: known answers, what s = 0 finds of large lamps, and what merging must leave alone.
+
+A floor under a plate of glass, lamp and camera above: lamp, delta events, floor, delta events, camera. No
+strategy joins two neighbours of that path; point lamps are found by merging alone.
+"""
+
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import views
+import welch as st
+from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.sampling.points import Points
+from mitsuba_bdpt.transport import merging, photons
+from mitsuba_bdpt.transport.inputs import Kernel
+from mitsuba_bdpt.transport.merge_radius import Footprints
+from snapshots import ROUNDING, stopped
+
+import drjit as dr  # isort: skip
+
+LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
+IOR, THICKNESS, ALBEDO, INTENSITY = 1.5, 0.2, 0.5, 10.0
+
+# What is left of the blur at a quarter of a pixel, relative; it is 3e-3 at two pixels and falls as r^2.
+BLUR = 1e-3
+
+
+def transform():
+    return mi.ScalarTransform4f()
+
+
+def matte(value=ALBEDO):
+    return {"type": "diffuse", "reflectance": value}
+
+
+def point():
+    return {"type": "point", "position": list(LAMP), "intensity": INTENSITY}
+
+
+def sun():
+    return {"type": "directional", "direction": [0.3, 0.1, -1.0], "irradiance": 5.0}
+
+
+def ball(radius=0.5):
+    return {
+        "type": "sphere",
+        "center": list(LAMP),
+        "radius": radius,
+        "bsdf": matte(0.0),
+        "emitter": {"type": "area", "radiance": 10.0},
+    }
+
+
+def glass():
+    return {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
+
+
+def under_glass(light, floor=None, plate=None, kind="perspective", **more):
+    """The scene; ``more`` of its entries."""
+    lens = {"aperture_radius": 0.3, "focus_distance": 3.0} if kind == "thinlens" else {}
+    eye = views.camera(kind, origin=CAMERA, target=(0, 0, 0), fov=FOV, size=SIZE, **lens)
+    to_world = transform().translate([0, 0, 0.5]).scale([4, 4, THICKNESS / 2])
+    return {
+        "type": "scene",
+        "sensor": eye,
+        "floor": {"type": "rectangle", "to_world": transform().scale(4), "bsdf": floor or matte()},
+        "plate": {"type": "cube", "to_world": to_world, "bsdf": plate or glass()},
+        "light": light,
+        **more,
+    }
+
+
+def images(scene, spp, seeds, first=0, **parameters):
+    """(seeds, height, width) of the first colour."""
+    scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "rr_depth": 100, **parameters})
+    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
+    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
+
+
+# -- known answers -------------------------------------------------------------------------------------
+
+
+def transmitted(cos):
+    """What a face of the plate lets through at this cosine (Fresnel), twice."""
+    inside = np.sqrt(1 - (1 - cos * cos) / IOR**2)
+    s, p = (cos - IOR * inside) / (cos + IOR * inside), (IOR * cos - inside) / (IOR * cos + inside)
+    return (1 - (s * s + p * p) / 2) ** 2
+
+
+def shift(sin):
+    """Horizontal distance in the plate over its thickness, at this sine outside of it."""
+    return sin / np.sqrt(IOR**2 - sin * sin)
+
+
+def seen():
+    """Where each of 8 x 8 rays per pixel meets the floor, and the cosine outside of the plate."""
+    origin = np.array(CAMERA)
+    forward = -origin / np.linalg.norm(origin)
+    left = np.cross([0, 1, 0], forward)
+    left /= np.linalg.norm(left)
+    x, y = np.meshgrid(*[1 - 2 * (np.arange(8 * SIZE) + 0.5) / (8 * SIZE)] * 2)
+    half = np.tan(np.radians(FOV) / 2)
+    d = forward + half * (x[..., None] * left + y[..., None] * np.cross(forward, left))
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    cos, sin = -d[..., 2], np.linalg.norm(d[..., :2], axis=-1)
+    away = (origin[2] - THICKNESS) * sin / cos + THICKNESS * shift(sin)
+    return origin[:2] + d[..., :2] / sin[..., None] * away[..., None], cos
+
+
+def under_a_point(at):
+    """Irradiance of the floor: the lamp's flux in a ring of directions over the area of the ring it meets."""
+    theta = np.linspace(0, 1.4, 200001)
+    height = LAMP[2] - THICKNESS
+    radius = height * np.tan(theta) + THICKNESS * shift(np.sin(theta))
+    distance = np.linalg.norm(at - np.array(LAMP[:2]), axis=-1)
+    theta = np.interp(distance, radius, theta)
+    cos, sin = np.cos(theta), np.sin(theta)
+    widening = height / cos**2 + THICKNESS * cos * IOR**2 / (IOR**2 - sin**2) ** 1.5
+    return INTENSITY * transmitted(cos) * sin / (distance * widening)
+
+
+def under_the_sun(_):
+    cos = 1 / np.sqrt(1.1)
+    return 5.0 * cos * transmitted(cos)
+
+
+@pytest.mark.parametrize("light", ["point", "sun"])
+def test_floor_under_glass(light):
+    """Expected: each tile of 4 x 4 pixels has the radiance rho / pi E T, E by refraction of the lamp's
+    directions and T that of the camera's; systematic error `BLUR`. Without merging there is nothing.
+    """
+    at, cos = seen()
+    irradiance = (under_a_point if light == "point" else under_the_sun)(at)
+    expected = (ALBEDO / np.pi * irradiance * transmitted(cos)).reshape(4, 32, 4, 32).mean((1, 3)).ravel()
+    scene = mi.load_dict(under_glass(point() if light == "point" else sun()))
+    found = images(scene, 512, 10, merging=True, merging_radius=0.25)
+    st.check_known(st.tiles(found), expected, relative=0.2, rounding=BLUR)
+    st.check_known(found.mean((1, 2)), expected.mean(), relative=0.02, rounding=BLUR)
+    if light == "point":
+        assert not images(scene, 4, 1).any()
+
+
+def test_blur_goes_as_the_square_of_the_radius():
+    """Expected: with the same photons, what discs of 1.5 and three pixels lack of those of half a pixel is as
+    (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4; between 3 and 6 (photons that larger discs take besides).
+    """
+    scene = mi.load_dict(under_glass(point()))
+    small, middle, large = (
+        images(scene, 512, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
+    )
+    assert 3 < (large - small) / (middle - small) < 6
+    assert middle < small
+
+
+# -- against s = 0 -------------------------------------------------------------------------------------
+
+
+def bumpy(bsdf):
+    rng = np.random.default_rng(2)
+    heights = mi.Bitmap(rng.random((16, 16, 1), dtype=np.float32) * 0.02)
+    texture = {"type": "bitmap", "bitmap": heights, "raw": True}
+    return {"type": "bumpmap", "arbitrary": texture, "bsdf": bsdf}
+
+
+def mirror():
+    """Beside the floor, so that the camera sees it there too."""
+    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
+
+
+CASES = {
+    "diffuse": {},
+    "plastic": {"floor": {"type": "plastic"}},
+    "rough metal": {"floor": {"type": "roughconductor", "alpha": 0.3}},
+    "rough glass above": {"plate": {"type": "thindielectric"}},
+    "bumpy glass": {"plate": bumpy},
+    "bumpy floor": {"floor": bumpy},
+    "masked floor": {"floor": {"type": "mask", "opacity": 0.6, "bsdf": {"type": "diffuse"}}},
+    "mirror": {"mirror": mirror},
+    "lens": {"kind": "thinlens"},
+}
+
+
+@pytest.mark.parametrize("parameters", [{}, {"skip": "none"}], ids=["default", "all"])
+@pytest.mark.parametrize("case", CASES)
+def test_large_lamps_look_as_without(case, parameters):
+    """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what merging finds. Expected: the same
+    tiles, by Welch's test, in discs of a quarter of a pixel.
+    """
+    more = {
+        name: value(glass() if name == "plate" else matte()) if value is bumpy else value
+        for name, value in CASES[case].items()
+    }
+    if "mirror" in more:
+        more["mirror"] = mirror()
+    scene = mi.load_dict(under_glass(ball(), **more))
+    a = images(scene, 256, 8, merging=True, merging_radius=0.25, **parameters)
+    b = images(scene, 256, 8, first=100, **parameters)
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+def test_a_lens_and_a_point_lamp():
+    """Rationale: a wide lens is hit by light subpaths, t = 0, which makes the paths that merging makes.
+    Expected: the same tiles as by t = 0 alone, in discs of half a pixel.
+    """
+    scene = under_glass(point(), kind="thinlens")
+    scene["sensor"] |= {"aperture_radius": 0.8}
+    scene = mi.load_dict(scene)
+    a = images(scene, 512, 8, merging=True, merging_radius=0.5, skip="none")
+    b = images(scene, 512, 8, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
+
+
+def test_paths_longer_than_stored():
+    """Rationale: t = 0 makes no path of more than ``stored_vertices`` edges, merging does. Expected: with 1
+    the same tiles as without merging and limits.
+    """
+    scene = under_glass(ball(), kind="thinlens")
+    scene["sensor"] |= {"aperture_radius": 0.8}
+    scene = mi.load_dict(scene)
+    a = images(scene, 256, 8, merging=True, merging_radius=0.5, skip="none", stored_vertices=1)
+    b = images(scene, 256, 8, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+@pytest.mark.parametrize("heuristic", ["power", "maximum", "uniform"])
+def test_heuristics(heuristic):
+    """Expected: the same tiles as with the balance heuristic without merging."""
+    scene = mi.load_dict(under_glass(ball()))
+    a = images(scene, 256, 8, merging=True, merging_radius=0.25, heuristic=heuristic)
+    b = images(scene, 256, 8, first=100)
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+def test_what_is_not_connected_is_merged():
+    """Rationale: an edge is joined only by a strategy that is in use. A point lamp above the plate, the
+    camera below it: t = 1 sees the floor; without light subpaths merging does. Expected: the same tiles.
+    """
+    scene = under_glass(point())
+    scene["sensor"] = views.camera(origin=(0, 0.1, 0.35), target=(0.5, 0, 0), fov=90, size=SIZE)
+    scene = mi.load_dict(scene)
+    a = images(scene, 256, 8, max_depth=4, merging=True, merging_radius=0.25, light_paths=0)
+    b = images(scene, 256, 8, first=100, max_depth=4)
+    assert b.mean() > 0.01
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+# -- what merging leaves alone ----------------------------------------------------------------------------
+
+
+def test_other_paths_are_what_they_were():
+    """Rationale: paths that some strategy joins weigh what they weighed. Expected: without glass the image is
+    that of the same seed without merging, to the rounding of sums; a mirror out of sight is there, so that
+    photons are looked for.
+    """
+    mirror = {"type": "sphere", "center": [0, 0, 9], "radius": 0.1, "bsdf": {"type": "conductor"}}
+    scene = mi.load_dict(under_glass(ball(), plate=matte(0.3), mirror=mirror))
+    a, b = (images(scene, 16, 1, merging=merges) for merges in (True, False))
+    np.testing.assert_allclose(a, b, **ROUNDING)
+
+
+def test_joined_paths_are_not_merged():
+    """Rationale: one joined edge is enough. A wall above the plate, lit by the floor below it through the
+    glass: t = 1 joins it with the camera. Expected: the image of the same seed without merging.
+    """
+    to_world = transform().translate([-2, 0, 2]).rotate([0, 1, 0], 90).scale(1.2)
+    wall = {"type": "rectangle", "to_world": to_world, "bsdf": matte()}
+    scene = under_glass(point(), wall=wall)
+    scene["sensor"] = views.camera(origin=(1, 0, 2), target=(-2, 0, 2), fov=35, size=SIZE)
+    scene = mi.load_dict(scene)
+    a, b = (images(scene, 64, 1, max_depth=8, merging=merges) for merges in (True, False))
+    np.testing.assert_allclose(a, b, **ROUNDING)
+    assert a.min() > 0
+
+
+def test_nothing_leaks_through_a_thin_wall():
+    """Expected: a floor that is lit through glass from below alone is black from above."""
+    scene = under_glass(point() | {"position": [0.5, 0, -2.0]})
+    below = transform().translate([0, 0, -0.5]).scale([4, 4, 0.1])
+    scene["below"] = {"type": "cube", "to_world": below, "bsdf": glass()}
+    scene["floor"]["bsdf"] = {"type": "twosided", "bsdf": matte()}
+    assert not images(scene, 64, 2, merging=True, merging_radius=2.0).any()
+
+
+CHANGES = {
+    "crop window": {"film": {"crop_width": 8, "crop_height": 4, "crop_offset_x": 4, "crop_offset_y": 6}},
+    "border": {"film": {"sample_border": True, "rfilter": {"type": "gaussian"}}},
+    "hidden lamp": {"bdpt": {"hide_emitters": True}},
+    "features": {"bdpt": {"aovs": "dd:depth"}},
+    "instance": {},
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_makes_no_difference(change):
+    """Expected: the same tiles of the floor as without the change (in the window of pixels that both have);
+    the instance is of the plate.
+    """
+    more = CHANGES[change]
+    plain, changed = under_glass(point()), under_glass(point())
+    changed["sensor"]["film"] |= more.get("film", {})
+    if change == "instance":
+        plate = changed.pop("plate")
+        changed["group"] = {
+            "type": "shapegroup",
+            "plate": plate | {"to_world": transform().scale([4, 4, 0.1])},
+        }
+        to_world = transform().translate([0, 0, 0.5])
+        changed["again"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
+    a = images(plain, 256, 8, merging=True)
+    b = images(changed, 256, 8, first=100, merging=True, **more.get("bdpt", {}))
+    if change == "crop window":
+        a = a[:, 6:10, 4:12]
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=2)
+
+
+def test_sensors_without_pixels():
+    """Rationale: a meter has no pixels by which to measure a disc. It faces the floor below the plate.
+    Expected: without light subpaths merging finds what t = 1 finds with them.
+    """
+    scene = under_glass(point())
+    del scene["sensor"]
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    film |= {"pixel_format": "rgb", "component_format": "float32"}
+    meter = {"type": "irradiancemeter", "film": film}
+    to_world = transform().translate([0.5, 0, 0.2]).rotate([1, 0, 0], 180).scale(0.2)
+    scene["paper"] = {"type": "rectangle", "to_world": to_world, "bsdf": matte(), "sensor": meter}
+    scene = mi.load_dict(scene)
+    a = images(scene, 1 << 14, 8, max_depth=4, merging=True, light_paths=0)
+    b = images(scene, 1 << 14, 8, first=100, max_depth=4)
+    assert b.mean() > 0.01
+    st.assert_agree(st.compare_images(a.reshape(8, 1), b.reshape(8, 1)))
+
+
+# -- photons -----------------------------------------------------------------------------------------------
+
+
+def traced(count=1 << 14):
+    """The photons of one pass, as arrays of NumPy."""
+    scene = mi.load_dict(under_glass(ball()))
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    render = rendering.Render(scene, scene.sensors()[0], method.settings, 0, 4)
+    kernel: Kernel = render.kernel
+    radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
+    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count))
+    of_pass, counts = photons.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
+    found = of_pass.photons.found
+    arrays = [np.array(getattr(found, name)) for name in ("p", "d", "n", "flux", "older", "edges", "lane")]
+    return arrays, np.array(of_pass.photons.starts), counts.numpy()
+
+
+def test_photons_are_in_the_same_order_on_any_number_of_threads():
+    """Rationale: photons are kept in the order in which threads find them, and sums of a draw depend on
+    their order. Expected: after sorting they are the same to the bit with one thread and with several.
+    """
+    first, starts, _ = traced()
+    assert len(first[4]) > 1000 and starts[-1] == len(first[4]) and (np.diff(starts.astype(int)) >= 0).all()
+    before = dr.thread_count()
+    try:
+        for threads in (1, 4):
+            dr.set_thread_count(threads)
+            again, others, _ = traced()
+            np.testing.assert_array_equal(starts, others)
+            for a, b in zip(first, again, strict=True):
+                np.testing.assert_array_equal(a, b)
+    finally:
+        dr.set_thread_count(before)
+
+
+def test_cells_may_share_a_bucket(monkeypatch):
+    """Expected: with four buckets, in which all cells share, the image of the same photons; under a point
+    lamp on a matte floor it does not depend on which photon of a disc is drawn.
+    """
+    scene = mi.load_dict(under_glass(point()))
+    expected = images(scene, 16, 1, merging=True)
+    for module in (photons, merging):
+        monkeypatch.setattr(module, "BUCKET_BITS", 2)
+    np.testing.assert_allclose(images(scene, 16, 1, merging=True), expected, **ROUNDING)
+
+
+def test_which_photons_are_near():
+    """Expected: those in the disc, in a flat cylinder about it, whose normals agree to 37 degrees."""
+    p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0], 0, [0, 0, 0, 0.24, 0.26, 0, 0])
+    n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51)])
+    photon = merging.Photon(p, None, n, None, None, None, None)
+    z = SimpleNamespace(si=SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1)))
+    found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
+    assert found == [True, True, False, True, False, True, False]
+
+
+def test_no_photon_is_dropped(monkeypatch):
+    """Rationale: there may be more photons than there was memory for. Expected: with room for a few the same
+    photons and counts, which are traced again.
+    """
+    first, _, counts = traced()
+    monkeypatch.setattr(photons, "_CAPACITY", 1e-3)
+    again, _, others = traced()
+    np.testing.assert_array_equal(counts, others)
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# -- renders -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("parameters", [{}, {"variance": True}], ids=str)
+def test_a_resumed_render_is_the_uninterrupted_one(parameters):
+    """Rationale: radius and photons of a pass follow from the passes done (of the replicate). Expected: the
+    image of a render that went on is that of the one that never stopped.
+    """
+
+    def bdpt():
+        given = {"type": "bdpt", "max_depth": 6, "merging": True, "spp_per_pass": 8}
+        return mi.load_dict(given | parameters)
+
+    scene = mi.load_dict(under_glass(point()))
+    expected = np.array(bdpt().render(scene, seed=3, spp=64))
+    start = stopped(bdpt(), scene, 3, seed=3, spp=64)
+    again = bdpt()
+    np.testing.assert_allclose(
+        np.array(again.render(scene, seed=3, spp=64, start=start)), expected, **ROUNDING
+    )
+    assert expected.any()
+
+
+def test_what_a_render_says():
+    """Expected: `explain` and the statistics say that the render is not unbiased, and nothing is lost."""
+    scene = mi.load_dict(under_glass(point()))
+    plain, merged = (mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": m}) for m in (False, True))
+    assert "lost: delta emitter" in plain.explain(scene)
+    text = merged.explain(scene)
+    assert "lost:" not in text and "consistent, not unbiased" in text
+    mi.render(scene, integrator=merged, spp=4)
+    found = merged.statistics
+    assert not found["unbiased"] and found["merging"]["photons"] and found["merging"]["merges"]
+    assert found["rays"]["photon"] and found["lost_light"] == {}
+    mi.render(scene, integrator=plain, spp=4)
+    assert plain.statistics["unbiased"] and "merging" not in plain.statistics
+    assert "photon" not in plain.statistics["rays"]
+
+
+def test_what_needs_no_merging():
+    """Expected: without delta surfaces no photon is traced, the render is unbiased, and `explain` says so."""
+    scene = mi.load_dict(under_glass(ball(), plate=matte()))
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    assert "skipped (impossible): merging: without delta surfaces" in method.explain(scene)
+    mi.render(scene, integrator=method, spp=4)
+    assert method.statistics["unbiased"] and not method.statistics["rays"]["photon"]
+
+
+def test_what_is_refused():
+    """Expected: errors that name the parameter, what is in the way, and the remedy."""
+    # (Mitsuba's loader makes RuntimeErrors of all errors.)
+    with pytest.raises(RuntimeError, match="merging together with strategy_images"):
+        mi.load_dict({"type": "bdpt", "max_depth": 3, "merging": True, "strategy_images": True})
+    with pytest.raises(RuntimeError, match="merging_radius=0"):
+        mi.load_dict({"type": "bdpt", "merging_radius": 0.0})
+    method = mi.load_dict({"type": "bdpt", "merging": True})
+    moving = under_glass(ball())
+    moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}
+    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
+    foggy = under_glass(ball(), plate={"type": "null"})
+    foggy["plate"]["interior"] = fog
+    for scene, words in ((moving, "shutter"), (foggy, "participating media")):
+        with pytest.raises(NotImplementedError, match=words):
+            method.render(mi.load_dict(scene), spp=1)
