@@ -723,6 +723,20 @@ MUTANTS = (
         ("tests/images/test_merging.py::test_floor_under_glass[sun]",),
     ),
     Mutant(
+        "merging: merges count as independent",
+        "transport/merging.py",
+        "return min(1.0, 1 / (samples * math.pi * radius**2))",
+        "return 1.0",
+        ("tests/images/test_merging.py::test_merges_do_not_outweigh_what_is_better",),
+    ),
+    Mutant(
+        "merging: what merging finds is called lost",
+        "planning/lost_light.py",
+        "    if plan.merging:  # which",
+        "    if False:  # which",
+        ("tests/images/test_merging.py::test_no_light_is_called_lost_that_merging_finds[perspective]",),
+    ),
+    Mutant(
         "merging: s = 0 does not know of merges",
         "transport/techniques.py",
         "dr.select(joined, 0, merges))",

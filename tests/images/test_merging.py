@@ -345,7 +345,7 @@ def traced(count=1 << 14):
     render = rendering.Render(scene, scene.sensors()[0], method.settings, 0, 4)
     kernel: Kernel = render.kernel
     radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
-    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count))
+    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1))
     of_pass, counts = photons.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
     found = of_pass.photons.found
     arrays = [np.array(getattr(found, name)) for name in ("p", "d", "n", "flux", "older", "edges", "lane")]
@@ -440,6 +440,27 @@ def test_what_a_render_says():
     mi.render(scene, integrator=plain, spp=4)
     assert plain.statistics["unbiased"] and "merging" not in plain.statistics
     assert "photon" not in plain.statistics["rays"]
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
+def test_no_light_is_called_lost_that_merging_finds(kind):
+    """Rationale: paths of more than 64 edges, and those through the lens itself, are lost with merging too,
+    and the share of lost light was estimated by all. Expected: no share, at any depth.
+    """
+    scene = mi.load_dict(under_glass(point(), kind=kind))
+    method = mi.load_dict({"type": "bdpt", "merging": True, "light_paths": 0})
+    mi.render(scene, integrator=method, spp=4)
+    assert method.statistics["lost_light"] == {}
+
+
+def test_merges_do_not_outweigh_what_is_better():
+    """Rationale: all camera vertices in a disc meet the same photons; weighted as if these were independent,
+    merges under a sky had 183 times the variance of s = 0. Expected: at most 1.3 times that without merging,
+    in the mean of the pixels (10 seeds: 2,304 degrees of freedom, of pixels that have photons in common).
+    """
+    scene = mi.load_dict(under_glass({"type": "constant", "radiance": 1.0}))
+    a, b = (images(scene, 256, 10, merging=merges).var(0, ddof=1).mean() for merges in (True, False))
+    assert 0 < a < 1.3 * b
 
 
 def test_what_needs_no_merging():

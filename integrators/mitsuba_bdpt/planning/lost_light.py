@@ -129,6 +129,8 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
     """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
     if plan.arrival or not prepared.emitters.traced:  # what starts no light subpath has none to look with
         return False
+    if plan.merging:  # which finds the paths that are looked at
+        return False
     if prepared.space is not None:  # what it looks with knows surfaces only
         return False
     return bool(unreachable_paths(prepared, plan, settings))

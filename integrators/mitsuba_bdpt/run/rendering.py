@@ -30,7 +30,7 @@ from ..transport import mis, photons
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.merge_radius import SHRINKING, Footprints
-from ..transport.merging import Merging
+from ..transport.merging import Merging, coefficient
 from ..transport.plan import Plan
 from .pass_points import PassPoints
 from .progress import Progress
@@ -230,7 +230,8 @@ class Render:
         done = passes_since(self.passes, step.done)
         factor = self._radius_in_pixels(done)
         count = photons_of(step.size * int(self.prepared.camera.region.size.prod()))
-        merging = Merging(footprints.radius(factor), dr.opaque(mi.Float, count))
+        kappa = coefficient(step.size, factor)
+        merging = Merging(footprints.radius(factor), dr.opaque(mi.Float, count), dr.opaque(mi.Float, kappa))
         points = self.points.of_photons(step, done, self.planner.changes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
             merging, counts = photons.trace(self.kernel, merging, points, count)

@@ -68,8 +68,8 @@ class Partial:
 class Merge:
     """A merge at a vertex.
 
-    ``eta``: number of photons' subpaths times the area of the disc; ``isolated``: the path up to the event
-    there has no edge that a strategy in use joins.
+    ``eta``: kappa times the number of photons' subpaths times the area of the disc; ``isolated``: the path up
+    to the event there has no edge that a strategy in use joins.
     """
 
     eta: mi.Float

@@ -407,7 +407,7 @@ def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, coefficient: mis.Coeffici
     if walk.isolated is None:
         return None
     isolated = walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
-    return mis.Merge(kernel.merging.eta(vertex.si.p), isolated)
+    return mis.Merge(kernel.merging.weighed(vertex.si.p), isolated)
 
 
 def may_merge(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
