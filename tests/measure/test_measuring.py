@@ -132,7 +132,7 @@ def test_a_terminal_sees_how_far_a_command_is(here, monkeypatch, capsys):
     common = ["elsewhere/room.xml", "--resolution", "16", "--project", "project", "--spp", "2"]
     compare = ["compare", "bdpt", "path", "--pairs", "1", "--scenes", *common]
     for words, text in (
-        (["reference", *common, "--seconds", "1"], "room: seconds of the reference"),
+        (["reference", *common, "--seconds", "60"], "room: seconds of the reference"),
         (compare, "room, 2 spp, seed 1"),
         (["equal-time", *common], "bdpt"),
         (["pyramid", *common], "room: samples per pixel"),
