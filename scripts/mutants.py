@@ -734,7 +734,10 @@ MUTANTS = (
         "planning/lost_light.py",
         "    if plan.merging:  # which",
         "    if False:  # which",
-        ("tests/images/test_merging.py::test_no_light_is_called_lost_that_merging_finds[perspective]",),
+        (
+            "tests/images/test_merging.py::test_no_light_is_called_lost_that_merging_finds[perspective]",
+            "tests/images/test_merging.py::test_no_light_is_called_lost_that_merging_finds[thinlens]",
+        ),
     ),
     Mutant(
         "merging: s = 0 does not know of merges",
