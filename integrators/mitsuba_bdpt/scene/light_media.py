@@ -135,14 +135,20 @@ def _outside(space: Space, found: np.ndarray) -> int:
 
 def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the media before the first boundaries around the sensor, and whether there are any."""
-    u = np.random.default_rng(0).random((5, _PROBES))
-    film, aperture = mi.Point2f(u[2], u[3]), mi.Point2f(u[0], u[1])
-    own, _ = sensor.sample_ray_differential(sensor.shutter_open(), mi.Float(u[4]), film, aperture)
+    own, u = _camera_rays(sensor, _PROBES, 0)
     at_one_point = sensor.class_name() in _AT_ONE_POINT
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1])) if at_one_point else own.d
     rays = mi.Ray3f(own.o + dr.zeros(mi.Point3f, _PROBES), d)
     number, found = boundaries.near_side(space, rays, mi.Bool(True))
     return np.array(number), np.array(found)
+
+
+def _camera_rays(sensor: mi.Sensor, count: int, seed: int):
+    """So many random rays of a sensor, and the random numbers that they were made of, (5, count)."""
+    u = np.random.default_rng(seed).random((5, count))
+    film, aperture = mi.Point2f(u[2], u[3]), mi.Point2f(u[0], u[1])
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), mi.Float(u[4]), film, aperture)
+    return ray, u
 
 
 # Sensors whose rays start near to one point, around which everything is looked at.
@@ -225,9 +231,7 @@ def medium_at_far_plane(space: Space, sensor: mi.Sensor) -> int:
     infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in space.scene.emitters())
     if not infinite or not isinstance(sensor, mi.ProjectiveCamera):
         return 0
-    u = np.random.default_rng(3).random((5, _OF_EMITTER))
-    film, aperture = mi.Point2f(u[2], u[3]), mi.Point2f(u[0], u[1])
-    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), mi.Float(u[4]), film, aperture)
+    ray, _ = _camera_rays(sensor, _OF_EMITTER, 3)
     number, arrived = (
         np.array(x) for x in boundaries.behind(space, mi.Ray3f(ray), mi.UInt32(space.media.sensor))
     )

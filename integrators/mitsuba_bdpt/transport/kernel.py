@@ -41,6 +41,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             if z is a hit: d_vcm, d_vc <- in the area measure               walk._vertex
             a point of an emitter; direction of the next edge and BSDF      walk._interact
                 towards that point <- one virtual call
+            where vertices are merged: total += z merged with a photon      merging.merge
             s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
                         (eqs. 42, 43)
             s = 1:  total += z lit by the point (eqs. 44, 45)               techniques.next_event

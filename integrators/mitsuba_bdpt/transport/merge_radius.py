@@ -22,7 +22,7 @@ _OF_DIAGONAL = 1 / 512
 # M. Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
 SHRINKING = 2 / 3
 
-# Most change of the radius per distance, see `Grid` in `merging`.
+# Most change of the radius per distance: the widths of cells allow for it (`merging.cell_at`).
 _STEEPEST = 0.5
 
 
