@@ -73,6 +73,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
         merging=merging,
+        guided=bool(__import__("os").environ.get("BDPT_GUIDED")),
     )
 
 

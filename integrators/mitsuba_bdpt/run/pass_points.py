@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points
-from ..sampling.sequences import CHANGED, PHOTONS, sequence_seed
+from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, sequence_seed
 from ..settings import Settings
 from ..transport.batch import Batch
 from .schedule import Step
@@ -39,6 +39,10 @@ class PassPoints:
         if number := step.replicate + (CHANGED + changes if changes else 0):
             seed = sequence_seed(seed, number)
         return Points("independent" if self._kind == "independent" else "sobol", seed)
+
+    def of_guide(self) -> Points:
+        """The points of the photons that guide s = 0."""
+        return Points("independent" if self._kind == "independent" else "sobol", sequence_seed(self.seed, GUIDE))
 
     def _of_sampler(self, step: Step, batch: Batch, seed) -> Points:
         """One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do."""

@@ -34,7 +34,7 @@ from ..transport.merging import Merging, coefficient
 from ..transport.plan import Plan
 from .pass_points import PassPoints
 from .progress import Progress
-from .schedule import REPLICATES, Step, batches, passes_since, photons_of, schedule
+from .schedule import REPLICATES, Step, batches, guide_photons_of, passes_since, photons_of, schedule
 from .snapshot import Snapshot, identity
 from .statistics import rays
 from .work import Meter
@@ -206,6 +206,8 @@ class Render:
     def _pass(self, step: Step):
         """Trace one pass, a launch for each of its batches."""
         first = not self.passes and self.planner.threshold is None
+        if self.plan.guided and self.kernel.guide is None:
+            self.kernel.guide = self._guide()
         if self.footprints is not None:
             self.kernel.merging = self._photons(step, self.footprints)
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
@@ -237,6 +239,14 @@ class Render:
             merging, counts = photons.trace(self.kernel, merging, points, count)
         self.meter.launched(counts)
         return merging
+
+    def _guide(self):
+        points = self.points.of_guide()
+        count = guide_photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
+        with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
+            guide, counts = photons.trace_guide(self.kernel, points, count)
+        self.meter.launched(counts)
+        return guide
 
     def _is_exact_enough(self) -> bool:
         """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""

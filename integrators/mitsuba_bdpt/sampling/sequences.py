@@ -12,6 +12,9 @@ PILOT, CHANGED = 1 << 16, 1 << 17
 # Photons have the sequence that follows this by the number of passes done, or one that follows from it.
 PHOTONS = 1 << 18
 
+# Those of the guide of s = 0.
+GUIDE = 1 << 19
+
 
 def sequence_seed(seed, number: int):
     """Seed of the sequence ``number`` of a render of ``seed`` (``UInt32`` both)."""

@@ -22,7 +22,8 @@ class Counters:
     subpaths that end for want of a finite throughput, colours, features. In scenes with media ``segments``
     of edges, those of joins included, each with a ray of its own, and tentative ``collisions`` in grids.
     With merging closest hits of photons' subpaths (``photon``), the ``photons`` kept, and the ``merges``:
-    camera vertices near to some.
+    camera vertices near to some. Where s = 0 is guided the same of photons, the camera vertices where it was
+    (``aimed``), and the closest hits that followed (``guided``).
 
     Records are added up, never changed: Dr.Jit's loops would not see it.
     """
@@ -41,6 +42,8 @@ class Counters:
     photon: mi.UInt32 | None = None
     photons: mi.UInt32 | None = None
     merges: mi.UInt32 | None = None
+    aimed: mi.UInt32 | None = None
+    guided: mi.UInt32 | None = None
 
     @staticmethod
     def zeros(*names: str) -> Counters:

@@ -83,6 +83,8 @@ class Kernel:
         self.inverse_threshold = f32(dr.inf)
         # The photons of a pass, a `merging.Photons`; None where vertices are not merged.
         self.merging = None
+        # What guides s = 0, a `photon_guide.Guide`; None where nothing does.
+        self.guide = None
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch, with the batch's ``points``.

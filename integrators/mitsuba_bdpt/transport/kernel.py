@@ -95,7 +95,7 @@ from ..geometry import rays
 from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
-from . import bsdf, contribution, merging, mis, stored_vertices, techniques
+from . import bsdf, contribution, guided_hits, merging, mis, stored_vertices, techniques
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Shared
@@ -266,12 +266,14 @@ def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
     if kernel.space is not None:
         edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
-    return replace(walk, broken=broken)
+    only_delta = mi.Bool(True) if merges and kernel.guide is not None else None
+    return replace(walk, broken=broken, only_delta=only_delta)
 
 
 def _no_merges(kernel: Kernel, asked: bool):
     """``d_vm`` of a subpath that begins; the number 0 where it is not ``asked`` for."""
-    return kernel.heuristic.zero() if asked and kernel.merging is not None else 0
+    used = kernel.merging is not None or kernel.guide is not None
+    return kernel.heuristic.zero() if asked and used else 0
 
 
 def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
@@ -295,6 +297,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
         kernel.kappa.direct,
         complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
         join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
+        guide=None if walk.only_delta is None else lambda y, walk, _: guided_hits.look_back(kernel, y, walk),
     )
 
 
@@ -325,6 +328,8 @@ def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
 
 def _camera_counters(kernel: Kernel) -> Counters:
     counters = counted_by_camera(kernel.plan, kernel.space)
+    if kernel.guide is not None:
+        counters += Counters.zeros("guided", "aimed")
     return counters if kernel.merging is None else counters + Counters.zeros("merges")
 
 
@@ -365,7 +370,8 @@ def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
     else:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     partial = _first_partial(kernel, start)
-    return Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
+    walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
+    return walk if kernel.guide is None else replace(walk, isolated=mi.Bool(True), guided=mi.Float(0))
 
 
 def _first_partial(kernel: Kernel, start):
@@ -374,12 +380,15 @@ def _first_partial(kernel: Kernel, start):
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
         arrival = h.present(arrival)
-    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival, _no_merges(kernel, True))
+    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival, _no_merges(kernel, kernel.guide is None))
 
 
 def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Side:
     def choose_emitter(z):
         return techniques.choose_emitter(kernel, z, sample.stream)
+
+    def aim(z, walk, step):
+        return guided_hits.aim(kernel, z, walk, step, sample.stream)
 
     return Side(
         "camera",
@@ -391,6 +400,7 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
         alpha=sink.alpha,
         parallel=kernel.camera.parallel,
         join=choose_emitter if kernel.plan.direct else None,
+        guide=aim if kernel.guide is not None else None,
     )
 
 
@@ -422,6 +432,8 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             counted = counters.non_finite, counters.merges
             total, lost, merges = merged(z, walk, total, counted)
             counters = replace(counters, non_finite=lost, merges=merges)
+        if kernel.guide is not None:
+            total, counters = guided_hits.follow(kernel, z, sample.stream, total, counters, add, shared)
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
             total, lost = dr.if_stmt(

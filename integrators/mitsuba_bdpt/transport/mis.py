@@ -66,13 +66,13 @@ class Partial:
 
 @dataclass
 class Merge:
-    """A merge at a vertex.
+    """A merge at a vertex, or what else makes isolated paths there.
 
-    ``eta``: kappa times the number of photons' subpaths times the area of the disc; ``isolated``: the path up
-    to the event there has no edge that a strategy in use joins.
+    ``ratio``: the partial sum of it, kappa times the number of photons' subpaths times the area of the disc;
+    ``isolated``: the path up to the event there has no edge that a strategy in use joins.
     """
 
-    eta: mi.Float
+    ratio: mi.Float | mi.Vector4f
     isolated: mi.Bool
 
 
@@ -259,7 +259,7 @@ def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge:
     """``d_vm`` after an event: the merges before it, and that at this vertex, which joins no delta event."""
     merges = heuristic.combine(
         heuristic.scale(partial.d_vm, step.pdf_rev_w),
-        heuristic.start(merge.eta),
+        merge.ratio,
     )
     kept = dr.select(
         step.delta,

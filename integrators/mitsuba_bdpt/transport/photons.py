@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points
-from . import bsdf
+from . import bsdf, mis
 from . import kernel as kernels
 from .counters import Counters, one
 from .inputs import Kernel
 from .merging import BUCKET_BITS, Merging, Photon, Photons, bucket_of, cell_at, level_of
 from .observer import Observer
-from .walk import may_merge, random_walk
+from .photon_guide import Guide, GuidePhoton
+from .walk import may_merge, newest_coefficient, random_walk
 
 # Photons that memory is taken for at first, over the number of subpaths: few subpaths have more.
 _CAPACITY = 0.5
@@ -28,36 +30,74 @@ def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple
 
     Also `Counters.summed`. Traced again if they are more than there was memory for: none is dropped.
     """
+    kernel = _kernel(kernel, points)
+    kernel.merging = merging
+
+    def photon(y, walk, lanes):
+        keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
+        older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
+        return keep, Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
+
+    photons, found, counters = _all(kernel, count, Photon, photon, {"isolated": True})
+    return replace(merging, photons=_sorted(merging, photons, found)), counters
+
+
+def trace_guide(kernel: Kernel, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
+    """The guide that ``count`` light subpaths make, None if they give no photon; `Counters.summed`.
+
+    Photons are those that s = 0 might find, at the first vertex that is not delta.
+    """
+    kernel = _kernel(kernel, points)
+    kernel.guide = None
+
+    def photon(y, walk, lanes):
+        joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
+        keep = y.hit & y.connectible() & ~joined & (y.edges < kernel.max_depth)
+        keep &= y.partial.d_vc > 0
+        return keep, GuidePhoton(y.si.p, -walk.d, dr.norm(y.si.p - y.previous), lanes)
+
+    photons, found, counters = _all(kernel, count, GuidePhoton, photon, {"only_delta": True})
+    return Guide.of(photons, found) if found else None, counters
+
+
+def _kernel(kernel: Kernel, points: Points) -> Kernel:
     kernel = kernel.bound(points, 1.0, Observer())
-    kernel.merging, kernel.last_light = merging, kernel.max_depth
+    kernel.last_light = kernel.max_depth
+    return kernel
+
+
+def _all(kernel: Kernel, count: int, kind, photon, ends) -> tuple[Any, int, mi.UInt64]:
+    """As `_traced`; none is left out."""
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        photons, found, counters = _traced(kernel, count, capacity)
+        photons, found, counters = _traced(kernel, count, dr.zeros(kind, capacity), photon, ends)
         if found <= capacity:
-            return replace(merging, photons=_sorted(merging, photons, found)), counters
+            return photons, found, counters
         capacity = found
 
 
-def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.UInt64]:
-    """Photons in the order of their arrival, how many there are, maybe more than the ``capacity``; counts."""
-    out = dr.zeros(Photon, capacity)
+def _traced(kernel: Kernel, count: int, out, photon, ends) -> tuple[Any, int, mi.UInt64]:
+    """Photons in the order of their arrival, how many there are, maybe more than fit into ``out``; counts.
+
+    ``photon(y, walk, lanes)`` says whether there is one at a vertex, and which; ``ends`` what `Side` has to
+    end subpaths.
+    """
+    capacity = dr.width(out)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
     shared = kernels.shared_by_lane(kernel, stream)
     e = kernels.emission(kernel, stream, shared)
     walk = kernels.light_walk(kernel, e, stream, shared, True)
-    side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, isolated=True)
+    side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, **ends)
 
     def visit(y, counters, walk):
-        keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
+        keep, found = photon(y, walk, lanes)
         keep &= bsdf.is_finite(
             y.throughput
         )  # else all that are drawn with it would be NaN; the walk counts it
-        older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
-        photon = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
         place = dr.scatter_inc(kept, mi.UInt32(0), keep)
-        dr.scatter(out, photon, place, keep & (place < most))
+        dr.scatter(out, found, place, keep & (place < most))
         return counters + Counters(photons=one(keep))
 
     begun = walk.active

@@ -14,7 +14,8 @@ class Plan:
     ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t<=1 over its count;
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
-    left out. ``merging``: whether vertices of isolated paths are merged.
+    left out. ``merging``: whether vertices of isolated paths are merged;
+    ``guided``: whether s = 0 is guided on them.
     """
 
     hit: bool
@@ -30,6 +31,7 @@ class Plan:
     hide_emitters: bool
     skipped: tuple[dict[str, str], ...] = ()
     merging: bool = False
+    guided: bool = False
 
     @property
     def light(self) -> bool:

@@ -39,8 +39,8 @@ def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     return active
 
 
-def hit_emitter(kernel: Kernel, z: Vertex) -> Contribution:
-    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43)."""
+def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution:
+    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43); one that was ``guided`` there, or its own."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
     active = sees_emitter(kernel, z)
@@ -65,7 +65,15 @@ def hit_emitter(kernel: Kernel, z: Vertex) -> Contribution:
         merges = h.scale(z.partial.d_vm, pdf_first * pdf_second)
         joined = mis.is_joined(z.partial, newest)
         camera_side = h.combine(camera_side, dr.select(joined, 0, merges))
-    weight, shares = h.weigh(kernel.kappa.hit, 0, camera_side)
+    light_side = 0
+    if z.guided is not None:  # the other of the two ways to make this path with s = 0
+        joined = mis.is_joined(z.partial, newest)
+        other = h.scale(dr.select(joined, 0, z.guided), kernel.kappa.hit)
+        if guided:
+            light_side, active = other, active & ~joined
+        else:
+            camera_side = h.combine(camera_side, other)
+    weight, shares = h.weigh(kernel.kappa.hit, light_side, camera_side)
     value = _known(z.throughput * radiance, pdf_connect, pdf_first, pdf_second)
     return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
 

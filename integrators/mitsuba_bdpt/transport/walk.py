@@ -35,7 +35,9 @@ class Walk:
     refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
     happened; ``broken``: it ended for want of a finite throughput or shading frame; ``edge`` what it carries
     along an edge in scenes with media, else None; ``isolated``: none of its edges is joined by a strategy in
-    use, see `merging` (None where vertices are not merged).
+    use, see `merging` (None where vertices are neither merged nor s = 0 guided). Where s = 0 is guided (see
+    `guided_hits`), camera subpaths have in ``guided`` the other density of their last direction that was not
+    delta over its own, and light subpaths in ``only_delta`` whether all their events were delta.
 
     What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
     """
@@ -53,6 +55,8 @@ class Walk:
     active: mi.Bool
     edge: Any = None  # a `flight.Edge`
     isolated: mi.Bool | None = None
+    guided: mi.Float | None = None
+    only_delta: mi.Bool | None = None
 
     @staticmethod
     def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
@@ -121,6 +125,9 @@ class Vertex:
     endpoint: Any = None
     endpoint_active: Any = None
     f: Any = None
+    # Set where s = 0 is guided: `Walk.guided` on arrival, and a `guided_hits.Aim`.
+    guided: Any = None
+    aim: Any = None
 
     @property
     def edge(self) -> Any:
@@ -168,7 +175,8 @@ class Side:
     happened. ``parallel``: the first edge has one direction, its density is one across it. ``join``: called
     with each vertex, returns the endpoint of the other side with which it is to be joined (`emitters.Direct`,
     or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no strategy does so.
-    ``isolated``: the subpath ends as soon as it is not, see `Walk`.
+    ``isolated``, ``only_delta``: the subpath ends as soon as it is not, see `Walk`. ``guide``: called with
+    each vertex, the walk before it and the step after it, returns its `guided_hits.Aim`.
     """
 
     name: str
@@ -182,6 +190,8 @@ class Side:
     parallel: bool = False
     join: Callable[[Vertex], tuple[Direct | CameraJoin, bsdf.Target]] | None = None
     isolated: bool = False
+    only_delta: bool = False
+    guide: Callable[[Vertex, Walk, Any], Any] | None = None
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
@@ -289,6 +299,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         event=walk.event,
         volume=volume,
         landing=landing,
+        guided=walk.guided,
     )
 
 
@@ -329,6 +340,8 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.event)
     sampled = _is_sampled(side, walk, vertex)
     step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
+    if side.guide is not None:
+        vertex.aim = side.guide(vertex, walk, step)
     return step
 
 
@@ -370,9 +383,13 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
-    isolated = None if merge is None else merge.isolated
+    isolated, only_delta = _isolated(walk, vertex, coefficient, step), None
     if side.isolated and isolated is not None:
         active &= isolated
+    if side.only_delta:
+        active &= step.delta
+    if walk.only_delta is not None:
+        only_delta = walk.only_delta & step.delta
     # Roulette as in `path`; the weights ignore it (it is not part of any density).
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
@@ -396,6 +413,8 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         broken=broken,
         active=active,
         isolated=isolated,
+        guided=_guided(h, walk, vertex, step),
+        only_delta=only_delta,
     )
     if passes is not None:
         after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
@@ -403,11 +422,32 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
 
 
 def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
-    """The `mis.Merge` at ``vertex``; ``coefficient`` of the class that joins the edge to it."""
+    """The `mis.Merge` at ``vertex``; ``coefficient`` of the class that joins the edge to it.
+
+    Where s = 0 is guided, on light subpaths what stands for it: the density of the direction they came from.
+    """
+    if mis.is_absent(walk.partial.d_vm):
+        return None
+    isolated = _isolated(walk, vertex, coefficient, step)
+    if kernel.merging is not None:
+        return mis.Merge(kernel.heuristic.start(kernel.merging.weighed(vertex.si.p)), isolated)
+    guided = dr.select(vertex.aim.active, vertex.aim.other, 0)
+    return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, guided), isolated)
+
+
+def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
+    """`Walk.isolated` after the event at ``vertex``; ``coefficient`` as of `_merge`."""
     if walk.isolated is None:
         return None
-    isolated = walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
-    return mis.Merge(kernel.merging.weighed(vertex.si.p), isolated)
+    return walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
+
+
+def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
+    """`Walk.guided` after the event at ``vertex``: delta events are made alike whatever led to them."""
+    if walk.guided is None or vertex.aim is None:  # guided subpaths follow delta events only
+        return walk.guided
+    other = dr.select(vertex.aim.active, vertex.aim.other / step.pdf_fwd_w, 0)
+    return dr.select(step.delta, walk.guided, h.start(other))
 
 
 def may_merge(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:

@@ -1,0 +1,155 @@
+"""Photons as a guide of directions: from where light that glass focuses arrives at a point.
+
+Source of the idea: H. W. Jensen, "Importance Driven Path Tracing Using the Photon Map", 1995. The photons are
+the vertices of light subpaths on the first surface that is not delta. Sorted along a space-filling curve
+(Morton's, "Z-order"), those next to a point's place on it are near it, however few there are: a window of
+them, dense around that place and sparse farther off, is a mixture of lobes about the photons' directions. The
+density is a function of the point and of photons that do not depend on the samples that use it, so that
+whatever it is nothing is biased.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+# Places of the photons of a window, from that of the point on.
+_NEAR = 8
+_FAR = (12, 18, 27, 40, 60, 90, 136, 204)
+WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
+
+# Bits of each coordinate of a place on the curve.
+_BITS = 21
+
+# Width of a lobe (tangent of half its directions' angle) over the photon's distance from the point, over its
+# last edge; the least one, and the largest, beyond which a photon says nothing.
+_WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
+
+
+@dataclass
+class GuidePhoton:
+    """``p`` position, ``d`` unit direction towards the light's side, ``length`` of its last edge, ``lane`` of its subpath."""
+
+    p: mi.Point3f
+    d: mi.Vector3f
+    length: mi.Float
+    lane: mi.UInt32
+
+
+@dataclass
+class Guide:
+    """``photons`` in the order of their ``place`` on the curve, so many as ``count``; and its box.
+
+    ``low`` corner of the box, ``scale`` places over length; ``offsets`` see `WINDOW`.
+    """
+
+    photons: GuidePhoton
+    place: mi.UInt64
+    count: mi.UInt32
+    low: mi.Point3f
+    scale: mi.Float
+    offsets: mi.Int32
+
+    @staticmethod
+    def of(photons: GuidePhoton, count: int) -> Guide:
+        """The guide of the first ``count`` of these ``photons``, one at least."""
+        index = dr.arange(mi.UInt32, count)
+        found = dr.gather(GuidePhoton, photons, index)
+        low = mi.Point3f(*(dr.min(x) for x in found.p))
+        extent = dr.max(mi.Vector3f(*(dr.max(x) for x in found.p)) - low)
+        scale = dr.select(extent > 0, ((1 << _BITS) - 1) / extent, 0)
+        place = _place(found.p, low, scale)
+        order = dr.argsort(place)
+        guide = Guide(
+            dr.gather(GuidePhoton, found, order),
+            dr.gather(mi.UInt64, place, order),
+            dr.opaque(mi.UInt32, count),
+            low,
+            scale,
+            mi.Int32(WINDOW),
+        )
+        dr.make_opaque(guide)
+        return guide
+
+
+def _place(p: mi.Point3f, low: mi.Point3f, scale: mi.Float) -> mi.UInt64:
+    """The place of ``p`` on the curve: the bits of its coordinates by turns."""
+    place = mi.UInt64(0)
+    for axis in range(3):
+        x = dr.clip((p[axis] - low[axis]) * scale, 0, (1 << _BITS) - 1)
+        place |= _spread(mi.UInt64(mi.UInt32(x))) << axis
+    return place
+
+
+def _spread(x: mi.UInt64) -> mi.UInt64:
+    """The lowest 21 bits of ``x``, each at three times its place."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << shift)) & mask
+    return x
+
+
+@dr.syntax
+def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
+    """The number of the first photon at or behind the place of ``p``."""
+    place = _place(p, guide.low, guide.scale)
+    low, high = mi.UInt32(0), mi.UInt32(guide.count)
+    while dr.hint(low < high, label="place among photons", exclude=[guide, place]):
+        middle = (low + high) >> 1
+        before = dr.gather(mi.UInt64, guide.place, middle) < place
+        low = dr.select(before, middle + 1, low)
+        high = dr.select(before, high, middle)
+    return low
+
+
+def _photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> GuidePhoton:
+    """The ``k``-th photon of the window about the number ``found``."""
+    number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
+    number = dr.clip(number, 0, mi.Int32(guide.count) - 1)
+    return dr.gather(GuidePhoton, guide.photons, mi.UInt32(number), active)
+
+
+def _width(photon: GuidePhoton, p: mi.Point3f) -> mi.Float:
+    """The width of its lobe at ``p``, 0 if it has none."""
+    width = _WIDTH * dr.norm(photon.p - p) / photon.length
+    return dr.select(width < _MOST, dr.maximum(width, _LEAST), 0)
+
+
+def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Point2f):
+    """A unit direction of the density at ``p``, and a mask: whether there is one."""
+    k = dr.minimum(mi.UInt32(u1 * len(WINDOW)), len(WINDOW) - 1)
+    photon = _photon(guide, found, k, True)
+    a = dr.square(_width(photon, p)) / 2
+    m = dr.minimum(2 * u2.x * a / (a + 2 - 2 * u2.x), 2)  # 1 - cos of the angle
+    sin, cos = dr.sincos(2 * dr.pi * u2.y)
+    across = dr.sqrt(dr.maximum(m * (2 - m), 0))
+    local = mi.Vector3f(across * cos, across * sin, 1 - m)
+    return mi.Frame3f(photon.d).to_world(local), a > 0
+
+
+@dr.syntax
+def densities(guide: Guide, p: mi.Point3f, found: mi.UInt32, first: mi.Vector3f, second: mi.Vector3f):
+    """The densities (solid angle) with which `draw` makes two unit directions at ``p``."""
+    k, of_first, of_second = mi.UInt32(0), mi.Float(0), mi.Float(0)
+    while dr.hint(
+        k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, first, second]
+    ):
+        photon = _photon(guide, found, k, True)
+        a = dr.square(_width(photon, p)) / 2
+        norm = a * (a + 2) / (4 * dr.pi * len(WINDOW))
+        of_first += norm / _tail(photon.d, first, a)
+        of_second += norm / _tail(photon.d, second, a)
+        k += 1
+    return of_first, of_second
+
+
+def _tail(d: mi.Vector3f, w: mi.Vector3f, a: mi.Float) -> mi.Float:
+    m = dr.squared_norm(w - d) / 2
+    return dr.square(dr.select(a > 0, a + m, 1))
