@@ -23,6 +23,7 @@ DEFAULT_STORED = 64
 HEURISTICS = ("balance", "power", "maximum", "uniform")
 SKIP = ("auto", "impossible", "none")
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
+GUIDING = ("auto", "always", "never")
 CONNECTIONS = ("auto", "all", "one", "none")
 POINTS = ("sobol", "sampler", "independent")
 
@@ -141,6 +142,14 @@ class Settings:
         """Radius of the first pass within which ``merging`` takes photons, in pixels as they are seen
         directly.""",
         low=1e-3,
+    )
+    photon_guiding: str = _parameter(
+        "auto",
+        "when s = 0 is guided",
+        """Guide s = 0 by photons on paths on which no two neighbours can be joined (lamp, glass, wall, glass,
+        camera), which are fireflies otherwise; unbiased. ``auto``: where the pilot finds that it pays.
+        ``always``: wherever it is possible. ``never``.""",
+        choices=GUIDING,
     )
     decisions: tuple[Any, ...] | None = _converted(
         "",

@@ -27,6 +27,10 @@ LEAST_OF_MANY = 1 << 22
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
 
+# Up to this ratio of its largest radiance to its mean a sky is even: a clear one without its sun has some
+# ten, one with it thousands.
+EVEN = 100
+
 # Films of fewer pixels ask no pilot, which takes splats for as noisy as those of an image of many pixels, and
 # have a light subpath for each camera subpath, since those that share one are correlated.
 FEW_PIXELS = 64

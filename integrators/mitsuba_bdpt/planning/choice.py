@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,9 @@ LIGHT_GAIN = 1.15
 # 1.10, small_casters/spot_sphere 1.24 to 1.30, elsewhere the same.)
 MORE_GAIN = 1.02
 
+# Guiding s = 0 has to gain this factor, outliers included.
+GUIDE_GAIN = 1.1
+
 # Among candidates whose times are within this factor of the best, that comes first whose kernel is the first
 # of these: pilots of other numbers of samples take the same kernel, which need not be compiled again.
 KERNEL_TIE = 1.05
@@ -53,12 +56,13 @@ LEAST_VARIANCE = 1e-4
 class Alternatives:
     """What a render may do: the ``candidates``, for so many ``samples`` that are still to come.
 
-    ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`
+    ``guidable``: whether s = 0 can be guided; ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`
     and `DIRECT_GAIN`."""
 
     candidates: list[Configuration]
     stratified: bool
     samples: float = math.inf
+    guidable: bool = False
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,39 @@ class Prediction:
 
 
 def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
-    """Predictions for the candidates, the best first; without those that lose light."""
+    """Predictions for the candidates, the best first; without those that lose light.
+
+    Before them the best of them with s = 0 guided, if that pays.
+    """
+    table = _unguided(moments, alternatives)
+    if table and guided_gain(moments, alternatives, table[0]) >= GUIDE_GAIN:
+        table.insert(0, _guided(moments, alternatives, table[0]))
+    return table
+
+
+def guided_gain(moments: Moments, alternatives: Alternatives, row: Prediction) -> float:
+    """By what factor a candidate takes less time to the same error, outliers included, if s = 0 is guided.
+
+    0 where it cannot be, and for path tracing alone, which would guide more than the pilot has seen: what
+    light tracing joins.
+
+    The number of light subpaths and their coefficients are chosen before and do not depend on it: outliers
+    would hide how other candidates differ.
+    """
+    if not alternatives.guidable or not row.candidate.light_paths:
+        return 0.0
+    alone, guided = moments.alone.mean(axis=0).tolist()
+    other = _guided(moments, alternatives, row)
+    return row.cost * (row.variance + alone) / (other.cost * (other.variance + guided))
+
+
+def _guided(moments: Moments, alternatives: Alternatives, row: Prediction) -> Prediction:
+    candidate = replace(row.candidate, guided=True)
+    return replace(row, candidate=candidate, cost=cost(candidate, moments.rays, alternatives.samples))
+
+
+def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
+    """Predictions for the candidates, the best first."""
     table = _predicted(moments, alternatives)
     if alternatives.stratified:
         table = _without_doubtful(table, moments.rays["evenness"] * UNIFORM >= 1)
@@ -144,11 +180,11 @@ def certainty(moments: Moments, alternatives: Alternatives) -> float:
     In what share of `RESAMPLINGS` of its independent groups the candidate that `choose` puts first is within
     `LIGHT_GAIN` of the best.
     """
-    best = choose(moments, alternatives)[0].candidate
+    best = _unguided(moments, alternatives)[0].candidate
     random = np.random.default_rng(len(alternatives.candidates))
     agree = 0
     for _ in range(RESAMPLINGS):
-        table = choose(moments.of(random.integers(0, GROUPS, GROUPS)), alternatives)
+        table = _unguided(moments.of(random.integers(0, GROUPS, GROUPS)), alternatives)
         times = {row.candidate: row.time for row in table}
         agree += times.get(best, math.inf) <= LIGHT_GAIN * min(times.values())
     return agree / RESAMPLINGS
@@ -183,9 +219,15 @@ def _robust_mean(values: np.ndarray) -> np.ndarray:
     return (values * scale[:, None]).mean(axis=0)
 
 
-def left_out(table: list[Prediction]) -> list[dict[str, str]]:
-    """What the best of `choose` does without, and why, as in ``statistics["skipped"]``."""
+def left_out(table: list[Prediction], guided: float = 0.0) -> list[dict[str, str]]:
+    """What the best of `choose` does without, and why, as in ``statistics["skipped"]``.
+
+    ``guided``: its `guided_gain`.
+    """
     skipped: list[dict[str, str]] = []
+    if guided and not table[0].candidate.guided:
+        why = f"in the pilot it gains {guided:.2f}x, and it takes {GUIDE_GAIN:g}x to be sure"
+        skipped.append({"class": "guided s=0", "level": "not worth its cost here", "why": why})
     without: dict[str, Callable[[Configuration], bool]] = {
         "t<=1": lambda c: not c.light_paths,
         "inner": lambda c: c.connections == "none",

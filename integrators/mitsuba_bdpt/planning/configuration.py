@@ -6,7 +6,7 @@ connections, and is what the kernel is told.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from ..transport.plan import Plan
 
@@ -43,13 +43,15 @@ class Configuration:
     """A way to render.
 
     The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
-    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``).
+    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: s = 0 is, or, with
+    `merging`, vertices are merged although all light can be found without.
     """
 
     light_paths: float
     connections: str
     kappa_light: float
     kappa_direct: float
+    guided: bool = field(default=False, kw_only=True)
 
     @classmethod
     def weighted(cls, weighting: Weighting, served: int, connections: str) -> Configuration:
@@ -83,6 +85,8 @@ class Configuration:
             connections=self.connections if full.connections != "none" and light else "none",
             kappa_light=self.kappa_light,
             kappa_direct=self.kappa_direct,
+            guided=full.guidable and not full.merging and self.guided,
+            merging=full.merging and (self.guided or not full.guidable),
         )
         served = self.camera_paths_per_light_path if adopted.light else 1
         return replace(adopted, camera_paths_per_light_path=served)

@@ -21,6 +21,7 @@ COSTS = {
     # In a scene with media, a pair that is evaluated by the lane of a packet that has most of them: others
     # wait for it, and long subpaths differ. (Six scenes: 0.13 to 0.28.)
     "packets": 0.18,
+    "aimed": 5.5,  # a vertex where s = 0 is guided, with what follows
     "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }
 
@@ -28,7 +29,7 @@ COSTS = {
 # tracing alone, for light subpaths beside it, for connections. (Renders of 2 samples of 16^2 pixels in seven
 # scenes: 8 to 13 ms, 8 to 17 ms, 0 to 2 ms, where a ray takes 34 to 53 ns on two cores.) Previews of 128^2 at
 # 4 samples per pixel have 200,000 to 500,000 rays.
-FIXED = {"start": 180e3, "light": 250e3, "inner": 20e3}
+FIXED = {"start": 180e3, "light": 250e3, "inner": 20e3, "guided": 600e3}
 
 # Numbers of BSDFs from which on, and up to which, the lanes of a packet take turns in evaluating theirs.
 FEW_BSDFS, MANY_BSDFS = 4, 16
@@ -53,4 +54,7 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
         total += COSTS["packets"] * rays.get("packets", 0)
         part = (rays["bsdfs"] - FEW_BSDFS) / (MANY_BSDFS - FEW_BSDFS)
         total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
+    if candidate.guided:
+        total += FIXED["guided"] / samples
+        total += COSTS["aimed"] * rays["aimed"]
     return total / camera

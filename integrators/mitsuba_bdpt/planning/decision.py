@@ -19,7 +19,7 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 LARGEST = 1e30
 
 # Entries of a record, see `Decision.record`.
-ENTRIES = ("pass", "light_paths", "connections", "coefficients", "cost", "variance", "mean")
+ENTRIES = ("pass", "light_paths", "connections", "guided", "coefficients", "cost", "variance", "mean")
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ class Decision(Configuration):
             "pass": self.first_pass,
             "light_paths": self.light_paths,
             "connections": self.connections,
+            "guided": self.guided,
             "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
             "cost": self.cost,
             "variance": self.variance,
@@ -122,7 +123,12 @@ def _read_decision(entry: Any) -> Decision:
         least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
         if not least <= value <= LARGEST:
             raise ValueError(f"{name}={value!r}")
-    return Decision(light_paths=light_paths, connections=connections, first_pass=first_pass, **numbers)
+    guided = entry.get("guided", False)  # which records of older versions lack
+    if not isinstance(guided, bool):
+        raise TypeError(f"guided={guided!r}")
+    return Decision(
+        light_paths=light_paths, connections=connections, first_pass=first_pass, guided=guided, **numbers
+    )
 
 
 def _number(entry: dict[str, Any], name: str) -> float:

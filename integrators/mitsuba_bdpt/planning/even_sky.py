@@ -5,14 +5,10 @@ from __future__ import annotations
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
-from .budget import CHEAP_SAMPLES
+from .budget import CHEAP_SAMPLES, EVEN
 from .candidates import candidates
 from .configuration import Configuration
 from .decision import Decision
-
-# Up to this ratio of its largest radiance to its mean a sky is even: a clear one without its sun has some
-# ten, one with it thousands.
-EVEN = 100
 
 # kappa of s = 1 under a sky of a ratio up to `UNIFORM`, where s = 0 has hardly any noise of its own; 1 under
 # other even ones. Efficiency over path with multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in

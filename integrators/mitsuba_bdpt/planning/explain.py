@@ -54,6 +54,7 @@ def explain(
             ("t=1 (light vertex seen by the sensor)", p.splat),
             ("(1,1) (emitter point seen by the sensor)", p.endpoints),
             ("t=0 (light subpath hits the sensor)", p.arrival),
+            ("guided s=0 (photons aim where no two neighbours can be joined)", p.guided),
             (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
         )
         if on
@@ -99,17 +100,18 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
     shown: set[tuple[str, str, int]] = set()
     for row in table:
         candidate = row.candidate
-        key = candidate.weighting.combination, candidate.connections, candidate.camera_paths_per_light_path
+        served, guided = candidate.camera_paths_per_light_path, ", guided" * candidate.guided
+        key = candidate.weighting.combination, candidate.connections, served, guided
         if key in shown:
             continue
         shown.add(key)
         light = (
-            f"light_paths=1/{candidate.camera_paths_per_light_path}"
+            f"light_paths=1/{served}"
             if candidate.light_paths
             else "light_paths=0"
         )
         lines.append(
-            f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections} "
+            f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections}{guided} "
             f"({row.cost:.2f}, {row.variance:.3g})"
         )
     lines.append(

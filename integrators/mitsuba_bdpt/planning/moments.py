@@ -13,13 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..transport.batch import NET, NETS
 from .rows import SAMPLE, SPLAT
 
 if TYPE_CHECKING:
-    import mitsuba as mi
+    from ..sensors.records import Region
 
     Lanes = TypeVar("Lanes", np.ndarray, mi.UInt32)
 
@@ -47,7 +49,7 @@ OWN_GAIN = 0.3
 
 
 # Fields of `Moments` that have a row for each group, and all of its arrays.
-_OF_GROUPS = ("base", "rare", "light", "draw")
+_OF_GROUPS = ("base", "rare", "light", "draw", "alone")
 _ARRAYS = (*_OF_GROUPS, "gain")
 
 
@@ -56,7 +58,8 @@ class Moments:
     """What a pilot found, in units of the image's relative squared error per sample and pixel.
 
     ``base``, ``rare``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): with independent numbers
-    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn; ``rare`` is that
+    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn, and a column of
+    ``alone`` where s = 0 can be guided: the first if it is not, the second if it is; ``rare`` is that
     part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
     weighting, is what the points of a net leave of the rest of ``base``. ``mean`` of the image (mean of the
     colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
@@ -68,6 +71,7 @@ class Moments:
     rare: np.ndarray
     light: np.ndarray
     draw: np.ndarray
+    alone: np.ndarray
     gain: np.ndarray
     mean: float
     rays: dict[str, float]
@@ -150,6 +154,13 @@ class Splats:
     lanes: int
 
 
+def tile_of(region: Region, position: mi.Point2f) -> mi.UInt32:
+    """The number of the fine tile at a ``position`` on the film."""
+    uv = dr.clip(region.to_uv(position), 0, 1)
+    xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
+    return xy.y * FINE + xy.x
+
+
 def group(lane: Lanes) -> Lanes:
     """The independent part to which a sample, or the light subpath of a lane, belongs.
 
@@ -158,10 +169,30 @@ def group(lane: Lanes) -> Lanes:
     return lane // PER_PIXEL % GROUPS
 
 
-def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict[str, float]) -> Moments:
+@dataclass(frozen=True)
+class Isolated:
+    """Second moments of s = 0 where it can be guided, if it is not and if it is.
+
+    ``sums`` over ``lanes`` camera samples, shape (`GROUPS`, fine tiles, 2); ``aimed``: vertices of one where
+    it can be.
+    """
+
+    sums: np.ndarray
+    aimed: float
+    lanes: int
+
+
+def moments(
+    samples: Samples,
+    nets: Samples | None,
+    splats: Splats,
+    rays: dict[str, float],
+    isolated: Isolated | None = None,
+) -> Moments:
     """The moments of a pilot of independent ``samples``, and ``nets``.
 
-    ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample.
+    ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample;
+    ``isolated`` light is in no sample.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
@@ -180,6 +211,9 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict[s
             total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
+    alone = np.zeros((GROUPS, 2))
+    if isolated is not None:
+        alone = np.matmul(of_group, isolated.sums)[:, 0] * (GROUPS / isolated.lanes)
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
@@ -188,6 +222,7 @@ def moments(samples: Samples, nets: Samples | None, splats: Splats, rays: dict[s
         rare=summed(None, "rare"),
         light=summed(samples.light, "light"),
         draw=summed(samples.draw),
+        alone=alone,
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,

@@ -48,9 +48,9 @@ from ..transport.counters import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.plan import Plan
-from . import moments
+from . import isolated, moments
 from .configuration import WEIGHTINGS, Weighting
-from .moments import FINE, GROUPS, PER_PIXEL, Moments
+from .moments import FINE, GROUPS, PER_PIXEL, Isolated, Moments, tile_of
 from .rows import SAMPLE, SPLAT, SUMS, Layout
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class Pilot:
     def splat(self, kernel: Kernel, c: Contribution, shared: Shared) -> Counters:
         """Add a contribution with t <= 1."""
         size = self._size(c)
-        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._tile(c.position)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + tile_of(self._region, c.position)
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
         _add(self._splats, SPLAT, found, row, size > 0)
@@ -167,7 +167,7 @@ class Pilot:
     def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
         """Add a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
-        others = {"joined": total["joined"], "tile": self._tile(sample.start.position)}
+        others = {"joined": total["joined"], "tile": tile_of(self._region, sample.start.position)}
         others["evaluated"] = total["evaluated"] if self._media else 0
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
@@ -177,8 +177,8 @@ class Pilot:
         """Run what was recorded, and ``counts`` with it."""
         dr.eval(self._samples, self._splats, counts)
 
-    def moments(self, counts: dict[str, int]) -> Moments:
-        """What was found; ``counts`` what the lanes counted."""
+    def moments(self, counts: dict[str, int], isolated: Isolated | None = None) -> Moments:
+        """What was found; ``counts`` what the lanes counted, ``isolated`` light is in no sample."""
         rows = np.array(self._samples).reshape(-1, SAMPLE.width)
         parts = slice(self._first_net), slice(self._first_net, None)
         independent, nets = (moments.Samples.of_rows(rows[part]) for part in parts)
@@ -190,7 +190,8 @@ class Pilot:
         rays["joined"] = SAMPLE.of(rows, "joined").mean()
         evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
         rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
-        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays)
+        rays["aimed"] = isolated.aimed if isolated else 0.0
+        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, isolated)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of this weighted ``size`` adds.
@@ -245,11 +246,6 @@ class Pilot:
         """
         return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
 
-    def _tile(self, position: mi.Point2f):
-        uv = dr.clip(self._region.to_uv(position), 0, 1)
-        xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
-        return xy.y * FINE + xy.x
-
 
 def measure(
     prepared: PreparedScene,
@@ -265,6 +261,7 @@ def measure(
     """
     everything = replace(
         plan,
+        merging=False,
         connections="none" if plan.connections == "none" else "all",
         camera_paths_per_light_path=1,
         kappa_light=1.0,
@@ -272,6 +269,10 @@ def measure(
         roulette=False,
     )
     kernel = Kernel(prepared, everything, settings, mis.ByClass())
+    found = None
+    if everything.guidable:
+        found = isolated.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
+        kernel.without_isolated = found is not None
     region = prepared.camera.region
     pixels = int(region.size.prod())
     stratified = settings.points != "independent"
@@ -285,7 +286,8 @@ def measure(
     points = Points("sobol" if stratified else "independent", seed)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
-    found = pilot.moments(dict(zip(COUNTERS, counts.numpy().tolist(), strict=True)))
+    counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))
+    found = pilot.moments(counted, found)
     known = {"bsdfs": prepared.traits.asked.count, "far": prepared.emitters.far_share}
     contrast = prepared.emitters.contrast
     known["media"] = float(prepared.space is not None)

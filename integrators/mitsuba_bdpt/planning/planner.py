@@ -108,11 +108,13 @@ class Planner:
         samples = self._expected(passes)
         moments = self._measured(budget.lanes(samples), samples)
         self.decided = replace(self.decided, moments=moments)
-        table = choice.choose(moments, self._alternatives(samples))
+        alternatives = self._alternatives(samples)
+        table = choice.choose(moments, alternatives)
         if not moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
             table = []
         if table:
-            self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table))
+            gain = choice.guided_gain(moments, alternatives, table[0])
+            self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table, gain))
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
         return table
 
@@ -207,7 +209,7 @@ class Planner:
     def _alternatives(self, samples: int) -> choice.Alternatives:
         """What may be done with so many ``samples`` that are still to come."""
         possible = candidates(self._prepared, self.full, self._settings)
-        return choice.Alternatives(possible, self._has_stratified_points(), samples)
+        return choice.Alternatives(possible, self._has_stratified_points(), samples, self.full.guidable)
 
     def _expected(self, passes: tuple[int, ...]) -> int:
         """Samples still to come, as far as that is known."""

@@ -13,6 +13,7 @@ from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
 from ..settings import DEFAULT_STORED, Settings
 from ..transport.plan import Plan
+from .budget import EVEN
 
 
 def plan(prepared: PreparedScene, settings: Settings) -> Plan:
@@ -41,6 +42,10 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     arrival = skip("t=0", "impossible", why) if why else True
     why = _why_not_merging(emitters, prepared.delta, bool(direct)) if settings.merging else ""
     merging = skip("merging", "impossible", why) if why else settings.merging
+    why = _why_not_guided(prepared, settings, bool(hit), bool(direct))
+    if why and settings.photon_guiding == "always":
+        skip("guided s=0", "impossible", why)
+    guidable = not why and (settings.photon_guiding != "never" or skip("guided s=0", "by hand", "photon_guiding=never"))
     for name, why in emitters.left_out:
         skip(name, "impossible", why)
 
@@ -73,7 +78,8 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
         merging=merging,
-        guided=bool(__import__("os").environ.get("BDPT_GUIDED")),
+        guided=guidable and not merging and settings.photon_guiding == "always",
+        guidable=guidable,
     )
 
 
@@ -152,6 +158,19 @@ def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
     if direct and not (delta or emitters.beams):
         return "without delta surfaces next-event estimation joins all that light meets first"
     return ""
+
+
+def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, direct: bool) -> str:
+    """Why s = 0 cannot be guided, or gains nothing by it; empty if neither."""
+    if prepared.space is not None:
+        return "photons in scenes with participating media are not traced"
+    if settings.strategy_images:
+        return "strategy images show each strategy by itself, and it is another s=0"
+    if not hit:
+        return "no emitter that a ray can hit"
+    if prepared.emitters.contrast <= EVEN:
+        return "s=0 finds an even sky by itself"
+    return _why_not_merging(prepared.emitters, prepared.delta, direct)
 
 
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:

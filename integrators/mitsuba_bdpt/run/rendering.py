@@ -31,10 +31,11 @@ from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.merge_radius import SHRINKING, Footprints
 from ..transport.merging import Merging, coefficient
+from ..transport.photon_guide import Guide
 from ..transport.plan import Plan
 from .pass_points import PassPoints
 from .progress import Progress
-from .schedule import REPLICATES, Step, batches, guide_photons_of, passes_since, photons_of, schedule
+from .schedule import REPLICATES, Step, batches, passes_since, photons_of, schedule
 from .snapshot import Snapshot, identity
 from .statistics import rays
 from .work import Meter
@@ -82,6 +83,8 @@ class Render:
         depth, variance = settings.strategy_depth, settings.variance
         self.accumulator = Accumulator(sensor.film(), colour, border, depth, variance, features)
         self.kernel = self._kernel()
+        # What `_guide` has made.
+        self._guides: tuple[Guide | None] | None = None
         # Whether the first pass, of one sample, gives roulette the scale of the image; see `_steps`.
         self._small_first: bool | None = None
         self._error: float | None = None
@@ -206,9 +209,9 @@ class Render:
     def _pass(self, step: Step):
         """Trace one pass, a launch for each of its batches."""
         first = not self.passes and self.planner.threshold is None
-        if self.plan.guided and self.kernel.guide is None:
+        if self.plan.guided:
             self.kernel.guide = self._guide()
-        if self.footprints is not None:
+        if self.plan.merging and self.footprints is not None:
             self.kernel.merging = self._photons(step, self.footprints)
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
@@ -240,13 +243,15 @@ class Render:
         self.meter.launched(counts)
         return merging
 
-    def _guide(self):
-        points = self.points.of_guide()
-        count = guide_photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
-        with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-            guide, counts = photons.trace_guide(self.kernel, points, count)
-        self.meter.launched(counts)
-        return guide
+    def _guide(self) -> Guide | None:
+        """What guides s = 0 in all passes, traced before the first; None if there are no photons."""
+        if self._guides is None:
+            count = photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
+            with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
+                guide, counts = photons.trace_guide(self.kernel, self.points.of_guide(), count)
+            self.meter.launched(counts)
+            self._guides = (guide,)
+        return self._guides[0]
 
     def _is_exact_enough(self) -> bool:
         """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""

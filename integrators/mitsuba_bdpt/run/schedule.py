@@ -110,10 +110,6 @@ def photons_of(samples: int) -> int:
     return min(max(samples // SAMPLES_PER_PHOTON, FEWEST_PHOTONS), MOST_PHOTONS)
 
 
-def guide_photons_of(samples: int) -> int:
-    return min(max(samples // 8, 1 << 12), 1 << 17)
-
-
 def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):
     """Cut a pass into bands of rows that one kernel launch can take."""
     limit = _most_samples(settings)

@@ -15,8 +15,10 @@ def rays(render) -> dict:
     """Rays of a `Render` so far, by kind."""
     counts = render.meter.work.counts
     found = {name: counts[name] for name in RAYS}
-    if render.settings.merging:
+    if render.settings.merging or render.plan.guided:
         found["photon"] = counts["photon"]
+    if render.plan.guided:
+        found["guided"] = counts["guided"]
     if render.accumulator.features is not None:  # one per camera sample
         pixels = int(render.prepared.camera.region.size.prod())
         found["features"] = sum(render.accumulator.passes) * pixels

@@ -32,40 +32,53 @@ _SEED = 0x5BD1E995
 
 @dataclass
 class Aim:
-    """Where ``active``, the guide's direction ``d`` (unit, world), the density ``pdf`` with which it makes it,
-    and the density ``other`` with which it makes the walk's own direction (solid angle)."""
+    """What a guide says at a vertex, in solid angle.
 
-    active: mi.Bool
+    Its direction ``d`` (unit, world) and the density ``pdf`` with which it makes it, 0 if there is none; the
+    density ``other`` with which it makes the walk's own direction.
+    """
+
     d: mi.Vector3f
     pdf: mi.Float
     other: mi.Float
 
 
 def _nothing() -> Aim:
-    return Aim(mi.Bool(False), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
+    return Aim(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
 
 
-def own(stream: Stream) -> Stream:
+def _numbers(stream: Stream) -> Stream:
     """The random numbers of guided subpaths."""
     return Stream(stream.digits, sobol.mix(stream.seed ^ _SEED), sobol.mix(stream.key ^ _SEED), {})
 
 
 def aim(kernel: Kernel, z: Vertex, walk: Walk, step, stream: Stream) -> Aim:
     """What the guide says at the camera vertex ``z``; ``walk`` as it was before it arrived."""
-    guide = kernel.guide
     active = may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
-
-    def look(p, wo, event):
-        found = photon_guide.find(guide, p)
-        numbers = own(stream)
-        u1 = kernel.points.draw_1d("camera", numbers, Purpose.LOBE, event)
-        u2 = kernel.points.draw_2d("camera", numbers, Purpose.BSDF, event)
-        d, drawn = photon_guide.draw(guide, p, found, u1, u2)
-        pdf, other = photon_guide.densities(guide, p, found, d, wo)
-        return Aim(drawn | (other > 0), d, dr.select(drawn, pdf, 0), other)
-
     arguments = mi.Point3f(z.si.p), z.si.to_world(step.wo), mi.UInt32(z.event)
-    return dr.if_stmt(arguments, active, look, lambda p, wo, event: _nothing(), label="guide")
+    return dr.if_stmt(
+        arguments,
+        active,
+        lambda p, d, event: _look(kernel, p, d, event, _numbers(stream)),
+        lambda p, d, event: _nothing(),
+        label="guide",
+    )
+
+
+def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Aim:
+    """As `aim`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
+    possible = may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
+    return Aim(mi.Vector3f(0, 0, 1), mi.Float(0), dr.select(possible, step.pdf_fwd_w, 0))
+
+
+def _look(kernel: Kernel, p, d, event, numbers: Stream) -> Aim:
+    """A direction drawn at ``p``, and the density of another one, ``d``."""
+    found = photon_guide.find(kernel.guide, p)
+    u1 = kernel.points.draw_1d("camera", numbers, Purpose.LOBE, event)
+    u2 = kernel.points.draw_2d("camera", numbers, Purpose.BSDF, event)
+    drawn, possible = photon_guide.draw(kernel.guide, p, found, u1, u2)
+    pdf, other = photon_guide.densities(kernel.guide, p, found, drawn, d)
+    return Aim(drawn, dr.select(possible, pdf, 0), other)
 
 
 def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Aim:
@@ -76,76 +89,69 @@ def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Aim:
     def look(p, d):
         found = photon_guide.find(kernel.guide, p)
         _, other = photon_guide.densities(kernel.guide, p, found, d, d)
-        return Aim(mi.Bool(True), d, other, other)
+        return Aim(d, mi.Float(0), other)
 
     arguments = mi.Point3f(y.si.p), -walk.d
     return dr.if_stmt(arguments, active, look, lambda p, d: _nothing(), label="guide")
 
 
-def follow(kernel: Kernel, z: Vertex, stream: Stream, total, counters: Counters, add, shared):
-    """Follow the direction of the `Aim` at ``z``; returns ``total`` with what it found, and the counters.
+def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
+    """Follow the direction of the `Aim` at ``z``; returns the ``state`` after that.
 
-    ``add(c, total, lost)`` adds a contribution.
+    ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and counts of what was not
+    finite, of `Counters.aimed` and `Counters.guided`.
     """
+    chain = _chain(kernel, stream, shared, add)
+    return dr.if_stmt(
+        (z, *state), z.aim.pdf > 0, chain, lambda z, *state: state, label="guided subpath"
+    )
+
+
+def _chain(kernel: Kernel, stream: Stream, shared, add):
+    """A function that follows the `Aim` at a vertex, as `follow` does."""
+
+    def visit(vertex, state, walk):
+        return dr.if_stmt(
+            (vertex, *state),
+            techniques.sees_emitter(kernel, vertex),
+            lambda v, total, lost: add(techniques.hit_emitter(kernel, v, True), total, lost),
+            lambda v, total, lost: (total, lost),
+            label="guided s = 0",
+        )
 
     def chain(z, total, lost, aimed, traced):
         walk = _begun(kernel, z, shared)
         side = Side(
             "camera",
             shared,
-            bsdf.brightest(walk.throughput),
+            bsdf.brightest(walk.throughput),  # what delta events leave of it plays roulette
             False,
             kernel.max_depth,
             kernel.kappa.splat,
             only_delta=True,
         )
-
-        def visit(vertex, state, walk):
-            total, lost = state
-            return dr.if_stmt(
-                (vertex, total, lost),
-                techniques.sees_emitter(kernel, vertex),
-                lambda v, total, lost: add(techniques.hit_emitter(kernel, v, True), total, lost),
-                lambda v, total, lost: (total, lost),
-                label="guided s = 0",
-            )
-
         first, begun = walk.edges, walk.active
-        (total, lost), walk = random_walk(kernel, side, walk, own(stream), visit, (total, lost))
-        lost += one(walk.broken)
+        state = total, lost
+        (total, lost), walk = random_walk(kernel, side, walk, _numbers(stream), visit, state)
         traced += dr.select(begun, walk.edges - first, 0)
-        return total, lost, aimed + one(begun), traced
+        return total, lost + one(walk.broken), aimed + one(begun), traced
 
-    total, lost, aimed, traced = dr.if_stmt(
-        (z, total, counters.non_finite, counters.aimed, counters.guided),
-        z.aim.active & (z.aim.pdf > 0),
-        chain,
-        lambda z, total, lost, aimed, traced: (total, lost, aimed, traced),
-        label="guided subpath",
-    )
-    return total, replace(counters, non_finite=lost, aimed=aimed, guided=traced)
+    return chain
 
 
 def _begun(kernel: Kernel, z: Vertex, shared) -> Walk:
     """A subpath that leaves ``z`` in the guide's direction."""
-    h, guided, local = kernel.heuristic, z.aim, z.si.to_local(z.aim.d)
-    f = bsdf.evaluate(z.bsdf, z.si, local, True, kernel.traits)
-    throughput = z.throughput * f.value / guided.pdf
+    h, d, pdf, local = kernel.heuristic, z.aim.d, z.aim.pdf, z.si.to_local(z.aim.d)
+    f = bsdf.evaluate(z.bsdf, z.si, local, pdf > 0, kernel.traits)
+    throughput = dr.select(pdf > 0, z.throughput * f.value / pdf, 0)
     active = bsdf.brightest(throughput) > 0
     broken = not_finite(active, throughput)
     active &= ~broken
-    step = bsdf.Step(
-        local, f.value, guided.pdf, f.pdf_rev_w, z.cosine(guided.d), mi.Bool(False), mi.Bool(False), mi.Float(1)
-    )
-    coefficient = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-    partial = mis.scatter(h, z.partial, coefficient, step)
-    ray = rays.spawn(z.anchor, guided.d, shared)
+    unlike, one_ = mi.Bool(False), mi.Float(1)
+    step = bsdf.Step(local, f.value, pdf, f.pdf_rev_w, z.cosine(d), unlike, unlike, one_)
+    partial = mis.scatter(h, z.partial, newest_coefficient(kernel, kernel.kappa.splat, z.edges), step)
+    ray = rays.spawn(z.anchor, d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, z.si.p, throughput, partial, active)
-    return replace(
-        walk,
-        edges=z.edges + 1,
-        seen=mi.Bool(True),
-        broken=broken,
-        guided=h.start(f.pdf_fwd_w / guided.pdf),
-    )
+    guided = h.start(dr.select(pdf > 0, f.pdf_fwd_w / pdf, 0))
+    return replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, guided=guided)

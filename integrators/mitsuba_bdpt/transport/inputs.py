@@ -85,6 +85,8 @@ class Kernel:
         self.merging = None
         # What guides s = 0, a `photon_guide.Guide`; None where nothing does.
         self.guide = None
+        # Whether s = 0 makes no paths on which it might be guided: a pilot knows those by `isolated_light`.
+        self.without_isolated = False
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch, with the batch's ``points``.

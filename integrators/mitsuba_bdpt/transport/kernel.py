@@ -95,7 +95,7 @@ from ..geometry import rays
 from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
-from . import bsdf, contribution, guided_hits, merging, mis, stored_vertices, techniques
+from . import bsdf, contribution, guided_hits, isolated_light, merging, mis, stored_vertices, techniques
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Shared
@@ -157,6 +157,28 @@ def retrace(
     kernel = kernel.bound(points, _count_light(batch, sharing), observer)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), sharing.lane(slot))
     return (of_light + _camera_subpath(kernel, sink, lane, slot, mi.Bool(True))).summed()
+
+
+def trace_isolated(kernel: Kernel, gauge: isolated_light.Gauge, batch: Batch, points: Points, add):
+    """Follow a pilot's camera subpaths as long as they are isolated, and ask the ``gauge`` of their vertices.
+
+    ``add(lane, position, found)`` gets what each lane found, see `isolated_light`.
+    """
+    kernel = kernel.bound(points, 1.0, Observer())
+    index = dr.arange(mi.UInt32, batch.size)
+    place = Places(kernel, batch, batch.samples)
+    shared = shared_by_lane(kernel, points.stream("light", place.index(index), index))
+    sample = _camera_sample(kernel, Lane(place, shared, None), index, mi.Bool(True))
+    walk = _camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
+    side = replace(_camera_side(kernel, None, sample, shared, walk), join=None, guide=None, isolated=True)
+
+    def visit(z, state, walk):
+        found = isolated_light.look(kernel, gauge, z, walk, sample.stream)
+        return (state[0] + found.alone, state[1] + found.guided, state[2] + found.aimed)
+
+    state = mi.Float(0), mi.Float(0), mi.UInt32(0)
+    state, walk = random_walk(kernel, side, walk, sample.stream, visit, state)
+    add(index, sample.start.position, isolated_light.Found(*state))
 
 
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
@@ -371,7 +393,9 @@ def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     partial = _first_partial(kernel, start)
     walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
-    return walk if kernel.guide is None else replace(walk, isolated=mi.Bool(True), guided=mi.Float(0))
+    if kernel.guide is None and not kernel.without_isolated:
+        return walk
+    return replace(walk, isolated=mi.Bool(True), guided=mi.Float(0))
 
 
 def _first_partial(kernel: Kernel, start):
@@ -388,6 +412,8 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
         return techniques.choose_emitter(kernel, z, sample.stream)
 
     def aim(z, walk, step):
+        if kernel.without_isolated:
+            return guided_hits.mark(kernel, z, walk, step)
         return guided_hits.aim(kernel, z, walk, step, sample.stream)
 
     return Side(
@@ -397,10 +423,10 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
         False,
         kernel.max_depth,
         kernel.kappa.splat,
-        alpha=sink.alpha,
+        alpha=sink is not None and sink.alpha,
         parallel=kernel.camera.parallel,
         join=choose_emitter if kernel.plan.direct else None,
-        guide=aim if kernel.guide is not None else None,
+        guide=aim if kernel.guide is not None or kernel.without_isolated else None,
     )
 
 
@@ -433,7 +459,10 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             total, lost, merges = merged(z, walk, total, counted)
             counters = replace(counters, non_finite=lost, merges=merges)
         if kernel.guide is not None:
-            total, counters = guided_hits.follow(kernel, z, sample.stream, total, counters, add, shared)
+            state = total, counters.non_finite, counters.aimed, counters.guided
+            state = guided_hits.follow(kernel, z, sample.stream, shared, add, state)
+            total, lost, aimed, traced = state
+            counters = replace(counters, non_finite=lost, aimed=aimed, guided=traced)
         if plan.hit:
             # A branch of its own: few lanes hit an emitter.
             total, lost = dr.if_stmt(

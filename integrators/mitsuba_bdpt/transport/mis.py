@@ -78,7 +78,10 @@ class Merge:
 
 def is_joined(partial: Partial, coefficient: Coefficient):
     """Mask: a strategy in use, of this ``coefficient``, joins the edge to the vertex of ``partial``."""
-    return mi.Bool(False) if is_absent(coefficient) else (partial.d_vcm > 0) & (coefficient > 0)
+    if is_absent(coefficient):
+        return mi.Bool(False)
+    used = dr.max(coefficient) if isinstance(coefficient, mi.Vector4f) else coefficient
+    return (partial.d_vcm > 0) & (used > 0)
 
 
 def is_absent(x: PartialSum) -> bool:

@@ -30,12 +30,18 @@ _WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
 
 @dataclass
 class GuidePhoton:
-    """``p`` position, ``d`` unit direction towards the light's side, ``length`` of its last edge, ``lane`` of its subpath."""
+    """A photon: ``p`` position, ``d`` unit direction towards the light's side, ``length`` of its last edge.
+
+    For `isolated_light` also ``n`` geometric normal, ``flux`` the throughput of its subpath, and ``hit`` the
+    partial sum of s = 0, in the area measure.
+    """
 
     p: mi.Point3f
     d: mi.Vector3f
     length: mi.Float
-    lane: mi.UInt32
+    n: mi.Normal3f
+    flux: mi.Spectrum
+    hit: mi.Float
 
 
 @dataclass
@@ -109,11 +115,17 @@ def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
     return low
 
 
-def _photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> GuidePhoton:
+def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> GuidePhoton:
     """The ``k``-th photon of the window about the number ``found``."""
     number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
     number = dr.clip(number, 0, mi.Int32(guide.count) - 1)
     return dr.gather(GuidePhoton, guide.photons, mi.UInt32(number), active)
+
+
+def exists(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.Bool:
+    """Mask: the window has a photon of this number; beyond the first and last of all it repeats them."""
+    number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k)
+    return (number >= 0) & (number < mi.Int32(guide.count))
 
 
 def _width(photon: GuidePhoton, p: mi.Point3f) -> mi.Float:
@@ -125,13 +137,13 @@ def _width(photon: GuidePhoton, p: mi.Point3f) -> mi.Float:
 def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Point2f):
     """A unit direction of the density at ``p``, and a mask: whether there is one."""
     k = dr.minimum(mi.UInt32(u1 * len(WINDOW)), len(WINDOW) - 1)
-    photon = _photon(guide, found, k, True)
-    a = dr.square(_width(photon, p)) / 2
+    chosen = photon(guide, found, k, True)
+    a = dr.square(_width(chosen, p)) / 2
     m = dr.minimum(2 * u2.x * a / (a + 2 - 2 * u2.x), 2)  # 1 - cos of the angle
     sin, cos = dr.sincos(2 * dr.pi * u2.y)
     across = dr.sqrt(dr.maximum(m * (2 - m), 0))
     local = mi.Vector3f(across * cos, across * sin, 1 - m)
-    return mi.Frame3f(photon.d).to_world(local), a > 0
+    return mi.Frame3f(chosen.d).to_world(local), a > 0
 
 
 @dr.syntax
@@ -141,11 +153,11 @@ def densities(guide: Guide, p: mi.Point3f, found: mi.UInt32, first: mi.Vector3f,
     while dr.hint(
         k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, first, second]
     ):
-        photon = _photon(guide, found, k, True)
-        a = dr.square(_width(photon, p)) / 2
+        near = photon(guide, found, k, True)
+        a = dr.square(_width(near, p)) / 2
         norm = a * (a + 2) / (4 * dr.pi * len(WINDOW))
-        of_first += norm / _tail(photon.d, first, a)
-        of_second += norm / _tail(photon.d, second, a)
+        of_first += norm / _tail(near.d, first, a)
+        of_second += norm / _tail(near.d, second, a)
         k += 1
     return of_first, of_second
 

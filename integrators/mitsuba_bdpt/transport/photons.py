@@ -54,7 +54,8 @@ def trace_guide(kernel: Kernel, points: Points, count: int) -> tuple[Guide | Non
         joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
         keep = y.hit & y.connectible() & ~joined & (y.edges < kernel.max_depth)
         keep &= y.partial.d_vc > 0
-        return keep, GuidePhoton(y.si.p, -walk.d, dr.norm(y.si.p - y.previous), lanes)
+        length = dr.norm(y.si.p - y.previous)
+        return keep, GuidePhoton(y.si.p, -walk.d, length, y.si.n, y.throughput, y.partial.d_vc)
 
     photons, found, counters = _all(kernel, count, GuidePhoton, photon, {"only_delta": True})
     return Guide.of(photons, found) if found else None, counters

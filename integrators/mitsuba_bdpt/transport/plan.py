@@ -15,7 +15,7 @@ class Plan:
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out. ``merging``: whether vertices of isolated paths are merged;
-    ``guided``: whether s = 0 is guided on them.
+    ``guided``: whether s = 0 is guided on them; ``guidable``: whether a pilot may say that it pays.
     """
 
     hit: bool
@@ -32,6 +32,7 @@ class Plan:
     skipped: tuple[dict[str, str], ...] = ()
     merging: bool = False
     guided: bool = False
+    guidable: bool = False
 
     @property
     def light(self) -> bool:

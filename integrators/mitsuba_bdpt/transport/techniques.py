@@ -69,7 +69,9 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
     if z.guided is not None:  # the other of the two ways to make this path with s = 0
         joined = mis.is_joined(z.partial, newest)
         other = h.scale(dr.select(joined, 0, z.guided), kernel.kappa.hit)
-        if guided:
+        if kernel.without_isolated:
+            active &= joined | (z.guided == 0)
+        elif guided:
             light_side, active = other, active & ~joined
         else:
             camera_side = h.combine(camera_side, other)

@@ -431,8 +431,7 @@ def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, coefficient: mis.Coeffici
     isolated = _isolated(walk, vertex, coefficient, step)
     if kernel.merging is not None:
         return mis.Merge(kernel.heuristic.start(kernel.merging.weighed(vertex.si.p)), isolated)
-    guided = dr.select(vertex.aim.active, vertex.aim.other, 0)
-    return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, guided), isolated)
+    return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.aim.other), isolated)
 
 
 def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
@@ -446,7 +445,7 @@ def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
     """`Walk.guided` after the event at ``vertex``: delta events are made alike whatever led to them."""
     if walk.guided is None or vertex.aim is None:  # guided subpaths follow delta events only
         return walk.guided
-    other = dr.select(vertex.aim.active, vertex.aim.other / step.pdf_fwd_w, 0)
+    other = dr.select(vertex.aim.other > 0, vertex.aim.other / step.pdf_fwd_w, 0)
     return dr.select(step.delta, walk.guided, h.start(other))
 
 

@@ -1,0 +1,86 @@
+# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
+# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
+"""The part of a pilot that asks whether guiding s = 0 pays, see `transport.isolated_light`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..sampling.points import Points
+from ..sampling.sequences import GUIDE, sequence_seed
+from ..scene.prepared import PreparedScene
+from ..sensors.records import Region
+from ..settings import Settings
+from ..transport import mis
+from ..transport.batch import Batch
+from ..transport.inputs import Kernel
+from ..transport.isolated_light import Found, Gauge
+from ..transport.kernel import trace_isolated
+from ..transport.photons import trace_guide
+from ..transport.plan import Plan
+from . import moments
+from .moments import FINE, GROUPS, Isolated, tile_of
+
+# Camera samples that look for vertices where s = 0 can be guided: most of their subpaths end at once. Light
+# subpaths that give the photons to measure with, and as many that give those of the guide.
+LANES, PHOTONS = 1 << 14, 1 << 15
+
+# An estimate of s = 0 may be as many times as large as what arrives as a render has samples, over this: what
+# a render is not likely to meet is missing from its image, not noise. (One sample in so many is on a path
+# where s = 0 can be guided.)
+SHARE = 16
+
+
+def measure(
+    prepared: PreparedScene, plan: Plan, settings: Settings, seed: mi.UInt32, samples: float
+) -> Isolated | None:
+    """Second moments of s = 0 where it can be guided by ``plan``, in a render of so many ``samples``.
+
+    None if no photon is found.
+    """
+    kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
+    made = [
+        trace_guide(kernel, Points("sobol", sequence_seed(seed, GUIDE + number)), PHOTONS)[0]
+        for number in range(2)
+    ]
+    if made[0] is None or made[1] is None:
+        return None
+    kernel.without_isolated = True
+    counts = dr.opaque(mi.Float, PHOTONS), dr.opaque(mi.Float, samples / SHARE)
+    gauge = Gauge(made[0], made[1], *counts)
+    region = prepared.camera.region
+    pixels = int(region.size.prod())
+    chosen = min(LANES, pixels)
+    batch = Batch(0, chosen, 0, LANES // chosen, spread=pixels)
+    sums = Sums(region)
+    trace_isolated(kernel, gauge, batch, Points("sobol", seed), sums.add)
+    found, aimed = sums.evaluated()
+    return Isolated(found, aimed / batch.size, batch.size)
+
+
+class Sums:
+    """What the lanes have `Found`, by group and fine tile."""
+
+    def __init__(self, region: Region):
+        self._region = region
+        self._sums = dr.zeros(mi.Float64, GROUPS * FINE**2 * 2)
+        self._aimed = dr.zeros(mi.UInt32, 1)
+        dr.make_opaque(self._sums, self._aimed)
+
+    def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
+        """Add what a ``lane`` found, whose camera sample has this ``position`` on the film."""
+        row = moments.group(lane) * FINE**2 + tile_of(self._region, position)
+        values = mi.ArrayXd([mi.Float64(found.alone), mi.Float64(found.guided)])
+        dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
+        dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))
+
+    def evaluated(self) -> tuple[np.ndarray, int]:
+        """The sums, shape (`GROUPS`, fine tiles, 2), and how many vertices could be guided."""
+        dr.eval(self._sums, self._aimed)
+        return np.array(self._sums).reshape(GROUPS, FINE**2, 2), int(self._aimed[0])

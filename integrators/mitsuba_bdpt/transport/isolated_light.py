@@ -1,0 +1,118 @@
+"""What s = 0 costs on paths where it might be guided: second moments of its estimates, by photons.
+
+Few samples of a pilot meet a lamp behind glass by chance, and one that does is a firefly. Photons tell of each
+vertex z where s = 0 can be guided (see `guided_hits`) what light arrives there: those near it, in a disc of
+radius R, stand for an integral over directions, as in `merging`. With a photon's flux Phi, N photons' subpaths,
+f / p_0 the estimate of s = 0 of the path through it, and E the mean over photons in the disc times their number::
+
+    second moment of s = 0          E[ z.throughput f / |n.d| Phi / (N pi R^2) * f / p_0 ]
+    the same if it is guided        E[ ... / (1 + p_g / p_bsdf) ]
+
+The photons of the guide are others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..sampling.points import Purpose, Stream, sequential
+from . import bsdf, photon_guide
+from .contribution import size_of
+from .inputs import Kernel
+from .photon_guide import WINDOW, Guide
+from .walk import Vertex, Walk, may_merge
+
+# Cosine between normals from which on a photon is taken to lie on the surface of the vertex.
+_SAME_SIDE = 0.8
+
+
+@dataclass
+class Gauge:
+    """Photons to measure with, those of the ``guide``, and how many subpaths made the former (``count``).
+
+    ``most``: an estimate of s = 0 counts as so many times what arrives at most, and as often more.
+    """
+
+    photons: Guide
+    guide: Guide
+    count: mi.Float
+    most: mi.Float
+
+
+@dataclass
+class Found:
+    """Second moments of a vertex, ``alone`` and ``guided``, and 1 where it may be guided (``aimed``).
+
+    Of the mean of the colours.
+    """
+
+    alone: mi.Float
+    guided: mi.Float
+    aimed: mi.UInt32
+
+
+def nothing() -> Found:
+    """Of a vertex where s = 0 cannot be guided."""
+    return Found(mi.Float(0), mi.Float(0), mi.UInt32(0))
+
+
+def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) -> Found:
+    """What the ``gauge`` says of the camera vertex ``z``; ``walk`` as it was before it arrived."""
+    possible = may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
+
+    def measure(z):
+        place = photon_guide.find(gauge.photons, z.si.p)
+        word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
+        chosen, total, radius = _draw(gauge.photons, z, place, word)
+        active = total > 0
+        y = photon_guide.photon(gauge.photons, place, chosen, active)
+        f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(y.d), active, kernel.traits)
+        cos = dr.abs(dr.dot(z.si.n, y.d))
+        value = _mean(z.throughput * f.value * y.flux) / cos
+        active &= (value > 0) & (f.pdf_fwd_w > 0) & dr.isfinite(value)
+        # Of all photons in the disc, for which this one stands.
+        arriving = value / size_of(y.flux) * total / (gauge.count * dr.pi * dr.square(radius))
+        by_hit = dr.minimum(value / (y.hit * f.pdf_fwd_w), gauge.most * arriving)
+        there = photon_guide.find(gauge.guide, z.si.p)
+        pdf, _ = photon_guide.densities(gauge.guide, z.si.p, there, y.d, y.d)
+        second = arriving * by_hit
+        guided = second / (1 + pdf / f.pdf_fwd_w)
+        found = (dr.select(active, x, 0) for x in (second, guided))
+        return Found(*found, mi.UInt32(1))
+
+    return dr.if_stmt((z,), possible, measure, lambda z: nothing(), label="isolated light")
+
+
+def _mean(colours: mi.Spectrum) -> mi.Float:
+    colours = mi.unpolarized_spectrum(colours)
+    return sum(colours) / len(colours)
+
+
+@dr.syntax
+def _draw(photons: Guide, z: Vertex, place: mi.UInt32, word: mi.UInt32):
+    """One of the photons near ``z`` in proportion to its flux: its number in the window, their total, R.
+
+    R is the geometric mean of the window's distances: half of the photons are nearer.
+    """
+    k, logs = mi.UInt32(0), mi.Float(0)
+    while dr.hint(k < len(WINDOW), label="distances of a window", exclude=[photons, z, place]):
+        y = photon_guide.photon(photons, place, k, True)
+        logs += dr.log(dr.maximum(dr.norm(y.p - z.si.p), 1e-30))
+        k += 1
+    radius = dr.exp(logs / len(WINDOW))
+
+    k = mi.UInt32(0)
+    chosen, total = mi.UInt32(0), mi.Float(0)
+    while dr.hint(k < len(WINDOW), label="photons of a disc", exclude=[photons, z, place, radius]):
+        y = photon_guide.photon(photons, place, k, True)
+        near = (dr.norm(y.p - z.si.p) <= radius) & (dr.dot(y.n, z.si.n) > _SAME_SIDE)
+        near &= photon_guide.exists(photons, place, k)
+        size = dr.select(near, size_of(y.flux), 0)
+        total += size
+        u, word = sequential(word)
+        chosen = dr.select(u * total < size, k, chosen)
+        k += 1
+    return chosen, total, radius
