@@ -56,8 +56,8 @@ LEAST_VARIANCE = 1e-4
 class Alternatives:
     """What a render may do: the ``candidates``, for so many ``samples`` that are still to come.
 
-    ``guidable``: whether s = 0 can be guided; ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`
-    and `DIRECT_GAIN`."""
+    ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`
+    and `DIRECT_GAIN`; ``guidable``: whether s = 0 can be guided."""
 
     candidates: list[Configuration]
     stratified: bool

@@ -43,8 +43,8 @@ class Configuration:
     """A way to render.
 
     The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
-    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: s = 0 is, or, with
-    `merging`, vertices are merged although all light can be found without.
+    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: s = 0 is, or,
+    with `merging`, vertices are merged although all light can be found without.
     """
 
     light_paths: float

@@ -105,11 +105,7 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
         if key in shown:
             continue
         shown.add(key)
-        light = (
-            f"light_paths=1/{served}"
-            if candidate.light_paths
-            else "light_paths=0"
-        )
+        light = f"light_paths=1/{served}" if candidate.light_paths else "light_paths=0"
         lines.append(
             f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections}{guided} "
             f"({row.cost:.2f}, {row.variance:.3g})"

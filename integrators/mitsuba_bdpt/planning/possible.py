@@ -45,7 +45,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     why = _why_not_guided(prepared, settings, bool(hit), bool(direct))
     if why and settings.photon_guiding == "always":
         skip("guided s=0", "impossible", why)
-    guidable = not why and (settings.photon_guiding != "never" or skip("guided s=0", "by hand", "photon_guiding=never"))
+    guidable = not why
+    if guidable and settings.photon_guiding == "never":
+        guidable = skip("guided s=0", "by hand", "photon_guiding=never")
     for name, why in emitters.left_out:
         skip(name, "impossible", why)
 

@@ -44,8 +44,8 @@ _USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
 
 # Of a camera sample, for each weighting: its estimate, and the second moments of its contributions without
 # t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
-# with inner connections what drawing one adds. Then the number of its vertices that were joined; its tile; in scenes with media the number of pairs that were
-# evaluated, else 0.
+# with inner connections what drawing one adds. Then the number of its vertices that were joined; its tile; in
+# scenes with media the number of pairs that were evaluated, else 0.
 SAMPLE = Layout(
     {
         "estimate": len(WEIGHTINGS),

@@ -42,7 +42,8 @@ class PassPoints:
 
     def of_guide(self) -> Points:
         """The points of the photons that guide s = 0."""
-        return Points("independent" if self._kind == "independent" else "sobol", sequence_seed(self.seed, GUIDE))
+        seed = sequence_seed(self.seed, GUIDE)
+        return Points("independent" if self._kind == "independent" else "sobol", seed)
 
     def _of_sampler(self, step: Step, batch: Batch, seed) -> Points:
         """One sampler per band of rows goes on from pass to pass, as Mitsuba's own passes do."""

@@ -1,14 +1,14 @@
 """Guided s = 0: one more way to make isolated paths, which aims at light that glass focuses.
 
-An isolated path (see `merging`) from an emitter with area is made by s = 0 and t = 0 alone, and by s = 0 only
-if a sampled direction happens to lead to the emitter by delta events. At the last vertex z whose event is not
-delta the direction is drawn a second time, from the density p_g of a `photon_guide.Guide`, and followed through
-delta events only. All densities but those of the direction cancel::
+An isolated path (see `merging`) from an emitter with area is made by s = 0 and t = 0 alone, and by s = 0
+only if a sampled direction happens to lead to the emitter by delta events. At the last vertex z whose event
+is not delta the direction is drawn a second time, from the density p_g of a `photon_guide.Guide`, and
+followed through delta events only. All densities but those of the direction cancel::
 
     guided s = 0 over s = 0 = p_g / p_bsdf
 
-Both have a weight, which holds that ratio, and so does t = 0, which asks for p_g at the same vertex (its first
-that is not delta).
+Both have a weight, which holds that ratio, and so does t = 0, which asks for p_g at the same vertex (its
+first that is not delta).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..geometry import rays
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream
 from . import bsdf, mis, photon_guide, techniques
-from .counters import Counters, one
+from .counters import one
 from .inputs import Kernel
 from .walk import Side, Vertex, Walk, may_merge, newest_coefficient, not_finite, random_walk
 
@@ -82,7 +82,7 @@ def _look(kernel: Kernel, p, d, event, numbers: Stream) -> Aim:
 
 
 def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Aim:
-    """The density with which the guide makes, at the light vertex ``y``, the direction the light came from."""
+    """What the guide says at the light vertex ``y``; ``other``: of the direction the light came from."""
     joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
     active = y.hit & walk.only_delta & y.connectible() & ~joined
 
@@ -102,9 +102,7 @@ def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
     finite, of `Counters.aimed` and `Counters.guided`.
     """
     chain = _chain(kernel, stream, shared, add)
-    return dr.if_stmt(
-        (z, *state), z.aim.pdf > 0, chain, lambda z, *state: state, label="guided subpath"
-    )
+    return dr.if_stmt((z, *state), z.aim.pdf > 0, chain, lambda z, *state: state, label="guided subpath")
 
 
 def _chain(kernel: Kernel, stream: Stream, shared, add):

@@ -1,12 +1,12 @@
 """What s = 0 costs on paths where it might be guided: second moments of its estimates, by photons.
 
-Few samples of a pilot meet a lamp behind glass by chance, and one that does is a firefly. Photons tell of each
-vertex z where s = 0 can be guided (see `guided_hits`) what light arrives there: those near it, in a disc of
-radius R, stand for an integral over directions, as in `merging`. With a photon's flux Phi, N photons' subpaths,
-f / p_0 the estimate of s = 0 of the path through it, and E the mean over photons in the disc times their number::
+Few samples of a pilot meet a lamp behind glass by chance, and one that does is a firefly. Photons tell of
+each vertex z where s = 0 can be guided (see `guided_hits`) what light arrives there: those near it, in a disc
+of radius R, stand for an integral over directions, as in `merging`. With the throughput T of z, a photon's
+flux Phi, N photons' subpaths and f / p_0 the estimate of s = 0 of the path through it::
 
-    second moment of s = 0          E[ z.throughput f / |n.d| Phi / (N pi R^2) * f / p_0 ]
-    the same if it is guided        E[ ... / (1 + p_g / p_bsdf) ]
+    second moment of s = 0          sum over photons of  T f / |n.d| Phi / (N pi R^2) * f / p_0
+    the same if it is guided        ... / (1 + p_g / p_bsdf)
 
 The photons of the guide are others.
 """

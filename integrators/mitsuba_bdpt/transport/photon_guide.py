@@ -150,9 +150,7 @@ def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Poi
 def densities(guide: Guide, p: mi.Point3f, found: mi.UInt32, first: mi.Vector3f, second: mi.Vector3f):
     """The densities (solid angle) with which `draw` makes two unit directions at ``p``."""
     k, of_first, of_second = mi.UInt32(0), mi.Float(0), mi.Float(0)
-    while dr.hint(
-        k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, first, second]
-    ):
+    while dr.hint(k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, first, second]):
         near = photon(guide, found, k, True)
         a = dr.square(_width(near, p)) / 2
         norm = a * (a + 2) / (4 * dr.pi * len(WINDOW))

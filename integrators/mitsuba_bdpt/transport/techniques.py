@@ -40,7 +40,7 @@ def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
 
 
 def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution:
-    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43); one that was ``guided`` there, or its own."""
+    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43), or one that was ``guided`` there."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
     active = sees_emitter(kernel, z)
