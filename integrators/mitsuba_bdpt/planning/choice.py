@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..transport.plan import GUIDED
 from .configuration import WEIGHTINGS, Configuration
 from .costs import cost
 from .decision import Decision
@@ -93,30 +94,38 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     Before them the best of them with s = 0 guided, if that pays.
     """
     table = _unguided(moments, alternatives)
-    if table and guided_gain(moments, alternatives, table[0]) >= GUIDE_GAIN:
-        table.insert(0, _guided(moments, alternatives, table[0]))
+    if table and (guided := _guided(moments, alternatives, table[0])):
+        gain, row = max(guided, key=lambda found: found[0])
+        if gain >= GUIDE_GAIN:
+            table.insert(0, row)
     return table
 
 
 def guided_gain(moments: Moments, alternatives: Alternatives, row: Prediction) -> float:
     """By what factor a candidate takes less time to the same error, outliers included, if s = 0 is guided.
 
-    0 where it cannot be, and for path tracing alone, which would guide more than the pilot has seen: what
-    light tracing joins.
+    At most; 0 where it cannot be.
+    """
+    return max((gain for gain, _ in _guided(moments, alternatives, row)), default=0.0)
 
-    The number of light subpaths and their coefficients are chosen before and do not depend on it: outliers
-    would hide how other candidates differ.
+
+def _guided(moments: Moments, alternatives: Alternatives, row: Prediction) -> list[tuple[float, Prediction]]:
+    """The candidate of a ``row`` with each number of guided samples, after its gain, see `guided_gain`.
+
+    None for path tracing alone, which would guide more than the pilot has seen: what light tracing joins. The
+    number of light subpaths and their coefficients are chosen before and do not depend on it: outliers would
+    hide how other candidates differ.
     """
     if not alternatives.guidable or not row.candidate.light_paths:
-        return 0.0
-    alone, guided = moments.alone.mean(axis=0).tolist()
-    other = _guided(moments, alternatives, row)
-    return row.cost * (row.variance + alone) / (other.cost * (other.variance + guided))
-
-
-def _guided(moments: Moments, alternatives: Alternatives, row: Prediction) -> Prediction:
-    candidate = replace(row.candidate, guided=True)
-    return replace(row, candidate=candidate, cost=cost(candidate, moments.rays, alternatives.samples))
+        return []
+    first, *guided = moments.isolated.mean(axis=0).tolist()
+    found: list[tuple[float, Prediction]] = []
+    for samples, isolated in zip(GUIDED, guided, strict=True):
+        candidate = replace(row.candidate, guided=samples)
+        each = cost(candidate, moments.rays, alternatives.samples)
+        gain = row.cost * (row.variance + first) / (each * (row.variance + isolated))
+        found.append((gain, replace(row, candidate=candidate, cost=each)))
+    return found
 
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:

@@ -43,15 +43,15 @@ class Configuration:
     """A way to render.
 
     The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
-    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: s = 0 is, or,
-    with `merging`, vertices are merged although all light can be found without.
+    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: samples
+    by which s = 0 is at a vertex; with `merging`, not 0 if vertices are merged though s = 0 finds that light.
     """
 
     light_paths: float
     connections: str
     kappa_light: float
     kappa_direct: float
-    guided: bool = field(default=False, kw_only=True)
+    guided: int = field(default=0, kw_only=True)
 
     @classmethod
     def weighted(cls, weighting: Weighting, served: int, connections: str) -> Configuration:
@@ -85,8 +85,8 @@ class Configuration:
             connections=self.connections if full.connections != "none" and light else "none",
             kappa_light=self.kappa_light,
             kappa_direct=self.kappa_direct,
-            guided=full.guidable and not full.merging and self.guided,
-            merging=full.merging and (self.guided or not full.guidable),
+            guided=self.guided if full.guidable and not full.merging else 0,
+            merging=full.merging and (self.guided > 0 or not full.guidable),
         )
         served = self.camera_paths_per_light_path if adopted.light else 1
         return replace(adopted, camera_paths_per_light_path=served)

@@ -21,7 +21,8 @@ COSTS = {
     # In a scene with media, a pair that is evaluated by the lane of a packet that has most of them: others
     # wait for it, and long subpaths differ. (Six scenes: 0.13 to 0.28.)
     "packets": 0.18,
-    "aimed": 5.5,  # a vertex where s = 0 is guided, with what follows
+    "guide": 2.0,  # a vertex where s = 0 is guided
+    "aimed": 3.5,  # each guided sample of it
     "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }
 
@@ -56,5 +57,5 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
         total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
     if candidate.guided:
         total += FIXED["guided"] / samples
-        total += COSTS["aimed"] * rays["aimed"]
+        total += (COSTS["guide"] + COSTS["aimed"] * candidate.guided) * rays["aimed"]
     return total / camera

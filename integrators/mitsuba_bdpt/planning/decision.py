@@ -8,6 +8,7 @@ from typing import Any, TypeGuard
 
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
+from ..transport.plan import GUIDED
 from .configuration import Configuration
 
 # Contributions below a share of the image's mean play roulette before their ray is traced: below this one,
@@ -123,9 +124,9 @@ def _read_decision(entry: Any) -> Decision:
         least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
         if not least <= value <= LARGEST:
             raise ValueError(f"{name}={value!r}")
-    guided = entry.get("guided", False)  # which records of older versions lack
-    if not isinstance(guided, bool):
-        raise TypeError(f"guided={guided!r}")
+    guided = entry.get("guided", 0)  # which records of older versions lack
+    if isinstance(guided, bool) or guided not in (0, *GUIDED):
+        raise ValueError(f"guided={guided!r}")
     return Decision(
         light_paths=light_paths, connections=connections, first_pass=first_pass, guided=guided, **numbers
     )

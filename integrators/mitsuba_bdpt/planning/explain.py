@@ -54,7 +54,10 @@ def explain(
             ("t=1 (light vertex seen by the sensor)", p.splat),
             ("(1,1) (emitter point seen by the sensor)", p.endpoints),
             ("t=0 (light subpath hits the sensor)", p.arrival),
-            ("guided s=0 (photons aim where no two neighbours can be joined)", p.guided),
+            (
+                f"guided s=0 ({p.guided} per vertex of paths on which no two neighbours can be joined)",
+                p.guided,
+            ),
             (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
         )
         if on
@@ -100,7 +103,10 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
     shown: set[tuple[str, str, int]] = set()
     for row in table:
         candidate = row.candidate
-        served, guided = candidate.camera_paths_per_light_path, ", guided" * candidate.guided
+        served, guided = (
+            candidate.camera_paths_per_light_path,
+            f", guided={candidate.guided}" * (candidate.guided > 0),
+        )
         key = candidate.weighting.combination, candidate.connections, served, guided
         if key in shown:
             continue

@@ -21,7 +21,7 @@ from ..transport.inputs import Kernel
 from ..transport.isolated_light import Found, Gauge
 from ..transport.kernel import trace_isolated
 from ..transport.photons import trace_guide
-from ..transport.plan import Plan
+from ..transport.plan import GUIDED, Plan
 from . import moments
 from .moments import FINE, GROUPS, Isolated, tile_of
 
@@ -62,23 +62,27 @@ def measure(
     return Isolated(found, aimed / batch.size, batch.size)
 
 
+# Moments of a vertex, see `Found`; an even number, so that Dr.Jit adds them as a packet.
+_WIDTH = 1 + len(GUIDED)
+
+
 class Sums:
     """What the lanes have `Found`, by group and fine tile."""
 
     def __init__(self, region: Region):
         self._region = region
-        self._sums = dr.zeros(mi.Float64, GROUPS * FINE**2 * 2)
+        self._sums = dr.zeros(mi.Float64, GROUPS * FINE**2 * _WIDTH)
         self._aimed = dr.zeros(mi.UInt32, 1)
         dr.make_opaque(self._sums, self._aimed)
 
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
         """Add what a ``lane`` found, whose camera sample has this ``position`` on the film."""
         row = moments.group(lane) * FINE**2 + tile_of(self._region, position)
-        values = mi.ArrayXd([mi.Float64(found.alone), mi.Float64(found.guided)])
+        values = mi.ArrayXd([mi.Float64(x) for x in found.moments])
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
         dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))
 
     def evaluated(self) -> tuple[np.ndarray, int]:
-        """The sums, shape (`GROUPS`, fine tiles, 2), and how many vertices could be guided."""
+        """The sums, shape (`GROUPS`, fine tiles, moments), and how many vertices could be guided."""
         dr.eval(self._sums, self._aimed)
-        return np.array(self._sums).reshape(GROUPS, FINE**2, 2), int(self._aimed[0])
+        return np.array(self._sums).reshape(GROUPS, FINE**2, _WIDTH), int(self._aimed[0])

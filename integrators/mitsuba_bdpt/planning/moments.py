@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport.batch import NET, NETS
+from ..transport.plan import GUIDED
 from .rows import SAMPLE, SPLAT
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ OWN_GAIN = 0.3
 
 
 # Fields of `Moments` that have a row for each group, and all of its arrays.
-_OF_GROUPS = ("base", "rare", "light", "draw", "alone")
+_OF_GROUPS = ("base", "rare", "light", "draw", "isolated")
 _ARRAYS = (*_OF_GROUPS, "gain")
 
 
@@ -58,10 +59,11 @@ class Moments:
     """What a pilot found, in units of the image's relative squared error per sample and pixel.
 
     ``base``, ``rare``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): with independent numbers
-    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn, and a column of
-    ``alone`` where s = 0 can be guided: the first if it is not, the second if it is; ``rare`` is that
+    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn; ``rare`` is that
     part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
-    weighting, is what the points of a net leave of the rest of ``base``. ``mean`` of the image (mean of the
+    weighting, is what the points of a net leave of the rest of ``base``. ``isolated``, shape (`GROUPS`,
+    numbers): the variance of paths on which s = 0 can be guided, which are in no other, if it is not, and
+    with each of `plan.GUIDED` numbers of samples. ``mean`` of the image (mean of the
     colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
     ``rays`` and connections per camera sample and kind, with one light subpath each, the number of ``bsdfs``,
     ``far``, the share of light subpaths that start at infinity, and the sky's ``evenness``, its mean radiance
@@ -71,7 +73,7 @@ class Moments:
     rare: np.ndarray
     light: np.ndarray
     draw: np.ndarray
-    alone: np.ndarray
+    isolated: np.ndarray
     gain: np.ndarray
     mean: float
     rays: dict[str, float]
@@ -211,9 +213,9 @@ def moments(
             total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
-    alone = np.zeros((GROUPS, 2))
+    guided = np.zeros((GROUPS, 1 + len(GUIDED)))
     if isolated is not None:
-        alone = np.matmul(of_group, isolated.sums)[:, 0] * (GROUPS / isolated.lanes)
+        guided = np.matmul(of_group, isolated.sums)[:, 0] * (GROUPS / isolated.lanes)
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
@@ -222,7 +224,7 @@ def moments(
         rare=summed(None, "rare"),
         light=summed(samples.light, "light"),
         draw=summed(samples.draw),
-        alone=alone,
+        isolated=guided,
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,

@@ -12,7 +12,7 @@ from ..emitters.emitters import Emitters
 from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
 from ..settings import DEFAULT_STORED, Settings
-from ..transport.plan import Plan
+from ..transport.plan import GUIDED, Plan
 from .budget import EVEN
 
 
@@ -80,7 +80,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
         merging=merging,
-        guided=guidable and not merging and settings.photon_guiding == "always",
+        guided=GUIDED[0] if guidable and not merging and settings.photon_guiding == "always" else 0,
         guidable=guidable,
     )
 

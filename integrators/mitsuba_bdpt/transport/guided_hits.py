@@ -32,82 +32,89 @@ _SEED = 0x5BD1E995
 
 @dataclass
 class Aim:
-    """What a guide says at a vertex, in solid angle.
+    """What a guide says at a vertex: where s = 0 can be guided (``active``), and the place of its photons.
 
-    Its direction ``d`` (unit, world) and the density ``pdf`` with which it makes it, 0 if there is none; the
-    density ``other`` with which it makes the walk's own direction.
+    ``other``: the density (solid angle, times the number of guided samples) with which it makes the walk's
+    own direction.
     """
 
-    d: mi.Vector3f
-    pdf: mi.Float
+    active: mi.Bool
+    found: mi.UInt32
     other: mi.Float
 
 
-def _nothing() -> Aim:
-    return Aim(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
+def _numbers(stream: Stream, number: mi.UInt32) -> Stream:
+    """The random numbers of the guided subpath of this ``number`` at each vertex."""
+    seed = sobol.mix(stream.seed ^ (_SEED + number))
+    return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED), {})
 
 
-def _numbers(stream: Stream) -> Stream:
-    """The random numbers of guided subpaths."""
-    return Stream(stream.digits, sobol.mix(stream.seed ^ _SEED), sobol.mix(stream.key ^ _SEED), {})
+def _possible(kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
+    """Mask: s = 0 can be guided at the camera vertex ``z``; ``walk`` as it was before it arrived."""
+    return may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
 
 
-def aim(kernel: Kernel, z: Vertex, walk: Walk, step, stream: Stream) -> Aim:
+def aim(kernel: Kernel, z: Vertex, walk: Walk, step) -> Aim:
     """What the guide says at the camera vertex ``z``; ``walk`` as it was before it arrived."""
-    active = may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
-    arguments = mi.Point3f(z.si.p), z.si.to_world(step.wo), mi.UInt32(z.event)
-    return dr.if_stmt(
-        arguments,
-        active,
-        lambda p, d, event: _look(kernel, p, d, event, _numbers(stream)),
-        lambda p, d, event: _nothing(),
-        label="guide",
-    )
-
-
-def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Aim:
-    """As `aim`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
-    possible = may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
-    return Aim(mi.Vector3f(0, 0, 1), mi.Float(0), dr.select(possible, step.pdf_fwd_w, 0))
-
-
-def _look(kernel: Kernel, p, d, event, numbers: Stream) -> Aim:
-    """A direction drawn at ``p``, and the density of another one, ``d``."""
-    found = photon_guide.find(kernel.guide, p)
-    u1 = kernel.points.draw_1d("camera", numbers, Purpose.LOBE, event)
-    u2 = kernel.points.draw_2d("camera", numbers, Purpose.BSDF, event)
-    drawn, possible = photon_guide.draw(kernel.guide, p, found, u1, u2)
-    pdf, other = photon_guide.densities(kernel.guide, p, found, drawn, d)
-    return Aim(drawn, dr.select(possible, pdf, 0), other)
+    return _asked(kernel, z, z.si.to_world(step.wo), _possible(kernel, z, walk))
 
 
 def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Aim:
     """What the guide says at the light vertex ``y``; ``other``: of the direction the light came from."""
     joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
-    active = y.hit & walk.only_delta & y.connectible() & ~joined
+    return _asked(kernel, y, -walk.d, y.hit & walk.only_delta & y.connectible() & ~joined)
 
+
+def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Aim:
+    """As `aim`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
+    possible = _possible(kernel, z, walk)
+    return Aim(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
+
+
+def _asked(kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Aim:
     def look(p, d):
         found = photon_guide.find(kernel.guide, p)
-        _, other = photon_guide.densities(kernel.guide, p, found, d, d)
-        return Aim(d, mi.Float(0), other)
+        return Aim(mi.Bool(True), found, _density(kernel, p, found, d))
 
-    arguments = mi.Point3f(y.si.p), -walk.d
-    return dr.if_stmt(arguments, active, look, lambda p, d: _nothing(), label="guide")
+    def nothing(p, d):
+        return Aim(mi.Bool(False), mi.UInt32(0), mi.Float(0))
+
+    return dr.if_stmt((mi.Point3f(vertex.si.p), d), active, look, nothing, label="guide")
+
+
+def _density(kernel: Kernel, p, found, d) -> mi.Float:
+    return kernel.plan.guided * photon_guide.density(kernel.guide, p, found, d)
 
 
 def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
-    """Follow the direction of the `Aim` at ``z``; returns the ``state`` after that.
+    """Follow directions of the guide at ``z``, where there is one; returns the ``state`` after that.
 
     ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and counts of what was not
     finite, of `Counters.aimed` and `Counters.guided`.
     """
-    chain = _chain(kernel, stream, shared, add)
-    return dr.if_stmt((z, *state), z.aim.pdf > 0, chain, lambda z, *state: state, label="guided subpath")
+    return dr.if_stmt(
+        (z, *state),
+        z.aim.active,
+        lambda z, *state: _follow_all(kernel, z, stream, shared, add, state),
+        lambda z, *state: state,
+        label="guided subpaths",
+    )
 
 
-def _chain(kernel: Kernel, stream: Stream, shared, add):
-    """A function that follows the `Aim` at a vertex, as `follow` does."""
+@dr.syntax
+def _follow_all(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
+    number = mi.UInt32(0)
+    while dr.hint(
+        number < kernel.plan.guided,
+        label="guided subpaths of a vertex",
+        exclude=[kernel, z, stream, shared, add],
+    ):
+        state = _follow_one(kernel, z, _numbers(stream, number), shared, add, state)
+        number += 1
+    return state
 
+
+def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
     def visit(vertex, state, walk):
         return dr.if_stmt(
             (vertex, *state),
@@ -117,39 +124,39 @@ def _chain(kernel: Kernel, stream: Stream, shared, add):
             label="guided s = 0",
         )
 
-    def chain(z, total, lost, aimed, traced):
-        walk = _begun(kernel, z, shared)
-        side = Side(
-            "camera",
-            shared,
-            bsdf.brightest(walk.throughput),  # what delta events leave of it plays roulette
-            False,
-            kernel.max_depth,
-            kernel.kappa.splat,
-            only_delta=True,
-        )
-        first, begun = walk.edges, walk.active
-        state = total, lost
-        (total, lost), walk = random_walk(kernel, side, walk, _numbers(stream), visit, state)
-        traced += dr.select(begun, walk.edges - first, 0)
-        return total, lost + one(walk.broken), aimed + one(begun), traced
-
-    return chain
+    total, lost, aimed, traced = state
+    walk = _begun(kernel, z, numbers, shared)
+    side = Side(
+        "camera",
+        shared,
+        bsdf.brightest(walk.throughput),  # what delta events leave of it plays roulette
+        False,
+        kernel.max_depth,
+        kernel.kappa.splat,
+        only_delta=True,
+    )
+    first, begun = walk.edges, walk.active
+    (total, lost), walk = random_walk(kernel, side, walk, numbers, visit, (total, lost))
+    traced += dr.select(begun, walk.edges - first, 0)
+    return total, lost + one(walk.broken), aimed + one(begun), traced
 
 
-def _begun(kernel: Kernel, z: Vertex, shared) -> Walk:
-    """A subpath that leaves ``z`` in the guide's direction."""
-    h, d, pdf, local = kernel.heuristic, z.aim.d, z.aim.pdf, z.si.to_local(z.aim.d)
-    f = bsdf.evaluate(z.bsdf, z.si, local, pdf > 0, kernel.traits)
-    throughput = dr.select(pdf > 0, z.throughput * f.value / pdf, 0)
-    active = bsdf.brightest(throughput) > 0
+def _begun(kernel: Kernel, z: Vertex, numbers: Stream, shared) -> Walk:
+    """A subpath that leaves ``z`` in a direction that the guide makes."""
+    h, p, points = kernel.heuristic, z.si.p, kernel.points
+    u1 = points.draw_1d("camera", numbers, Purpose.LOBE, z.event)
+    u2 = points.draw_2d("camera", numbers, Purpose.BSDF, z.event)
+    d, active = photon_guide.draw(kernel.guide, p, z.aim.found, u1, u2)
+    pdf, local = _density(kernel, p, z.aim.found, d), z.si.to_local(d)
+    f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
+    throughput = dr.select(active, z.throughput * f.value / pdf, 0)
     broken = not_finite(active, throughput)
-    active &= ~broken
-    unlike, one_ = mi.Bool(False), mi.Float(1)
-    step = bsdf.Step(local, f.value, pdf, f.pdf_rev_w, z.cosine(d), unlike, unlike, one_)
+    active &= (bsdf.brightest(throughput) > 0) & ~broken
+    no, unit = mi.Bool(False), mi.Float(1)
+    step = bsdf.Step(local, f.value, pdf, f.pdf_rev_w, z.cosine(d), no, no, unit)
     partial = mis.scatter(h, z.partial, newest_coefficient(kernel, kernel.kappa.splat, z.edges), step)
     ray = rays.spawn(z.anchor, d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    walk = Walk.begin(kernel, pi, ray, z.si.p, throughput, partial, active)
-    guided = h.start(dr.select(pdf > 0, f.pdf_fwd_w / pdf, 0))
+    walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
+    guided = h.start(dr.select(active, f.pdf_fwd_w / pdf, 0))
     return replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, guided=guided)

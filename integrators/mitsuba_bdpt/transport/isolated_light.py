@@ -6,7 +6,7 @@ of radius R, stand for an integral over directions, as in `merging`. With the th
 flux Phi, N photons' subpaths and f / p_0 the estimate of s = 0 of the path through it::
 
     second moment of s = 0          sum over photons of  T f / |n.d| Phi / (N pi R^2) * f / p_0
-    the same if it is guided        ... / (1 + p_g / p_bsdf)
+    the same with n guided samples  ... / (1 + n p_g / p_bsdf)
 
 The photons of the guide are others.
 """
@@ -23,6 +23,7 @@ from . import bsdf, photon_guide
 from .contribution import size_of
 from .inputs import Kernel
 from .photon_guide import WINDOW, Guide
+from .plan import GUIDED
 from .walk import Vertex, Walk, may_merge
 
 # Cosine between normals from which on a photon is taken to lie on the surface of the vertex.
@@ -44,19 +45,18 @@ class Gauge:
 
 @dataclass
 class Found:
-    """Second moments of a vertex, ``alone`` and ``guided``, and 1 where it may be guided (``aimed``).
+    """Second moments (of the mean of the colours) at a vertex, and 1 where s = 0 may be guided (``aimed``).
 
-    Of the mean of the colours.
+    ``moments`` if it is not guided, and with each of `GUIDED` numbers of samples.
     """
 
-    alone: mi.Float
-    guided: mi.Float
+    moments: list[mi.Float]
     aimed: mi.UInt32
 
 
 def nothing() -> Found:
     """Of a vertex where s = 0 cannot be guided."""
-    return Found(mi.Float(0), mi.Float(0), mi.UInt32(0))
+    return Found([mi.Float(0) for _ in (0, *GUIDED)], mi.UInt32(0))
 
 
 def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) -> Found:
@@ -77,11 +77,10 @@ def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) ->
         arriving = value / size_of(y.flux) * total / (gauge.count * dr.pi * dr.square(radius))
         by_hit = dr.minimum(value / (y.hit * f.pdf_fwd_w), gauge.most * arriving)
         there = photon_guide.find(gauge.guide, z.si.p)
-        pdf, _ = photon_guide.densities(gauge.guide, z.si.p, there, y.d, y.d)
-        second = arriving * by_hit
-        guided = second / (1 + pdf / f.pdf_fwd_w)
-        found = (dr.select(active, x, 0) for x in (second, guided))
-        return Found(*found, mi.UInt32(1))
+        pdf = photon_guide.density(gauge.guide, z.si.p, there, y.d)
+        ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)
+        alone = dr.select(active, arriving * by_hit, 0)
+        return Found([alone / (1 + n * ratio) for n in (0, *GUIDED)], mi.UInt32(1))
 
     return dr.if_stmt((z,), possible, measure, lambda z: nothing(), label="isolated light")
 

@@ -174,11 +174,12 @@ def trace_isolated(kernel: Kernel, gauge: isolated_light.Gauge, batch: Batch, po
 
     def visit(z, state, walk):
         found = isolated_light.look(kernel, gauge, z, walk, sample.stream)
-        return (state[0] + found.alone, state[1] + found.guided, state[2] + found.aimed)
+        moments = [a + b for a, b in zip(state.moments, found.moments, strict=True)]
+        return isolated_light.Found(moments, state.aimed + found.aimed)
 
-    state = mi.Float(0), mi.Float(0), mi.UInt32(0)
-    state, walk = random_walk(kernel, side, walk, sample.stream, visit, state)
-    add(index, sample.start.position, isolated_light.Found(*state))
+    nothing = isolated_light.nothing()
+    found, walk = random_walk(kernel, side, walk, sample.stream, visit, nothing)
+    add(index, sample.start.position, found)
 
 
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
@@ -414,7 +415,7 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
     def aim(z, walk, step):
         if kernel.without_isolated:
             return guided_hits.mark(kernel, z, walk, step)
-        return guided_hits.aim(kernel, z, walk, step, sample.stream)
+        return guided_hits.aim(kernel, z, walk, step)
 
     return Side(
         "camera",

@@ -147,19 +147,13 @@ def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Poi
 
 
 @dr.syntax
-def densities(guide: Guide, p: mi.Point3f, found: mi.UInt32, first: mi.Vector3f, second: mi.Vector3f):
-    """The densities (solid angle) with which `draw` makes two unit directions at ``p``."""
-    k, of_first, of_second = mi.UInt32(0), mi.Float(0), mi.Float(0)
-    while dr.hint(k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, first, second]):
+def density(guide: Guide, p: mi.Point3f, found: mi.UInt32, d: mi.Vector3f) -> mi.Float:
+    """The density (solid angle) with which `draw` makes the unit direction ``d`` at ``p``."""
+    k, total = mi.UInt32(0), mi.Float(0)
+    while dr.hint(k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, d]):
         near = photon(guide, found, k, True)
         a = dr.square(_width(near, p)) / 2
-        norm = a * (a + 2) / (4 * dr.pi * len(WINDOW))
-        of_first += norm / _tail(near.d, first, a)
-        of_second += norm / _tail(near.d, second, a)
+        m = dr.squared_norm(d - near.d) / 2
+        total += a * (a + 2) / dr.square(dr.select(a > 0, a + m, 1))
         k += 1
-    return of_first, of_second
-
-
-def _tail(d: mi.Vector3f, w: mi.Vector3f, a: mi.Float) -> mi.Float:
-    m = dr.squared_norm(w - d) / 2
-    return dr.square(dr.select(a > 0, a + m, 1))
+    return total / (4 * dr.pi * len(WINDOW))

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# Numbers of guided samples at a vertex among which a pilot chooses.
+GUIDED = (1, 4, 16)
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -14,8 +17,8 @@ class Plan:
     ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t<=1 over its count;
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
-    left out. ``merging``: whether vertices of isolated paths are merged;
-    ``guided``: whether s = 0 is guided on them; ``guidable``: whether a pilot may say that it pays.
+    left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: samples by which s = 0 is
+    guided at a vertex, 0 for none; ``guidable``: whether a pilot may say that it pays.
     """
 
     hit: bool
@@ -31,7 +34,7 @@ class Plan:
     hide_emitters: bool
     skipped: tuple[dict[str, str], ...] = ()
     merging: bool = False
-    guided: bool = False
+    guided: int = 0
     guidable: bool = False
 
     @property
