@@ -27,7 +27,7 @@ from .moments import FINE, GROUPS, Isolated, tile_of
 
 # Camera samples that look for vertices where s = 0 can be guided: most of their subpaths end at once. Light
 # subpaths that give the photons to measure with, and as many that give those of the guide.
-LANES, PHOTONS = 1 << 14, 1 << 15
+LANES, PHOTONS = 1 << 14, 1 << 16
 
 # An estimate of s = 0 may be as many times as large as what arrives as a render has samples, over this: what
 # a render is not likely to meet is missing from its image, not noise. (One sample in so many is on a path

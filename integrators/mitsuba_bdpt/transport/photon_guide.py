@@ -16,8 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 # Places of the photons of a window, from that of the point on.
-_NEAR = 8
-_FAR = (12, 18, 27, 40, 60, 90, 136, 204)
+_NEAR = 4
+_FAR = (6, 12, 25, 60)
 WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
 
 # Bits of each coordinate of a place on the curve.

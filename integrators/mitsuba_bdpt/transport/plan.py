@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 # Numbers of guided samples at a vertex among which a pilot chooses.
-GUIDED = (1, 4, 16)
+GUIDED = (1, 4, 8)
 
 
 @dataclass(frozen=True)
