@@ -723,6 +723,24 @@ MUTANTS = (
         ("tests/images/test_merging.py::test_floor_under_glass[sun]",),
     ),
     Mutant(
+        "merging: the camera's density for the light's",
+        "transport/merging.py",
+        "light_side = h.scale(photon.older, f.pdf_fwd_w)",
+        "light_side = h.scale(photon.older, f.pdf_rev_w)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_with_merges_agrees_with_explicit_densities[balance-n0c0-True]",
+        ),
+    ),
+    Mutant(
+        "merging: merges at other vertices do not count",
+        "transport/merging.py",
+        "h.combine(older, z.partial.d_vm)",
+        "older",
+        (
+            "tests/transport/test_oracle.py::test_kernel_with_merges_agrees_with_explicit_densities[balance-n0c0-True]",
+        ),
+    ),
+    Mutant(
         "merging: merges count as independent",
         "transport/merging.py",
         "return min(1.0, 1 / (samples * math.pi * radius**2))",
