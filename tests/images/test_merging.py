@@ -4,6 +4,7 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy joins two neighbours of that path; point lamps are found by merging alone.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -144,14 +145,18 @@ def test_floor_under_glass(light):
 
 
 def test_blur_goes_as_the_square_of_the_radius():
-    """Expected: with the same photons, what discs of 1.5 and three pixels lack of those of half a pixel is as
-    (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4; between 3 and 6 (photons that larger discs take besides).
+    """Rationale: the blur is that of a disc, and vanishes with it. The lamp is near to the plate, so that the
+    floor's irradiance is strongly curved.
+
+    Expected: with the same photons, what discs of 1.5 and three pixels lack of those of half a pixel is as
+    (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4, with a standard error of 0.5; between 3 and 7 (of the radius
+    itself it would be 2.5, of its cube 8.3).
     """
-    scene = mi.load_dict(under_glass(point()))
+    scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
-        images(scene, 512, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
+        images(scene, 128, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
     )
-    assert 3 < (large - small) / (middle - small) < 6
+    assert 3 < (large - small) / (middle - small) < 7
     assert middle < small
 
 
@@ -184,22 +189,30 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("parameters", [{}, {"skip": "none"}], ids=["default", "all"])
-@pytest.mark.parametrize("case", CASES)
-def test_large_lamps_look_as_without(case, parameters):
-    """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what merging finds. Expected: the same
-    tiles, by Welch's test, in discs of a quarter of a pixel.
-    """
+def lit_by_a_ball(case):
     more = {
         name: value(glass() if name == "plate" else matte()) if value is bumpy else value
         for name, value in CASES[case].items()
     }
     if "mirror" in more:
         more["mirror"] = mirror()
-    scene = mi.load_dict(under_glass(ball(), **more))
-    a = images(scene, 256, 8, merging=True, merging_radius=0.25, **parameters)
-    b = images(scene, 256, 8, first=100, **parameters)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    return mi.load_dict(under_glass(ball(), **more))
+
+
+@cache
+def without_merging(case):
+    """Tiles of a scene lit by a ball, without merging."""
+    return st.tiles(images(lit_by_a_ball(case), 256, 8, first=100))
+
+
+@pytest.mark.parametrize("parameters", [{}, {"skip": "none"}], ids=["default", "all"])
+@pytest.mark.parametrize("case", CASES)
+def test_large_lamps_look_as_without(case, parameters):
+    """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what merging finds. Expected: the same
+    tiles, by Welch's test, in discs of a quarter of a pixel.
+    """
+    a = images(lit_by_a_ball(case), 256, 8, merging=True, merging_radius=0.25, **parameters)
+    st.assert_agree(st.compare_images(st.tiles(a), without_merging(case)), at_least=16)
 
 
 def test_a_lens_and_a_point_lamp():
@@ -229,10 +242,8 @@ def test_paths_longer_than_stored():
 @pytest.mark.parametrize("heuristic", ["power", "maximum", "uniform"])
 def test_heuristics(heuristic):
     """Expected: the same tiles as with the balance heuristic without merging."""
-    scene = mi.load_dict(under_glass(ball()))
-    a = images(scene, 256, 8, merging=True, merging_radius=0.25, heuristic=heuristic)
-    b = images(scene, 256, 8, first=100)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    a = images(lit_by_a_ball("diffuse"), 256, 8, merging=True, merging_radius=0.25, heuristic=heuristic)
+    st.assert_agree(st.compare_images(st.tiles(a), without_merging("diffuse")), at_least=16)
 
 
 def test_what_is_not_connected_is_merged():
@@ -294,13 +305,18 @@ CHANGES = {
 }
 
 
+@cache
+def under_glass_and_a_point():
+    return images(under_glass(point()), 256, 8, merging=True)
+
+
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_makes_no_difference(change):
     """Expected: the same tiles of the floor as without the change (in the window of pixels that both have);
     the instance is of the plate.
     """
     more = CHANGES[change]
-    plain, changed = under_glass(point()), under_glass(point())
+    changed = under_glass(point())
     changed["sensor"]["film"] |= more.get("film", {})
     if change == "instance":
         plate = changed.pop("plate")
@@ -310,7 +326,7 @@ def test_what_makes_no_difference(change):
         }
         to_world = transform().translate([0, 0, 0.5])
         changed["again"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-    a = images(plain, 256, 8, merging=True)
+    a = under_glass_and_a_point()
     b = images(changed, 256, 8, first=100, merging=True, **more.get("bdpt", {}))
     if change == "crop window":
         a = a[:, 6:10, 4:12]
