@@ -463,7 +463,7 @@ MUTANTS = (
         "planning/pilot.py",
         "                    moment -= dr.square(estimate)\n",
         "                    pass\n",
-        ("tests/planning/test_pilot.py::test_predicted_variance[n0c0-cornell]",),
+        ("tests/planning/test_pilot.py::test_predicted_variance[cornell-n0c0]",),
     ),
     Mutant(
         "pilot: rays of light subpaths by camera samples",
