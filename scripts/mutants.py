@@ -463,7 +463,7 @@ MUTANTS = (
         "planning/pilot.py",
         "                    moment -= dr.square(estimate)\n",
         "                    pass\n",
-        ("tests/planning/test_pilot.py::test_predicted_variance[n0c0-cornell]",),
+        ("tests/planning/test_pilot.py::test_predicted_variance[cornell-n0c0]",),
     ),
     Mutant(
         "pilot: rays of light subpaths by camera samples",
@@ -721,6 +721,24 @@ MUTANTS = (
         "    eta = merging.eta(z.si.p)",
         "    eta = merging.eta(z.si.p) / 2",
         ("tests/images/test_merging.py::test_floor_under_glass[sun]",),
+    ),
+    Mutant(
+        "merging: the camera's density for the light's",
+        "transport/merging.py",
+        "light_side = h.scale(photon.older, f.pdf_fwd_w)",
+        "light_side = h.scale(photon.older, f.pdf_rev_w)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_with_merges_agrees_with_explicit_densities[balance-n0c0-True]",
+        ),
+    ),
+    Mutant(
+        "merging: merges at other vertices do not count",
+        "transport/merging.py",
+        "h.combine(older, z.partial.d_vm)",
+        "older",
+        (
+            "tests/transport/test_oracle.py::test_kernel_with_merges_agrees_with_explicit_densities[balance-n0c0-True]",
+        ),
     ),
     Mutant(
         "merging: merges count as independent",

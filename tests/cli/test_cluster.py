@@ -16,6 +16,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.files.loading import load
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.workers import results
 
@@ -49,24 +50,28 @@ def test_parts_cover_the_samples_with_seeds_of_their_own():
     assert len({seed for seed, _ in many} | {seed for seed, _ in neighbour}) == 1 << 13
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "fog_lamp"])
-def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name):
-    """Expected: the image is that of the same parts rendered here one after the other and joined; the pilot
-    ran once, its decisions are in the statistics. Tolerance: rounding of atomic sums and of half precision.
+@pytest.mark.parametrize(
+    "name, merges", [("cornell_box", False), ("fog_lamp", False), ("smallvcm_cornell_lamp", True)]
+)
+def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, merges):
+    """Expected: the image is that of the same parts rendered here one after the other and joined, also with
+    merging, whose radius begins anew in each; the pilot ran once, its decisions are in the statistics.
+    Tolerance: rounding of atomic sums and of half precision.
     """
-    path = SCENE.with_stem(name)
-    assert main(arguments(workers, tmp_path / "a.exr", scene=path)) == 0
+    path, given = SCENE.with_stem(name), ["-P", "merging=true"] * merges
+    assert main(arguments(workers, tmp_path / "a.exr", *given, scene=path)) == 0
     pixels, statistics = image(tmp_path / "a.exr")
+    assert np.isfinite(pixels).all() and statistics["unbiased"] != merges
+    assert not merges or statistics["merging"]["merges"]
     assert sum(statistics["passes"]) == statistics["spp"] == 256
     (decided,) = statistics["decisions"]
     assert statistics["no_pilot"] == ""
     assert main(arguments(workers, tmp_path / "short.exr", "--spp", "15", scene=path)) == 0
     assert "samples are too few" in image(tmp_path / "short.exr")[1]["no_pilot"]
-    scene = mi.load_file(str(path), resolution=32)
     options = Namespace(
         scene=path,
         defines=[("resolution", "32")],
-        properties=[],
+        properties=[("merging", True)] * merges,
         variant=mi.variant(),
         integrator=None,
         sensor=0,
@@ -74,12 +79,13 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name):
         target_error=None,
         seed=0,
     )
-    job = cluster._job(scene, scene.integrator(), options, 256)
+    scene, integrator = load(options)
+    job = cluster._job(scene, integrator, options, 256)
     assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]
     merged = cluster.Merged()
     for index, part in enumerate(cluster.parts_of(256, 8, 0)):
         merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, *part)))
-    expected = np.array(scene.integrator().assemble(merged.snapshot, scene))[..., :3]
+    expected = np.array(integrator.assemble(merged.snapshot, scene))[..., :3]
     np.testing.assert_allclose(pixels, expected, rtol=2e-3, atol=1e-6)
 
 

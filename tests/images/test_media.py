@@ -34,7 +34,7 @@ from mitsuba_bdpt.transport import inputs, stored_vertices
 from scipy import stats
 
 DEPTH = 4
-SEEDS = 24
+SEEDS = 12
 CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
 
 
@@ -153,7 +153,7 @@ def path_lengths(name):
     """
     kind = "volpathmis" if name in CHROMATIC else "volpath"
     tiles = {
-        k: parts.tile_means(load(name), parts.integrator(kind, max_depth=k), 128, 5000, SEEDS) @ CHANNELS
+        k: parts.tile_means(load(name), parts.integrator(kind, max_depth=k), 192, 5000, SEEDS) @ CHANNELS
         for k in range(1, DEPTH + 1)
     }
     return {k: tiles[k] - tiles[k - 1] for k in range(2, DEPTH + 1)}

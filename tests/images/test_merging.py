@@ -4,6 +4,7 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy joins two neighbours of that path; point lamps are found by merging alone.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import views
 import welch as st
-from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import merging, photons
 from mitsuba_bdpt.transport.inputs import Kernel
@@ -144,14 +145,18 @@ def test_floor_under_glass(light):
 
 
 def test_blur_goes_as_the_square_of_the_radius():
-    """Expected: with the same photons, what discs of 1.5 and three pixels lack of those of half a pixel is as
-    (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4; between 3 and 6 (photons that larger discs take besides).
+    """Rationale: the blur is that of a disc, and vanishes with it. The lamp is near to the plate, so that the
+    floor's irradiance is strongly curved.
+
+    Expected: with the same photons, what discs of 1.5 and three pixels lack of those of half a pixel is as
+    (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4, with a standard error of 0.5; between 3 and 7 (of the radius
+    itself it would be 2.5, of its cube 8.3).
     """
-    scene = mi.load_dict(under_glass(point()))
+    scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
-        images(scene, 512, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
+        images(scene, 128, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
     )
-    assert 3 < (large - small) / (middle - small) < 6
+    assert 3 < (large - small) / (middle - small) < 7
     assert middle < small
 
 
@@ -184,22 +189,30 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("parameters", [{}, {"skip": "none"}], ids=["default", "all"])
-@pytest.mark.parametrize("case", CASES)
-def test_large_lamps_look_as_without(case, parameters):
-    """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what merging finds. Expected: the same
-    tiles, by Welch's test, in discs of a quarter of a pixel.
-    """
+def lit_by_a_ball(case):
     more = {
         name: value(glass() if name == "plate" else matte()) if value is bumpy else value
         for name, value in CASES[case].items()
     }
     if "mirror" in more:
         more["mirror"] = mirror()
-    scene = mi.load_dict(under_glass(ball(), **more))
-    a = images(scene, 256, 8, merging=True, merging_radius=0.25, **parameters)
-    b = images(scene, 256, 8, first=100, **parameters)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    return mi.load_dict(under_glass(ball(), **more))
+
+
+@cache
+def without_merging(case):
+    """Tiles of a scene lit by a ball, without merging."""
+    return st.tiles(images(lit_by_a_ball(case), 256, 8, first=100))
+
+
+@pytest.mark.parametrize("parameters", [{}, {"skip": "none"}], ids=["default", "all"])
+@pytest.mark.parametrize("case", CASES)
+def test_large_lamps_look_as_without(case, parameters):
+    """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what merging finds. Expected: the same
+    tiles, by Welch's test, in discs of a quarter of a pixel.
+    """
+    a = images(lit_by_a_ball(case), 256, 8, merging=True, merging_radius=0.25, **parameters)
+    st.assert_agree(st.compare_images(st.tiles(a), without_merging(case)), at_least=16)
 
 
 def test_a_lens_and_a_point_lamp():
@@ -229,10 +242,8 @@ def test_paths_longer_than_stored():
 @pytest.mark.parametrize("heuristic", ["power", "maximum", "uniform"])
 def test_heuristics(heuristic):
     """Expected: the same tiles as with the balance heuristic without merging."""
-    scene = mi.load_dict(under_glass(ball()))
-    a = images(scene, 256, 8, merging=True, merging_radius=0.25, heuristic=heuristic)
-    b = images(scene, 256, 8, first=100)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    a = images(lit_by_a_ball("diffuse"), 256, 8, merging=True, merging_radius=0.25, heuristic=heuristic)
+    st.assert_agree(st.compare_images(st.tiles(a), without_merging("diffuse")), at_least=16)
 
 
 def test_what_is_not_connected_is_merged():
@@ -246,6 +257,65 @@ def test_what_is_not_connected_is_merged():
     b = images(scene, 256, 8, first=100, max_depth=4)
     assert b.mean() > 0.01
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+# -- what is smaller than a disc --------------------------------------------------------------------------
+
+# Half of the width of the sheet and of the box, which is an eighth as thick; radius of the ball.
+HALF, BALL = 0.8, 0.35
+SMALL = {
+    "sheet": {"type": "rectangle", "to_world": transform().scale(HALF)},
+    "box": {"type": "cube", "to_world": transform().scale([HALF, HALF, HALF / 8])},
+    "ball": {"type": "sphere", "radius": BALL},
+}
+
+
+@cache
+def small(shape):
+    """A scene in which all light has met this shape under the glass, and its image's brightness without
+    merging. The lamp lies where its reflection in the glass is not seen.
+    """
+    scene = under_glass(ball(1.0) | {"center": [6.0, 0.0, 4.5]})
+    scene["floor"] = SMALL[shape] | {"bsdf": matte()}
+    scene["sensor"]["fov"] = 36
+    scene = mi.load_dict(scene)
+    return scene, images(scene, 1024, 8, first=100).mean()
+
+
+def of_a_square(share):
+    """The share of the light that is left of a square, of pairs of points in a disc that both are in it.
+
+    The radius is ``share`` of half of the width a: 1 - 2 mean|x| / a + mean|x y| / a^2 over the disc.
+    """
+    return 1 - 4 / (3 * np.pi) * share + share**2 / (8 * np.pi)
+
+
+@pytest.mark.parametrize(
+    "shape, radius, least, most",
+    [
+        ("sheet", HALF / 4, of_a_square(1 / 4) - 0.04, of_a_square(1 / 4) + 0.04),
+        ("sheet", HALF, of_a_square(1) - 0.03, of_a_square(1) + 0.07),
+        ("box", HALF / 4, of_a_square(1 / 4) - 0.05, 0.97),
+        ("ball", BALL / 2, 0.75, 1.0),
+        ("ball", BALL, 0.25, 0.6),
+    ],
+    ids=["sheet, a quarter", "sheet", "box, a quarter", "ball, half", "ball"],
+)
+def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
+    """Rationale: a disc that is larger than what it lies on has fewer photons than its area says: light is
+    lost at edges and on curved surfaces, the more the larger the radius. (Merges have all of the weight.)
+
+    Expected, over the image without merging: of a sheet what a disc leaves of a square, 0.90 and 0.62, which
+    is 1 - 0.4 times the radius over half of the width; of a thin box as much, and not all; of a ball most at
+    half of its radius, and at its radius a quarter to 0.6. Tolerance: three standard errors of 0.013, beside
+    0.02 for the perspective, in which edges look smaller than the middle; standard errors of the ball: 0.03.
+    """
+    monkeypatch.setattr(rendering, "coefficient", lambda *_: 1.0)
+    monkeypatch.setattr(schedule, "FEWEST_PHOTONS", 1 << 18)
+    scene, expected = small(shape)
+    pixel = Footprints.of(scene, scene.sensors()[0]).angle * np.linalg.norm(CAMERA)
+    found = images(scene, 16, 8, merging=True, merging_radius=radius / pixel).mean()
+    assert least < found / expected < most
 
 
 # -- what merging leaves alone ----------------------------------------------------------------------------
@@ -294,13 +364,18 @@ CHANGES = {
 }
 
 
+@cache
+def under_glass_and_a_point():
+    return images(under_glass(point()), 256, 8, merging=True)
+
+
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_makes_no_difference(change):
     """Expected: the same tiles of the floor as without the change (in the window of pixels that both have);
     the instance is of the plate.
     """
     more = CHANGES[change]
-    plain, changed = under_glass(point()), under_glass(point())
+    changed = under_glass(point())
     changed["sensor"]["film"] |= more.get("film", {})
     if change == "instance":
         plate = changed.pop("plate")
@@ -310,7 +385,7 @@ def test_what_makes_no_difference(change):
         }
         to_world = transform().translate([0, 0, 0.5])
         changed["again"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-    a = images(plain, 256, 8, merging=True)
+    a = under_glass_and_a_point()
     b = images(changed, 256, 8, first=100, merging=True, **more.get("bdpt", {}))
     if change == "crop window":
         a = a[:, 6:10, 4:12]
@@ -424,6 +499,26 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
         np.array(again.render(scene, seed=3, spp=64, start=start)), expected, **ROUNDING
     )
     assert expected.any()
+
+
+def test_joined_renders_are_their_mean():
+    """Rationale: a part of a render knows nothing of the others. Expected: renders that are joined, of
+    several passes each, are the mean of their images by samples (to rounding of sums, box filter): the radius
+    and the photons of each begin anew. They say that they are not unbiased.
+    """
+    scene, parts = mi.load_dict(under_glass(point())), ((1, 16), (2, 32))
+
+    def bdpt():
+        return mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True, "spp_per_pass": 8})
+
+    snapshots = [stopped(bdpt(), scene, None, seed=seed, spp=spp).image_only() for seed, spp in parts]
+    whole = bdpt()
+    image = np.array(whole.assemble(snapshots[0].joined(snapshots[1]), scene))
+    expected = sum(spp / 48 * np.array(bdpt().render(scene, seed=seed, spp=spp)) for seed, spp in parts)
+    np.testing.assert_allclose(image, expected, **ROUNDING)
+    assert np.isfinite(image).all() and image.any()
+    found = whole.statistics
+    assert sum(found["passes"]) == 48 and found["merging"]["merges"] and not found["unbiased"]
 
 
 def test_what_a_render_says():

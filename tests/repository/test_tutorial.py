@@ -10,7 +10,7 @@ TUTORIAL = Path(__file__).parents[2] / "docs" / "user" / "tutorial.py"
 def test_tutorial_runs():
     """Expected: every cell runs at a small size and its assertions hold; it prints what it explains."""
     done = subprocess.run(
-        [sys.executable, str(TUTORIAL), "--size", "32"], capture_output=True, text=True, timeout=900
+        [sys.executable, str(TUTORIAL), "--size", "16"], capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, done.stdout + done.stderr
     for words in ("pilot: time to the same error", "estimated relMSE", "error of path over ours"):

@@ -34,17 +34,28 @@ from mitsuba_bdpt.measure import oracle
 from mitsuba_bdpt.measure.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
-from mitsuba_bdpt.transport import bsdf, connections, inputs, kernel, mis, stored_vertices, techniques
+from mitsuba_bdpt.transport import (
+    bsdf,
+    connections,
+    inputs,
+    kernel,
+    merging,
+    mis,
+    photons,
+    stored_vertices,
+    techniques,
+)
 from mitsuba_bdpt.transport.counters import Counters
+from mitsuba_bdpt.transport.merge_radius import Radius
 from mitsuba_bdpt.transport.observer import Observer
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------
 
 
-def check(paths, kappa, name, weights, relative):
+def check(paths, kappa, name, weights, relative, eta=None):
     """Compare with the oracle; returns how many paths were left out as tied."""
-    explicit = oracle.Explicit(paths, kappa)
+    explicit = oracle.Explicit(paths, kappa, eta)
     expected, used, tied = explicit.weights(name), explicit.used, explicit.tied
     weights = np.where(used, weights, 0)
     assert np.isfinite(weights).all()
@@ -175,9 +186,9 @@ class World:
     positions and normals here, computed in float64.
     """
 
-    def __init__(self, rng, n, k, lens):
+    def __init__(self, rng, n, k, lens, delta=0.2):
         self.rng, self.n, self.k, self.lens = rng, n, k, lens
-        paths = random_paths(rng, n, k, decades=2)
+        paths = random_paths(rng, n, k, decades=2, delta=delta)
         paths.lens[:] = lens
         if k == 1 and not lens:
             paths.kind[:] = rng.choice([AREA, ENVIRONMENT], n)
@@ -196,6 +207,7 @@ class World:
         # Mixed vertices: a delta event on a BSDF that could also be joined.
         self.mixed = rng.random((n, k + 1)) < 0.5
         self.demands = []  # masks that must hold
+        self.scene, self.merged = Scene(self), {}
 
     def _normals(self, direction):
         """Normals that no edge grazes: rounding stays near 1e-5."""
@@ -501,6 +513,9 @@ class Nothing:
     def stream(self, *_):
         return SimpleNamespace(rng=None)
 
+    def series(self, *_):
+        return mi.UInt32(1)
+
     def draw_1d(self, *_):
         return mi.Float(0.5)
 
@@ -519,9 +534,13 @@ def python_loop(times):
     return loop
 
 
-def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) -> np.ndarray:
-    """Weights of all strategies of the world's paths, by the unchanged kernel."""
-    k, scene = world.k, Scene(world)
+def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, merges=None) -> np.ndarray:
+    """Weights of all strategies of the world's paths, by the unchanged kernel.
+
+    With ``merges``, a `merging.Merging` without photons, those of the k - 1 merges follow, and `World.merged`
+    has what was merged.
+    """
+    k, scene = world.k, world.scene
     u32, f = mi.UInt32, mi.Float
     plan = SimpleNamespace(
         hit=True,
@@ -572,6 +591,10 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
         sensor_medium=None,
         scatters=True,
     )
+    shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+    if merges is not None:
+        k_.merging = traced_photons(world, k_, merges, shared, monkeypatch)
+        record_merges(world, monkeypatch)
     result = [f(0)] * (k + 2)
     stored = []
 
@@ -614,7 +637,6 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     monkeypatch.setattr(techniques, "sees_emitter", lambda kernel_, z: z.active)
     monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))
 
-    shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     scene.begin(from_light=True)
     monkeypatch.setattr(dr, "while_loop", python_loop(k if plan.arrival else k - 1))
     path, _ = kernel._light_subpath(k_, sink.Image(Nothing()), k_.points.stream(), shared, None)
@@ -625,7 +647,45 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch) ->
     kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), mi.Bool(True))
     dr.eval(result, world.demands)
     assert all(dr.all(x) for x in world.demands)
+    if merges is not None:
+        result += [world.merged[m].weight for m in range(1, k)]
     return columns(result, world.n)
+
+
+def traced_photons(world: World, k_, merges: merging.Merging, shared, monkeypatch) -> merging.Merging:
+    """The photons of one light subpath for each path, traced, sorted and kept by the unchanged code."""
+    k_.bound = lambda *_: SimpleNamespace(**vars(k_))
+    with monkeypatch.context() as patch:
+        patch.setattr(photons, "_CAPACITY", float(world.k))  # else they are traced again
+        patch.setattr(kernel, "shared_by_lane", lambda *_: shared)
+        patch.setattr(dr, "while_loop", python_loop(world.k - 1))
+        world.scene.begin(from_light=True)
+        return photons.trace(k_, merges, k_.points, world.n)[0]
+
+
+def record_merges(world: World, monkeypatch):
+    """Keep in ``world.merged`` what is merged at each x_m, a `Contribution`; inactive where nothing is."""
+    possible, merge, draw, loop = merging.possible, merging.merge, merging._draw, dr.while_loop
+    world.merged, mask = {}, {}
+
+    def recorded_possible(kernel_, z, walk):
+        mask[0] = possible(kernel_, z, walk)
+        return mask[0]
+
+    def recorded_merge(kernel_, z, stream):
+        out, m = merge(kernel_, z, stream), world.k - int(z.edges[0])
+        out.active = out.active & mask[0]
+        world.merged[m] = out
+        world.demands.append(~out.active | ((out.s == m + 1) & (out.t == world.k - m)))
+        return out
+
+    def drawn(*arguments):
+        with monkeypatch.context() as patch:  # a loop over photons, which are no stand-ins
+            patch.setattr(dr, "while_loop", loop)
+            return draw(*arguments)
+
+    for name, function in (("possible", recorded_possible), ("merge", recorded_merge), ("_draw", drawn)):
+        monkeypatch.setattr(merging, name, function)
 
 
 @pytest.mark.parametrize(
@@ -652,6 +712,55 @@ def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch)
         with monkeypatch.context() as patch:
             weights = kernel_weights(world, kappa, name, patch)
         check(world.paths, kappa, name, weights, relative=1e-3)
+
+
+@pytest.mark.parametrize(
+    "name, classes, lens",
+    [
+        ("balance", "odd", True),
+        ("balance", "n0c0", True),
+        ("power", "n1c0-half", True),
+        ("maximum", "odd", False),
+    ],
+)
+def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
+    """Rationale: as above, also of ``photons.trace``, ``merging.possible`` and ``merging.merge``: photons are
+    traced along the paths, sorted into the grid and found again from the camera's side, in discs so small
+    that each holds the vertex of its own path alone. Radii depend on the place, so that eta is spread over
+    three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.
+
+    Expected: the weights of all strategies and merges are the oracle's, as above. There is a merge at each
+    vertex where the oracle has one, and else only where an event is delta on a BSDF that has other lobes. A
+    merge's estimate is the photon's flux over eta and the cosine towards the light's side, to 1e-3; the flux
+    is 1 / density of the events before it, times their adjoint factors.
+    """
+    kappa, rng, share, total = COEFFICIENTS[classes], np.random.default_rng(9), 0.3, 0
+    for k in (4, 5):
+        world = World(rng, 1000, k, lens, delta=0.5)
+        centre, angle, low, high, count = (0.2, -0.1, 0.3), 1e-3, 2.5e-4, 2e-3, 10.0 ** (3 + k / 2)
+        radius = Radius(mi.Point3f(*centre), *(mi.Float(x) for x in (0.0, angle, low, high)))
+        with monkeypatch.context() as patch:
+            merges = merging.Merging(radius, mi.Float(count), mi.Float(share))
+            weights = kernel_weights(world, kappa, name, patch, merges)
+        distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
+        eta = count * np.pi * np.clip(angle * distance, low, high) ** 2
+        check(world.paths, kappa, name, weights, relative=1e-3, eta=share * eta)
+
+        paths, inner = world.paths, slice(1, k)
+        used = oracle.Explicit(paths, kappa, share * eta).used[:, k + 2 :]
+        merged = [world.merged[m] for m in range(1, k)]
+        active = np.stack([np.broadcast_to(c.active.numpy(), 1000) for c in merged], axis=1)
+        assert (active >= used).all()
+        assert not (active & ~used)[~(paths.delta & world.mixed)[:, inner]].any()
+        total += used.sum()
+        towards_light = paths.cos_camera[:, : k - 1]  # at x_1 ... x_{k-1}
+        density = np.where(paths.delta, 1, paths.to_camera)[:, inner]
+        flux = np.cumprod(paths.cos_light[:, inner] / towards_light / density, axis=1)
+        flux = np.concatenate([np.ones((1000, 1)), flux[:, :-1]], axis=1)
+        value = columns([c.value[0] for c in merged], 1000)
+        expected = flux / (eta[:, inner] * towards_light)
+        np.testing.assert_allclose(value[used], expected[used], rtol=1e-3, err_msg=f"k={k}")
+    assert total > 200
 
 
 # -- layer 3: densities of real scenes ---------------------------------------------------------------
