@@ -152,7 +152,8 @@ def _check_layers(settings: Settings):
     """Raise ``UsageError`` if two layers of the film have the same name."""
     seen = set()
     names = features.feature_names(settings.aovs)
-    for layer in layer_names(settings.strategy_depth, settings.variance, names):
+    depth, merges = settings.strategy_depth, settings.merge_images
+    for layer in layer_names(depth, settings.variance, names, merges=merges):
         if layer in seen:
             raise UsageError(
                 f"aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
@@ -213,11 +214,6 @@ def _check_together(settings: Settings):
         raise UsageError(
             "decisions together with light_paths, connections, skip or strategy_images is "
             "contradictory; leave out one or the other"
-        )
-    if settings.merging and settings.strategy_images:
-        raise UsageError(
-            "merging together with strategy_images is not possible: merges belong to no strategy (s, t); "
-            "leave out one of them"
         )
     _check_layers(settings)
     if settings.target_error and not settings.variance:
@@ -297,7 +293,7 @@ def check_film(sensor, settings: Settings):
     _check_has_pixels(sensor.film())
     channels = Channels.of(sensor.film(), len(colour.names), len(features.feature_names(settings.aovs)))
     film_limits.check_film(sensor.film(), channels, settings.variance)
-    film_limits.check_strategies(sensor.film(), settings.strategy_depth)
+    film_limits.check_strategies(sensor.film(), settings.strategy_depth, settings.merge_images)
     return colour
 
 

@@ -464,6 +464,36 @@ def test_merges_do_not_outweigh_what_is_better():
     assert 0 < a < 1.3 * b
 
 
+def strategy_images(scene, spp, seeds):
+    """Images and layers of the first colour by name, each (seeds, height, width)."""
+    parameters = {"type": "bdpt", "max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
+    method = mi.load_dict(parameters | {"strategy_images": True})
+    found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
+    found = np.array(found, dtype=np.float64)
+    names = method.aov_names()
+    assert found.shape[-1] == 3 + len(names)
+    return found[..., 0], {n[:-2]: found[..., 3 + i] for i, n in enumerate(names) if n.endswith(".R")}
+
+
+def test_strategy_image_of_merges():
+    """Expected: of a point lamp it is the image, weighted or not, and the other layers are black. Of a ball
+    the weighted layers add up to the image, of which merging has a part (1e-4); unweighted it has the same
+    tiles as s = 0, which makes the same paths of six edges.
+    """
+    image, layers = strategy_images(mi.load_dict(under_glass(point())), 16, 1)
+    for name, layer in layers.items():
+        expected = image if name.endswith("merged") else 0 * image
+        np.testing.assert_allclose(layer, expected, rtol=1e-4, atol=1e-6 * image.mean(), err_msg=name)
+
+    image, layers = strategy_images(mi.load_dict(under_glass(ball())), 256, 8)
+    total = sum(layer for name, layer in layers.items() if name.startswith("weighted"))
+    np.testing.assert_allclose(total, image, rtol=1e-4, atol=1e-6 * image.mean())
+    share = layers["weighted.merged"].mean() / layers["unweighted.merged"].mean()
+    assert 0.05 < share < 0.95
+    a, b = layers["unweighted.merged"], layers["unweighted.s0t7"]
+    st.assert_agree(st.compare_images(st.tiles(a[:4]), st.tiles(b[4:])), at_least=12)
+
+
 def test_what_needs_no_merging():
     """Expected: without delta surfaces no photon is traced, the render is unbiased, and `explain` says so."""
     scene = mi.load_dict(under_glass(ball(), plate=matte()))
@@ -476,8 +506,6 @@ def test_what_needs_no_merging():
 def test_what_is_refused():
     """Expected: errors that name the parameter, what is in the way, and the remedy."""
     # (Mitsuba's loader makes RuntimeErrors of all errors.)
-    with pytest.raises(RuntimeError, match="merging together with strategy_images"):
-        mi.load_dict({"type": "bdpt", "max_depth": 3, "merging": True, "strategy_images": True})
     with pytest.raises(RuntimeError, match="merging_radius=0"):
         mi.load_dict({"type": "bdpt", "merging_radius": 0.0})
     method = mi.load_dict({"type": "bdpt", "merging": True})

@@ -79,8 +79,10 @@ class Render:
         self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
         border = self.prepared.camera.region.border
-        depth, variance = settings.strategy_depth, settings.variance
-        self.accumulator = Accumulator(sensor.film(), colour, border, depth, variance, features)
+        strategies = settings.strategy_depth, settings.merge_images
+        self.accumulator = Accumulator(
+            sensor.film(), colour, border, *strategies, settings.variance, features
+        )
         self.kernel = self._kernel()
         # Whether the first pass, of one sample, gives roulette the scale of the image; see `_steps`.
         self._small_first: bool | None = None
