@@ -261,12 +261,6 @@ def check_merging(sensor, settings: Settings, media: bool):
     """Raise ``UnsupportedError`` where vertices cannot be merged; ``media``: whether the scene has some."""
     if not settings.merging:
         return
-    variant = mi.variant() or ""
-    if mi.is_spectral:
-        raise UnsupportedError(
-            f"merging in the variant {variant} is not supported: photons and camera subpaths have "
-            f"different wavelengths; use {variant.replace('spectral', 'rgb')}, or leave out merging"
-        )
     if sensor.shutter_open_time() > 0:
         raise UnsupportedError(
             f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "

@@ -13,7 +13,7 @@ import views
 import welch as st
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import merging, photons
+from mitsuba_bdpt.transport import merging, photons, wavelength_sets
 from mitsuba_bdpt.transport.inputs import Kernel
 from mitsuba_bdpt.transport.merge_radius import Footprints
 from snapshots import ROUNDING, stopped
@@ -200,6 +200,45 @@ def test_large_lamps_look_as_without(case, parameters):
     a = images(scene, 256, 8, merging=True, merging_radius=0.25, **parameters)
     b = images(scene, 256, 8, first=100, **parameters)
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+def test_spectral():
+    """Rationale: photons and camera subpaths share sets of wavelengths. Expected: in a spectral variant each
+    colour of a coloured floor under a coloured lamp is what s = 0 finds, in tiles; in one pass of many
+    samples and in passes of less than one for each set.
+    """
+    mi.set_variant("llvm_ad_spectral")
+    lamp = ball() | {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10, 6, 2]}}}
+    floor = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.4]}}
+    scene = mi.load_dict(under_glass(lamp, floor))
+    expected = coloured(scene, 256, 8, 100)
+    for first, spp, passes in ((0, 256, {}), (200, 64, {"spp_per_pass": 4})):
+        found = coloured(scene, spp, 8, first, merging=True, merging_radius=0.25, **passes)
+        family = [st.compare_images(st.tiles(found[..., i]), st.tiles(expected[..., i])) for i in range(3)]
+        st.assert_agree(st.Comparisons.join(family), at_least=40)
+
+
+def coloured(scene, spp, seeds, first, **parameters):
+    """(seeds, height, width, 3)."""
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "rr_depth": 100, **parameters})
+    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
+    return np.array([np.array(image, dtype=np.float64) for image in found])
+
+
+def test_wavelengths_lie_evenly():
+    """Expected: the numbers that choose wavelengths, those of a set a quarter apart, lie evenly in each pass;
+    neighbouring sets begin in different quarters; later passes have others between.
+    """
+    number = dr.arange(mi.UInt32, wavelength_sets.SETS)
+    starts = []
+    for done in range(8):
+        u = np.array(wavelength_sets.WavelengthSets.of(mi.Float(0.9), done).u(number), dtype=np.float64)
+        assert (u >= 0).all() and (u < 1).all()
+        assert (np.diff(np.floor((u - u[0]) % 1 * 4 + 1e-3)) != 0).all()
+        every = np.sort((u[:, None] + np.arange(4) / 4).ravel() % 1)
+        np.testing.assert_allclose(np.diff(every), 1 / len(every), atol=1e-5)
+        starts.append(every[0] * len(every))
+    assert np.diff(np.sort(starts)).min() > 1 / 16
 
 
 def test_a_lens_and_a_point_lamp():

@@ -44,7 +44,7 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
-    shared = kernels.shared_by_lane(kernel, stream)
+    shared = kernels.shared_by_lane(kernel, stream, mi.UInt64(lanes))
     e = kernels.emission(kernel, stream, shared)
     walk = kernels.light_walk(kernel, e, stream, shared, True)
     side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, isolated=True)
@@ -73,7 +73,9 @@ def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
     index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
     found = dr.gather(Photon, photons, index)
     radius = merging.radius
-    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)))
+    sets = merging.wavelengths
+    number = None if sets is None else sets.number(found.lane)
+    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)), number)
     bucket = bucket_of(cell)
     key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
     order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))
