@@ -95,6 +95,18 @@ class Photon:
     edges: mi.UInt32
     lane: mi.UInt32
 
+    # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
+
+    @staticmethod
+    def zeros(count: int) -> Photon:
+        """Room for so many."""
+        types = mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
+        return Photon(*(dr.zeros(kind, count) for kind in types))
+
+    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
+        """Those of these numbers."""
+        return Photon(*(dr.gather(type(column), column, index, active) for column in vars(self).values()))
+
 
 @dataclass
 class Photons:
@@ -155,7 +167,7 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
     chosen, total = _draw(kernel, z, word, wavelength_set)
     active = z.hit & (total > 0)
-    photon = dr.gather(Photon, merging.photons.found, chosen, active)
+    photon = merging.photons.found.at(chosen, active)
     f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)
     eta = merging.eta(z.si.p)
     # Per area of the surface: what the disc receives, f |cos| being per solid angle.
@@ -194,7 +206,7 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
         corner += dr.select(through, mi.UInt32(1), 0)
 
         tried = place < end
-        photon = dr.gather(Photon, photons.found, place, tried)
+        photon = photons.found.at(place, tried)
         near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # others share its bucket
         near &= _is_near(photon, z, r) & (photon.edges <= most)
         size = dr.select(near, size_of(photon.flux), 0)

@@ -40,7 +40,7 @@ def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple
 
 def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.UInt64]:
     """Photons in the order of their arrival, how many there are, maybe more than the ``capacity``; counts."""
-    out = dr.zeros(Photon, capacity)
+    out = Photon.zeros(capacity)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
@@ -71,7 +71,7 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
     """The first ``count`` by bucket, subpath and edge, an order that does not depend on threads."""
     index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
-    found = dr.gather(Photon, photons, index)
+    found = photons.at(index)
     radius = merging.radius
     sets = merging.wavelengths
     number = None if sets is None else sets.number(found.lane)
@@ -82,6 +82,6 @@ def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
     dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
     starts = dr.cumsum(counts)
-    result = Photons(dr.gather(Photon, found, order), dr.gather(mi.UInt64, cell, order), starts)
+    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts)
     dr.eval(result)
     return result
