@@ -709,6 +709,13 @@ MUTANTS = (
         ("tests/images/test_merging.py::test_cells_may_share_a_bucket",),
     ),
     Mutant(
+        "merging: photons of other wavelengths count",
+        "transport/merging.py",
+        "index += wavelength_set << (_CELL_BITS - SET_BITS)",
+        "index += 0",
+        ("tests/images/test_merging.py::test_spectral",),
+    ),
+    Mutant(
         "merging: normals are not compared",
         "transport/merging.py",
         "return within & flat & (dr.dot(photon.n, z.si.n) > _SAME_SIDE)",

@@ -243,7 +243,8 @@ class BDPTIntegrator:
     def aov_names(self) -> list[str]:
         """Names of the film's layers beside colours and alpha."""
         settings = self.settings
-        return layer_names(settings.strategy_depth, settings.variance, feature_names(settings.aovs))
+        depth, merges = settings.strategy_depth, settings.merge_images
+        return layer_names(depth, settings.variance, feature_names(settings.aovs), merges=merges)
 
     def sample(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""

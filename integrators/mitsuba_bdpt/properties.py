@@ -152,7 +152,8 @@ def _check_layers(settings: Settings):
     """Raise ``UsageError`` if two layers of the film have the same name."""
     seen = set()
     names = features.feature_names(settings.aovs)
-    for layer in layer_names(settings.strategy_depth, settings.variance, names):
+    depth, merges = settings.strategy_depth, settings.merge_images
+    for layer in layer_names(depth, settings.variance, names, merges=merges):
         if layer in seen:
             raise UsageError(
                 f"aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
@@ -214,11 +215,6 @@ def _check_together(settings: Settings):
             "decisions together with light_paths, connections, skip or strategy_images is "
             "contradictory; leave out one or the other"
         )
-    if settings.merging and settings.strategy_images:
-        raise UsageError(
-            "merging together with strategy_images is not possible: merges belong to no strategy (s, t); "
-            "leave out one of them"
-        )
     _check_layers(settings)
     if settings.target_error and not settings.variance:
         raise UsageError(
@@ -265,12 +261,6 @@ def check_merging(sensor, settings: Settings, media: bool):
     """Raise ``UnsupportedError`` where vertices cannot be merged; ``media``: whether the scene has some."""
     if not settings.merging:
         return
-    variant = mi.variant() or ""
-    if mi.is_spectral:
-        raise UnsupportedError(
-            f"merging in the variant {variant} is not supported: photons and camera subpaths have "
-            f"different wavelengths; use {variant.replace('spectral', 'rgb')}, or leave out merging"
-        )
     if sensor.shutter_open_time() > 0:
         raise UnsupportedError(
             f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "
@@ -297,7 +287,7 @@ def check_film(sensor, settings: Settings):
     _check_has_pixels(sensor.film())
     channels = Channels.of(sensor.film(), len(colour.names), len(features.feature_names(settings.aovs)))
     film_limits.check_film(sensor.film(), channels, settings.variance)
-    film_limits.check_strategies(sensor.film(), settings.strategy_depth)
+    film_limits.check_strategies(sensor.film(), settings.strategy_depth, settings.merge_images)
     return colour
 
 

@@ -170,7 +170,8 @@ class Settings:
         False,
         "true or false",
         """Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` of all *k* + 2 strategies of each
-        length *k*; needs a finite ``max_depth``.""",
+        length *k*, with ``merging`` also ``weighted.merged`` and ``unweighted.merged``; needs a finite
+        ``max_depth``.""",
     )
     variance: bool = _parameter(
         False,
@@ -215,6 +216,11 @@ class Settings:
     def strategy_depth(self) -> int:
         """The largest path length of the strategy images, 0 for none."""
         return self.max_depth if self.strategy_images else 0
+
+    @property
+    def merge_images(self) -> bool:
+        """Whether there is a strategy image of merges."""
+        return self.strategy_images and self.merging
 
 
 PARAMETERS: dict[str, Parameter] = {f.name: f.metadata["parameter"] for f in fields(Settings)}

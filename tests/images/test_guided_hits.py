@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import mitsuba as mi
-import numpy as np
 import pytest
-import views
 import welch as st
-from test_merging import ball, bumpy, glass, images, matte, mirror, point, transform, under_glass
+from test_merging import ball, bumpy, glass, images, matte, mirror, under_glass
 
 CASES = {
     "diffuse": {},

@@ -14,7 +14,7 @@ import views
 import welch as st
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import merging, photons
+from mitsuba_bdpt.transport import merging, photons, wavelength_sets
 from mitsuba_bdpt.transport.inputs import Kernel
 from mitsuba_bdpt.transport.merge_radius import Footprints
 from snapshots import ROUNDING, stopped
@@ -213,6 +213,45 @@ def test_large_lamps_look_as_without(case, parameters):
     """
     a = images(lit_by_a_ball(case), 256, 8, merging=True, merging_radius=0.25, **parameters)
     st.assert_agree(st.compare_images(st.tiles(a), without_merging(case)), at_least=16)
+
+
+def test_spectral():
+    """Rationale: photons and camera subpaths share sets of wavelengths. Expected: in a spectral variant each
+    colour of a coloured floor under a coloured lamp is what s = 0 finds, in tiles; in one pass of many
+    samples and in passes of less than one for each set.
+    """
+    mi.set_variant("llvm_ad_spectral")
+    lamp = ball() | {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10, 6, 2]}}}
+    floor = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.4]}}
+    scene = mi.load_dict(under_glass(lamp, floor))
+    expected = coloured(scene, 256, 8, 100)
+    for first, spp, passes in ((0, 256, {}), (200, 64, {"spp_per_pass": 4})):
+        found = coloured(scene, spp, 8, first, merging=True, merging_radius=0.25, **passes)
+        family = [st.compare_images(st.tiles(found[..., i]), st.tiles(expected[..., i])) for i in range(3)]
+        st.assert_agree(st.Comparisons.join(family), at_least=40)
+
+
+def coloured(scene, spp, seeds, first, **parameters):
+    """(seeds, height, width, 3)."""
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "rr_depth": 100, **parameters})
+    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
+    return np.array([np.array(image, dtype=np.float64) for image in found])
+
+
+def test_wavelengths_lie_evenly():
+    """Expected: the numbers that choose wavelengths, those of a set a quarter apart, lie evenly in each pass;
+    neighbouring sets begin in different quarters; later passes have others between.
+    """
+    number = dr.arange(mi.UInt32, wavelength_sets.SETS)
+    starts = []
+    for done in range(8):
+        u = np.array(wavelength_sets.WavelengthSets.of(mi.Float(0.9), done).u(number), dtype=np.float64)
+        assert (u >= 0).all() and (u < 1).all()
+        assert (np.diff(np.floor((u - u[0]) % 1 * 4 + 1e-3)) != 0).all()
+        every = np.sort((u[:, None] + np.arange(4) / 4).ravel() % 1)
+        np.testing.assert_allclose(np.diff(every), 1 / len(every), atol=1e-5)
+        starts.append(every[0] * len(every))
+    assert np.diff(np.sort(starts)).min() > 1 / 16
 
 
 def test_a_lens_and_a_point_lamp():
@@ -559,6 +598,36 @@ def test_merges_do_not_outweigh_what_is_better():
     assert 0 < a < 1.3 * b
 
 
+def strategy_images(scene, spp, seeds):
+    """Images and layers of the first colour by name, each (seeds, height, width)."""
+    parameters = {"type": "bdpt", "max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
+    method = mi.load_dict(parameters | {"strategy_images": True})
+    found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
+    found = np.array(found, dtype=np.float64)
+    names = method.aov_names()
+    assert found.shape[-1] == 3 + len(names)
+    return found[..., 0], {n[:-2]: found[..., 3 + i] for i, n in enumerate(names) if n.endswith(".R")}
+
+
+def test_strategy_image_of_merges():
+    """Expected: of a point lamp it is the image, weighted or not, and the other layers are black. Of a ball
+    the weighted layers add up to the image, of which merging has a part (1e-4); unweighted it has the same
+    tiles as s = 0, which makes the same paths of six edges.
+    """
+    image, layers = strategy_images(mi.load_dict(under_glass(point())), 16, 1)
+    for name, layer in layers.items():
+        expected = image if name.endswith("merged") else 0 * image
+        np.testing.assert_allclose(layer, expected, rtol=1e-4, atol=1e-6 * image.mean(), err_msg=name)
+
+    image, layers = strategy_images(mi.load_dict(under_glass(ball())), 256, 8)
+    total = sum(layer for name, layer in layers.items() if name.startswith("weighted"))
+    np.testing.assert_allclose(total, image, rtol=1e-4, atol=1e-6 * image.mean())
+    share = layers["weighted.merged"].mean() / layers["unweighted.merged"].mean()
+    assert 0.05 < share < 0.95
+    a, b = layers["unweighted.merged"], layers["unweighted.s0t7"]
+    st.assert_agree(st.compare_images(st.tiles(a[:4]), st.tiles(b[4:])), at_least=12)
+
+
 def test_what_needs_no_merging():
     """Expected: without delta surfaces no photon is traced, the render is unbiased, and `explain` says so."""
     scene = mi.load_dict(under_glass(ball(), plate=matte()))
@@ -571,8 +640,6 @@ def test_what_needs_no_merging():
 def test_what_is_refused():
     """Expected: errors that name the parameter, what is in the way, and the remedy."""
     # (Mitsuba's loader makes RuntimeErrors of all errors.)
-    with pytest.raises(RuntimeError, match="merging together with strategy_images"):
-        mi.load_dict({"type": "bdpt", "max_depth": 3, "merging": True, "strategy_images": True})
     with pytest.raises(RuntimeError, match="merging_radius=0"):
         mi.load_dict({"type": "bdpt", "merging_radius": 0.0})
     method = mi.load_dict({"type": "bdpt", "merging": True})

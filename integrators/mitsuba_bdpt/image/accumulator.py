@@ -19,7 +19,7 @@ import numpy as np
 from ..errors import UsageError
 from .block import Block
 from .channels import Channels
-from .layers import layer_names, strategies, strategy_count, strategy_index
+from .layers import image_count, layer_names, strategies, strategy_count, strategy_index
 from .replicates import Replicates
 from .spread import Spread
 
@@ -32,11 +32,12 @@ class Accumulator:
 
     ``film`` Mitsuba's film; ``colour`` what it keeps of a spectrum, see `colour`; ``border`` how many
     pixels camera samples reach beyond the crop window; ``depth`` the largest path length of the strategy
-    images, 0 for none; ``variance`` whether the layers of the variance are wanted, see
-    `close_replicate`; ``features`` the `FeatureLayers` that camera samples bring along, or ``None``.
+    images, 0 for none, ``merges`` whether there is one of those too; ``variance`` whether the layers of the
+    variance are wanted, see `close_replicate`; ``features`` the `FeatureLayers` that camera samples bring
+    along, or ``None``.
     """
 
-    def __init__(self, film, colour, border: int, depth: int, variance: bool = False, features=None):
+    def __init__(self, film, colour, border: int, depth: int, merges: bool, variance: bool, features):
         self.film, self.colour, self.features = film, colour, features
         self.border = border
         self.depth = depth
@@ -45,14 +46,14 @@ class Accumulator:
         self.rfilter = film.rfilter()
         self.variance, self.replicates = variance, Replicates()
         names = features.names if features else []
-        colour.prepare(layer_names(depth, variance, names, colour.names))
+        colour.prepare(layer_names(depth, variance, names, colour.names, merges))
         self._channels = Channels.of(film, len(colour.names), len(names))
         self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf)
         # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
         # One strip of rows per strategy, far enough apart for the filter.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
-        rows = strategy_count(depth) * self._stride
+        rows = image_count(depth, merges) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if depth else None
         self._done: tuple[list, tuple[int, ...]] = ([], ())  # sums and passes
         self._share = [self._covered(n) for n in self.size]
@@ -74,12 +75,13 @@ class Accumulator:
         """Add a splat at a continuous film position."""
         self.light.put(position, [*colours], active)
 
-    def put_strategy(self, position, weighted, unweighted, s, t, active):
-        """Add to the technique images of the strategy (s, t)."""
+    def put_strategy(self, position, weighted, unweighted, c, active):
+        """Add to the technique images of the strategy of the contribution ``c``."""
         if self.strategies is None:
             raise ValueError("an accumulator of depth 0 has no strategy images")
         values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
-        self.strategies.put(position, values, active, strategy_index(s, t) * self._stride)
+        index = strategy_count(self.depth) if c.kind == "merge" else strategy_index(c.s, c.t)
+        self.strategies.put(position, values, active, index * self._stride)
 
     def evaluate(self, *others):
         """Run what was recorded since the last call as one kernel, ``others`` with it."""
@@ -211,8 +213,9 @@ class Accumulator:
         """The strategy images in the order of their layers; ``to_film``: what splats are multiplied by."""
         w, h = self.size
         tall = np.array(sums).reshape(-1, self._stride, w, 6)[:, :h]
-        order = enumerate(strategies(self.depth))
-        return [tall[index] * (to_film if t <= 1 else 1) for index, (_, _, t) in order]
+        splats = [t <= 1 for _, _, t in strategies(self.depth)]
+        splats += [False] * (len(tall) - len(splats))  # merges
+        return [image * (to_film if splat else 1) for image, splat in zip(tall, splats, strict=True)]
 
 
 @dataclass

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..errors import UsageError
 from .channels import Channels
-from .layers import strategy_count
+from .layers import image_count
 
 # Of one array.
 MOST_NUMBERS = 1 << 32
@@ -37,14 +37,14 @@ def check_film(film, channels: Channels, variance: bool):
         )
 
 
-def check_strategies(film, depth: int):
+def check_strategies(film, depth: int, merges: bool):
     """Raise `UsageError` if strategy images take more than `STRATEGY_MEMORY`.
 
-    They are those of paths of up to ``depth`` edges.
+    They are those of paths of up to ``depth`` edges, and of ``merges`` if there are some.
     """
     width, height = (int(x) for x in film.crop_size())
     # Six channels of each: three weighted, three not.
-    needed = strategy_count(depth) * width * height * 6 * (DOUBLE + ALL)
+    needed = image_count(depth, merges) * width * height * 6 * (DOUBLE + ALL)
     if needed > STRATEGY_MEMORY:
         raise UsageError(
             f"strategy_images at {width}x{height} with max_depth={depth} needs about "

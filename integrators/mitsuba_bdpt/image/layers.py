@@ -13,22 +13,30 @@ def strategy_count(depth: int) -> int:
     return depth * (depth + 5) // 2
 
 
+def image_count(depth: int, merges: bool) -> int:
+    """How many strategies have images: those of `strategies`, and where there are ``merges`` all of these."""
+    return strategy_count(depth) + merges
+
+
 def strategy_index(s, t):
     """Place of the strategy (s, t) in `strategies`; integers or arrays of them."""
     k = s + t - 1
     return (k - 1) * (k + 4) // 2 + s
 
 
-def layer_names(depth: int, variance: bool, features=(), colours=("R", "G", "B")) -> list[str]:
+def layer_names(
+    depth: int, variance: bool, features=(), colours=("R", "G", "B"), merges: bool = False
+) -> list[str]:
     """Names of the film's layers, in the order in which `Accumulator` keeps them.
 
     ``features``, the variance of the pixels in the film's ``colours``, and technique images of paths of up to
-    ``depth`` edges.
+    ``depth`` edges, with one of all ``merges`` if there are some.
     """
     names = [*features, *(f"variance.{colour}" for colour in colours if variance)]
+    of_strategies = [f"s{s}t{t}" for _, s, t in strategies(depth)] + ["merged"] * merges
     return names + [
-        f"{kind}.s{s}t{t}.{channel}"
-        for _, s, t in strategies(depth)
+        f"{kind}.{strategy}.{channel}"
+        for strategy in of_strategies
         for kind in ("weighted", "unweighted")
         for channel in "RGB"
     ]

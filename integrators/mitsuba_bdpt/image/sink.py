@@ -77,7 +77,7 @@ class Image:
         weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
         unweighted = self._film.colour(c.value * shared.weight, shared.wavelengths)
         finite = dr.all(dr.isfinite(weighted)) & dr.all(dr.isfinite(unweighted))
-        self._film.put_strategy(position, weighted, unweighted, c.s, c.t, c.active & finite)
+        self._film.put_strategy(position, weighted, unweighted, c, c.active & finite)
 
 
 def _alpha(kernel, seen):

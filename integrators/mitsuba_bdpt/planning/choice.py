@@ -40,8 +40,8 @@ MORE_GAIN = 1.02
 # pilots say 1.2 and 1.1, but three quarters of the trimmed error's efficiency is left.)
 GUIDE_GAIN = 2.0
 
-# A larger number of guided samples has to gain this factor over a smaller one: what guiding cannot help is in no
-# prediction of it.
+# A larger number of guided samples has to gain this factor over a smaller one: what guiding cannot help is in
+# no prediction of it.
 MORE_GUIDED_GAIN = 1.3
 
 # Among candidates whose times are within this factor of the best, that comes first whose kernel is the first

@@ -78,7 +78,7 @@ class Sums:
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
         """Add what a ``lane`` found, whose camera sample has this ``position`` on the film."""
         row = moments.group(lane) * FINE**2 + tile_of(self._region, position)
-        values = mi.ArrayXd([mi.Float64(x) for x in found.moments])
+        values = mi.ArrayXd(list(found.moments))
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
         dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))
 

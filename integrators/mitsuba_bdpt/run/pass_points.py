@@ -5,10 +5,11 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling.points import Points
-from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, sequence_seed
+from ..sampling.points import Points, sequential
+from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, WAVELENGTHS, sequence_seed
 from ..settings import Settings
 from ..transport.batch import Batch
+from ..transport.wavelength_sets import WavelengthSets
 from .schedule import Step
 
 
@@ -33,11 +34,21 @@ class PassPoints:
             seed = sequence_seed(self.seed, number)
         return self._of_sampler(step, batch, seed) if self._kind == "sampler" else Points(self._kind, seed)
 
-    def of_photons(self, step: Step, done: int, changes: int) -> Points:
-        """The points of the photons of a pass after ``done`` others of the same image, or replicate."""
-        seed = sequence_seed(self.seed, PHOTONS + done)
+    def wavelengths(self, step: Step, done: int, changes: int) -> WavelengthSets:
+        """The wavelengths of a pass after ``done`` others of the same image, or replicate, with merging."""
+        start, _ = sequential(self._seed_beside(WAVELENGTHS, step, changes))
+        return WavelengthSets.of(start, done)
+
+    def _seed_beside(self, sequence: int, step: Step, changes: int) -> mi.UInt32:
+        """The seed of a ``sequence`` of ours: others for each replicate and after changes of the plan."""
+        seed = sequence_seed(self.seed, sequence)
         if number := step.replicate + (CHANGED + changes if changes else 0):
             seed = sequence_seed(seed, number)
+        return seed
+
+    def of_photons(self, step: Step, done: int, changes: int) -> Points:
+        """The points of the photons of a pass after ``done`` others of the same image, or replicate."""
+        seed = self._seed_beside(PHOTONS + done, step, changes)
         return Points("independent" if self._kind == "independent" else "sobol", seed)
 
     def of_guide(self) -> Points:

@@ -33,6 +33,7 @@ from ..transport.merge_radius import SHRINKING, Footprints
 from ..transport.merging import Merging, coefficient
 from ..transport.photon_guide import Guide
 from ..transport.plan import Plan
+from ..transport.wavelength_sets import SETS
 from .pass_points import PassPoints
 from .progress import Progress
 from .schedule import REPLICATES, Step, batches, passes_since, photons_of, schedule
@@ -80,8 +81,10 @@ class Render:
         self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
         border = self.prepared.camera.region.border
-        depth, variance = settings.strategy_depth, settings.variance
-        self.accumulator = Accumulator(sensor.film(), colour, border, depth, variance, features)
+        strategies = settings.strategy_depth, settings.merge_images
+        self.accumulator = Accumulator(
+            sensor.film(), colour, border, *strategies, settings.variance, features
+        )
         self.kernel = self._kernel()
         # What `_guide` has made.
         self._guides: tuple[Guide | None] | None = None
@@ -235,9 +238,15 @@ class Render:
         done = passes_since(self.passes, step.done)
         factor = self._radius_in_pixels(done)
         count = photons_of(step.size * int(self.prepared.camera.region.size.prod()))
-        kappa = coefficient(step.size, factor)
-        merging = Merging(footprints.radius(factor), dr.opaque(mi.Float, count), dr.opaque(mi.Float, kappa))
-        points = self.points.of_photons(step, done, self.planner.changes)
+        changes = self.planner.changes
+        sets, wavelengths = 1, None
+        if mi.is_spectral:
+            sets, wavelengths = SETS, self.points.wavelengths(step, done, changes)
+            count = max(count // sets, 1) * sets
+        kappa = coefficient(step.size / sets, factor)
+        kappa, met = dr.opaque(mi.Float, kappa), dr.opaque(mi.Float, count / sets)
+        merging = Merging(footprints.radius(factor), met, kappa, wavelengths=wavelengths)
+        points = self.points.of_photons(step, done, changes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
             merging, counts = photons.trace(self.kernel, merging, points, count)
         self.meter.launched(counts)

@@ -9,8 +9,9 @@ import mitsuba as mi
 # images, after changes of the decision, those that follow the other one.
 PILOT, CHANGED = 1 << 16, 1 << 17
 
-# Photons have the sequence that follows this by the number of passes done, or one that follows from it.
-PHOTONS = 1 << 18
+# Photons have the sequence that follows this by the number of passes done, or one that follows from it; the
+# wavelengths of passes with merging begin with a number of the other one.
+PHOTONS, WAVELENGTHS = 1 << 18, 1 << 30
 
 # Those of the guide of s = 0.
 GUIDE = 1 << 19

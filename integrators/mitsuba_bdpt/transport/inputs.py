@@ -40,13 +40,15 @@ class Coefficients:
 class Shared:
     """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves.
 
-    ``u_wavelength`` chose the wavelengths, ``weight`` is 1 / their density.
+    ``u_wavelength`` chose the wavelengths, ``weight`` is 1 / their density; ``wavelength_set`` their number
+    among `WavelengthSets` (None where there are none).
     """
 
     time: mi.Float
     wavelengths: mi.Color0f | mi.Spectrum
     weight: mi.Spectrum
     u_wavelength: mi.Float
+    wavelength_set: mi.UInt32 | None = None
 
 
 class Kernel:

@@ -50,13 +50,13 @@ class Found:
     ``moments`` if it is not guided, and with each of `GUIDED` numbers of samples.
     """
 
-    moments: list[mi.Float]
+    moments: list[mi.Float64]
     aimed: mi.UInt32
 
 
 def nothing() -> Found:
     """Of a vertex where s = 0 cannot be guided."""
-    return Found([mi.Float(0) for _ in (0, *GUIDED)], mi.UInt32(0))
+    return Found([mi.Float64(0) for _ in (0, *GUIDED)], mi.UInt32(0))
 
 
 def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) -> Found:
@@ -74,8 +74,9 @@ def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) ->
         value = _mean(z.throughput * f.value * y.flux) / cos
         active &= (value > 0) & (f.pdf_fwd_w > 0) & dr.isfinite(value)
         # Of all photons in the disc, for which this one stands.
-        arriving = value / size_of(y.flux) * total / (gauge.count * dr.pi * dr.square(radius))
-        by_hit = dr.minimum(value / (y.hit * f.pdf_fwd_w), gauge.most * arriving)
+        # Squares, in any unit of radiance, are too large or too small for single precision.
+        arriving = mi.Float64(value / size_of(y.flux) * total / (gauge.count * dr.pi * dr.square(radius)))
+        by_hit = dr.minimum(mi.Float64(value / (y.hit * f.pdf_fwd_w)), gauge.most * arriving)
         there = photon_guide.find(gauge.guide, z.si.p)
         pdf = photon_guide.density(gauge.guide, z.si.p, there, y.d)
         ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)

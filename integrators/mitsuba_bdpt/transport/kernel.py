@@ -167,7 +167,8 @@ def trace_isolated(kernel: Kernel, gauge: isolated_light.Gauge, batch: Batch, po
     kernel = kernel.bound(points, 1.0, Observer())
     index = dr.arange(mi.UInt32, batch.size)
     place = Places(kernel, batch, batch.samples)
-    shared = shared_by_lane(kernel, points.stream("light", place.index(index), index))
+    in_sequence = place.index(index)
+    shared = shared_by_lane(kernel, points.stream("light", in_sequence, index), in_sequence)
     sample = _camera_sample(kernel, Lane(place, shared, None), index, mi.Bool(True))
     walk = _camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
     side = replace(_camera_side(kernel, None, sample, shared, walk), join=None, guide=None, isolated=True)
@@ -202,8 +203,9 @@ def _count_light(batch: Batch, sharing: Sharing) -> float:
 
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     """The lanes of these numbers with their light subpaths, which are traced."""
-    stream = kernel.points.stream("light", place.index(index), index)
-    shared = shared_by_lane(kernel, stream)
+    place_in_sequence = place.index(index)
+    stream = kernel.points.stream("light", place_in_sequence, index)
+    shared = shared_by_lane(kernel, stream, place_in_sequence)
     path = stored_vertices.allocate_light_path(kernel, dr.width(index))
     counters = Counters()
     if kernel.plan.light:
@@ -211,7 +213,8 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     return Lane(place, shared, path), counters
 
 
-def shared_by_lane(kernel: Kernel, stream) -> Shared:
+def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
+    """Time and wavelengths of the subpaths of a lane, whose light subpath has this ``index``."""
     sensor, points = kernel.camera.sensor, kernel.points
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -219,9 +222,14 @@ def shared_by_lane(kernel: Kernel, stream) -> Shared:
         time += u * sensor.shutter_open_time()
     if not mi.is_spectral:
         return Shared(time, mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
-    u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
+    number = None
+    if kernel.merging is None:
+        u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
+    else:
+        number = kernel.merging.wavelengths.number(index)
+        u = kernel.merging.wavelengths.u(number)
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
-    return Shared(time, wavelengths, weight, u)
+    return Shared(time, wavelengths, weight, u, number)
 
 
 # -- the light subpath ------------------------------------------------------------------------
@@ -440,7 +448,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
     def merge(z, total, lost, merges):
-        c = merging.merge(kernel, z, sample.stream)
+        c = merging.merge(kernel, z, sample.stream, shared.wavelength_set)
         return *add(c, total, lost), merges + one(c.active)
 
     def merged(z, walk, total, counted):

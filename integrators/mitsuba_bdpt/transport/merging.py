@@ -33,6 +33,7 @@ from .contribution import Contribution, size_of
 from .inputs import Kernel
 from .merge_radius import Radius
 from .walk import Vertex, Walk, may_merge
+from .wavelength_sets import SET_BITS, WavelengthSets
 
 # Bits of a bucket's number in the hash table, and of each coordinate of a cell.
 BUCKET_BITS = 18
@@ -47,15 +48,17 @@ _SAME_SIDE, _FLAT = 0.8, 0.25
 class Merging:
     """What a pass knows of merging.
 
-    ``radius``, ``count`` of photons' subpaths, `Photons` (None while they are traced), and ``kappa``, with
-    which merges enter all weights: all camera vertices in one disc meet the same photons, so that many merges
-    are worth as much as one, see `coefficient`. Numbers are opaque ``Float``.
+    ``radius``, ``count`` of photons' subpaths that a camera subpath can meet, `Photons` (None while they are
+    traced), and ``kappa``, with which merges enter all weights: all camera vertices in one disc meet the same
+    photons, so that many merges are worth as much as one, see `coefficient`. Numbers are opaque ``Float``.
+    In spectral variants ``wavelengths``, a `WavelengthSets`: subpaths meet those of the same set.
     """
 
     radius: Radius
     count: mi.Float
     kappa: mi.Float
     photons: Any = None
+    wavelengths: WavelengthSets | None = None
 
     def eta(self, p: mi.Point3f) -> mi.Float:
         """Number of subpaths times the area of the disc at ``p`` (scene units squared)."""
@@ -66,8 +69,8 @@ class Merging:
         return self.kappa * self.eta(p)
 
 
-def coefficient(samples: int, radius: float) -> float:
-    """kappa of merges in a pass of so many ``samples`` per pixel, in discs of this ``radius`` in pixels.
+def coefficient(samples: float, radius: float) -> float:
+    """kappa of merges in discs of this ``radius`` in pixels, if so many ``samples`` per pixel share photons.
 
     One over the number of camera vertices that share the photons of a disc. Without it merges under a sky,
     where s = 0 is good, took nearly all of the weight: 183 times the variance at 256 samples per pixel.
@@ -92,6 +95,18 @@ class Photon:
     edges: mi.UInt32
     lane: mi.UInt32
 
+    # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
+
+    @staticmethod
+    def zeros(count: int) -> Photon:
+        """Room for so many."""
+        types = mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
+        return Photon(*(dr.zeros(kind, count) for kind in types))
+
+    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
+        """Those of these numbers."""
+        return Photon(*(dr.gather(type(column), column, index, active) for column in vars(self).values()))
+
 
 @dataclass
 class Photons:
@@ -110,12 +125,13 @@ def level_of(radius: Radius, r: mi.Float) -> mi.UInt32:
     return mi.UInt32(dr.maximum(dr.floor(dr.log2(r / radius.low)), 0))
 
 
-def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, corner=None) -> mi.UInt64:
-    """The number of the cell at ``p`` in the grid ``level``.
+def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None, corner=None) -> mi.UInt64:
+    """The number of the cell at ``p`` in the grid ``level``, of this set of wavelengths (or None).
 
     Cells are at least as wide as the discs of the photons in it and of camera vertices near to them, so that
     a disc meets two at most in each direction: ``corner`` (0 to 7) chooses among those that the one at ``p``
-    meets. Coordinates are taken modulo 2^20: cells of the same number lie far apart.
+    meets. Coordinates are taken modulo 2^20: cells of the same number lie far apart, and so do those of the
+    same number that are of different sets.
     """
     width = radius.low * (1 + 2 * radius.angle) * mi.Float(mi.UInt32(4) << level)
     if corner is not None:
@@ -125,6 +141,8 @@ def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, corner=None) -> mi.
         index = mi.UInt32(cell[axis])
         if corner is not None:
             index += (corner >> axis) & 1
+        if axis == 0 and wavelength_set is not None:
+            index += wavelength_set << (_CELL_BITS - SET_BITS)
         number = (number << _CELL_BITS) | mi.UInt64(index & ((1 << _CELL_BITS) - 1))
     return number
 
@@ -140,13 +158,16 @@ def possible(kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
     return may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
 
 
-def merge(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
-    """The camera vertex ``z`` merged with a photon near it, drawn by its flux for all of them."""
+def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
+    """The camera vertex ``z`` merged with a photon near it, drawn by its flux for all of them.
+
+    Of those of its ``wavelength_set``, see `inputs.Shared`.
+    """
     h, merging = kernel.heuristic, kernel.merging
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
-    chosen, total = _draw(kernel, z, word)
+    chosen, total = _draw(kernel, z, word, wavelength_set)
     active = z.hit & (total > 0)
-    photon = dr.gather(Photon, merging.photons.found, chosen, active)
+    photon = merging.photons.found.at(chosen, active)
     f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)
     eta = merging.eta(z.si.p)
     # Per area of the surface: what the disc receives, f |cos| being per solid angle.
@@ -162,7 +183,7 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
 
 
 @dr.syntax
-def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32):
+def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
     """Draw one of the photons in the disc at ``z`` in proportion to its flux: its place, and their total."""
     radius, photons = kernel.merging.radius, kernel.merging.photons
     r = radius.at(z.si.p)
@@ -174,10 +195,10 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32):
     while dr.hint(
         (corner < corners) | (place < end),
         label="photons near a camera vertex",
-        exclude=[kernel, z, radius, photons, r, lowest, corners, most],
+        exclude=[kernel, z, wavelength_set, radius, photons, r, lowest, corners, most],
     ):
         through = place >= end  # the next cell
-        there = cell_at(radius, z.si.p, lowest + (corner >> 3), corner & 7)
+        there = cell_at(radius, z.si.p, lowest + (corner >> 3), wavelength_set, corner & 7)
         bucket = bucket_of(there)
         place = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket, through), place)
         end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)
@@ -185,7 +206,7 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32):
         corner += dr.select(through, mi.UInt32(1), 0)
 
         tried = place < end
-        photon = dr.gather(Photon, photons.found, place, tried)
+        photon = photons.found.at(place, tried)
         near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # others share its bucket
         near &= _is_near(photon, z, r) & (photon.edges <= most)
         size = dr.select(near, size_of(photon.flux), 0)

@@ -43,6 +43,20 @@ class GuidePhoton:
     flux: mi.Spectrum
     hit: mi.Float
 
+    # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
+
+    @staticmethod
+    def zeros(count: int) -> GuidePhoton:
+        """Room for so many."""
+        types = mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float
+        return GuidePhoton(*(dr.zeros(kind, count) for kind in types))
+
+    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> GuidePhoton:
+        """Those of these numbers."""
+        return GuidePhoton(
+            *(dr.gather(type(column), column, index, active) for column in vars(self).values())
+        )
+
 
 @dataclass
 class Guide:
@@ -62,14 +76,14 @@ class Guide:
     def of(photons: GuidePhoton, count: int) -> Guide:
         """The guide of the first ``count`` of these ``photons``, one at least."""
         index = dr.arange(mi.UInt32, count)
-        found = dr.gather(GuidePhoton, photons, index)
+        found = photons.at(index)
         low = mi.Point3f(*(dr.min(x) for x in found.p))
         extent = dr.max(mi.Vector3f(*(dr.max(x) for x in found.p)) - low)
         scale = dr.select(extent > 0, ((1 << _BITS) - 1) / extent, 0)
         place = _place(found.p, low, scale)
         order = dr.argsort(place)
         guide = Guide(
-            dr.gather(GuidePhoton, found, order),
+            found.at(order),
             dr.gather(mi.UInt64, place, order),
             dr.opaque(mi.UInt32, count),
             low,
@@ -119,7 +133,7 @@ def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> GuidePhoton:
     """The ``k``-th photon of the window about the number ``found``."""
     number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
     number = dr.clip(number, 0, mi.Int32(guide.count) - 1)
-    return dr.gather(GuidePhoton, guide.photons, mi.UInt32(number), active)
+    return guide.photons.at(mi.UInt32(number), active)
 
 
 def exists(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.Bool:

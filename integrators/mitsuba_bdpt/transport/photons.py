@@ -71,7 +71,7 @@ def _all(kernel: Kernel, count: int, kind, photon, ends) -> tuple[Any, int, mi.U
     """As `_traced`; none is left out."""
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        photons, found, counters = _traced(kernel, count, dr.zeros(kind, capacity), photon, ends)
+        photons, found, counters = _traced(kernel, count, kind.zeros(capacity), photon, ends)
         if found <= capacity:
             return photons, found, counters
         capacity = found
@@ -87,7 +87,7 @@ def _traced(kernel: Kernel, count: int, out, photon, ends) -> tuple[Any, int, mi
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
-    shared = kernels.shared_by_lane(kernel, stream)
+    shared = kernels.shared_by_lane(kernel, stream, mi.UInt64(lanes))
     e = kernels.emission(kernel, stream, shared)
     walk = kernels.light_walk(kernel, e, stream, shared, True)
     side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, **ends)
@@ -112,15 +112,17 @@ def _traced(kernel: Kernel, count: int, out, photon, ends) -> tuple[Any, int, mi
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
     """The first ``count`` by bucket, subpath and edge, an order that does not depend on threads."""
     index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
-    found = dr.gather(Photon, photons, index)
+    found = photons.at(index)
     radius = merging.radius
-    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)))
+    sets = merging.wavelengths
+    number = None if sets is None else sets.number(found.lane)
+    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)), number)
     bucket = bucket_of(cell)
     key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
     order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
     dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
     starts = dr.cumsum(counts)
-    result = Photons(dr.gather(Photon, found, order), dr.gather(mi.UInt64, cell, order), starts)
+    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts)
     dr.eval(result)
     return result
