@@ -34,7 +34,7 @@ from mitsuba_bdpt.transport import inputs, stored_vertices
 from scipy import stats
 
 DEPTH = 4
-SEEDS = 12
+SEEDS = 12  # which see all planted bugs (scripts/mutants.py media)
 CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
 
 
