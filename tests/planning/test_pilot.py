@@ -25,6 +25,7 @@ from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
 from mitsuba_bdpt.transport.batch import NET, NETS, Batch, Places
+from mitsuba_bdpt.transport.plan import GUIDED
 from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f
@@ -111,7 +112,8 @@ def moments_of(target, lanes, rounds=1, **parameters):
 def made_of(base, rays, light=0.0):
     """Moments of this ``base``, of which points take nothing off, and of splats, alike for all weightings."""
     none, gain, rays = np.zeros_like(base), np.ones(base.shape[1]), {"evenness": 0.0} | rays
-    return moments.Moments(base, none, none + light, none, gain, 1.0, rays, 4096)
+    isolated = np.zeros((len(base), 1 + len(GUIDED)))
+    return moments.Moments(base, none, none + light, none, isolated, gain, 1.0, rays, 4096)
 
 
 def candidate(number: int, served: int, connections: str) -> Configuration:

@@ -17,8 +17,8 @@ class Plan:
     ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t<=1 over its count;
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
-    left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: by how many samples s = 0
-    is guided at a vertex; ``guidable``: whether a pilot may say that it pays.
+    left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: by how many samples
+    s = 0 is guided at a vertex; ``guidable``: whether a pilot may say that it pays.
     """
 
     hit: bool
