@@ -49,6 +49,7 @@ SENSIBLE = {
     "skip": ("auto", "impossible", "none"),
     "connections": ("auto", "all", "one", "none"),
     "points": ("sobol", "sampler", "independent"),
+    "photon_guiding": ("auto", "always", "never"),
     "aovs": ("", "albedo:albedo", "dd:depth,nn:sh_normal"),
     "decisions": ("", "[]"),
 }

@@ -237,15 +237,15 @@ def _robust_mean(values: np.ndarray) -> np.ndarray:
     return (values * scale[:, None]).mean(axis=0)
 
 
-def left_out(table: list[Prediction], guided: float = 0.0) -> list[dict[str, str]]:
+def left_out(table: list[Prediction], guided: float = 0.0, name: str = "guided s=0") -> list[dict[str, str]]:
     """What the best of `choose` does without, and why, as in ``statistics["skipped"]``.
 
-    ``guided``: its `guided_gain`.
+    ``guided``: its `guided_gain`, of what has this ``name``.
     """
     skipped: list[dict[str, str]] = []
     if guided and not table[0].candidate.guided:
-        why = f"in the pilot it gains {guided:.2f}x, and it takes {GUIDE_GAIN:g}x to be sure"
-        skipped.append({"class": "guided s=0", "level": "not worth its cost here", "why": why})
+        why = f"in the pilot guiding gains {guided:.2f}x, outliers included, and has to gain {GUIDE_GAIN:g}x"
+        skipped.append({"class": name, "level": "not worth its cost here", "why": why})
     without: dict[str, Callable[[Configuration], bool]] = {
         "t<=1": lambda c: not c.light_paths,
         "inner": lambda c: c.connections == "none",

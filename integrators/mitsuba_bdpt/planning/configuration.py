@@ -85,7 +85,7 @@ class Configuration:
             connections=self.connections if full.connections != "none" and light else "none",
             kappa_light=self.kappa_light,
             kappa_direct=self.kappa_direct,
-            guided=self.guided if full.guidable and not full.merging else 0,
+            guided=max(self.guided, full.guided) if full.guidable and not full.merging else 0,
             merging=full.merging and (self.guided > 0 or not full.guidable),
         )
         served = self.camera_paths_per_light_path if adopted.light else 1

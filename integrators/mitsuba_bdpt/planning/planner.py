@@ -114,7 +114,8 @@ class Planner:
             table = []
         if table:
             gain = choice.guided_gain(moments, alternatives, table[0])
-            self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table, gain))
+            name = "merging" if self.full.merging else "guided s=0"
+            self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table, gain, name))
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
         return table
 

@@ -46,7 +46,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     if why and settings.photon_guiding == "always":
         skip("guided s=0", "impossible", why)
     guidable = not why
-    if guidable and settings.photon_guiding == "never":
+    if merging:  # a pilot may do without it where s = 0 finds that light too
+        guidable = guidable and not (emitters.unhittable or emitters.beams)
+    elif guidable and settings.photon_guiding == "never":
         guidable = skip("guided s=0", "by hand", "photon_guiding=never")
     for name, why in emitters.left_out:
         skip(name, "impossible", why)

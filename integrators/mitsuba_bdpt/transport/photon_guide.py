@@ -20,8 +20,8 @@ _NEAR = 4
 _FAR = (6, 12, 25, 60)
 WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
 
-# Bits of each coordinate of a place on the curve.
-_BITS = 21
+# Bits of each coordinate of a place on the curve, and of the number of a subpath: 64 together.
+_BITS, _LANE_BITS = 15, 19
 
 # Width of a lobe (tangent of half its directions' angle) over the photon's distance from the point, over its
 # last edge; the least one, and the largest, beyond which a photon says nothing.
@@ -33,7 +33,7 @@ class GuidePhoton:
     """A photon: ``p`` position, ``d`` unit direction towards the light's side, ``length`` of its last edge.
 
     For `isolated_light` also ``n`` geometric normal, ``flux`` the throughput of its subpath, and ``hit`` the
-    partial sum of s = 0, in the area measure.
+    partial sum of s = 0, in the area measure. ``lane`` of its subpath, which has no other photon.
     """
 
     p: mi.Point3f
@@ -42,13 +42,14 @@ class GuidePhoton:
     n: mi.Normal3f
     flux: mi.Spectrum
     hit: mi.Float
+    lane: mi.UInt32
 
     # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
 
     @staticmethod
     def zeros(count: int) -> GuidePhoton:
         """Room for so many."""
-        types = mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float
+        types = mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32
         return GuidePhoton(*(dr.zeros(kind, count) for kind in types))
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> GuidePhoton:
@@ -81,7 +82,8 @@ class Guide:
         extent = dr.max(mi.Vector3f(*(dr.max(x) for x in found.p)) - low)
         scale = dr.select(extent > 0, ((1 << _BITS) - 1) / extent, 0)
         place = _place(found.p, low, scale)
-        order = dr.argsort(place)
+        # By the subpath where places are the same, an order that does not depend on threads.
+        order = dr.argsort((place << _LANE_BITS) | mi.UInt64(found.lane))
         guide = Guide(
             found.at(order),
             dr.gather(mi.UInt64, place, order),

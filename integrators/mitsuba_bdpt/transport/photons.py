@@ -55,7 +55,7 @@ def trace_guide(kernel: Kernel, points: Points, count: int) -> tuple[Guide | Non
         keep = y.hit & y.connectible() & ~joined & (y.edges < kernel.max_depth)
         keep &= y.partial.d_vc > 0
         length = dr.norm(y.si.p - y.previous)
-        return keep, GuidePhoton(y.si.p, -walk.d, length, y.si.n, y.throughput, y.partial.d_vc)
+        return keep, GuidePhoton(y.si.p, -walk.d, length, y.si.n, y.throughput, y.partial.d_vc, lanes)
 
     photons, found, counters = _all(kernel, count, GuidePhoton, photon, {"only_delta": True})
     return Guide.of(photons, found) if found else None, counters
