@@ -7,7 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling.points import Points
+from ..sampling.points import Points, Purpose
 from . import bsdf
 from . import kernel as kernels
 from .counters import Counters, one
@@ -45,7 +45,12 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
     shared = kernels.shared_by_lane(kernel, stream, mi.UInt64(lanes))
-    e = kernels.emission(kernel, stream, shared)
+    e, aim = kernel.merging.aim.emission(
+        kernel.emitters,
+        kernel.points.draw_2d("light", stream, Purpose.EMISSION_POINT),
+        kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
+        shared,
+    )
     walk = kernels.light_walk(kernel, e, stream, shared, True)
     side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, isolated=True)
 
@@ -55,7 +60,7 @@ def _traced(kernel: Kernel, count: int, capacity: int) -> tuple[Photon, int, mi.
             y.throughput
         )  # else all that are drawn with it would be NaN; the walk counts it
         older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
-        photon = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
+        photon = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aim, y.edges, lanes)
         place = dr.scatter_inc(kept, mi.UInt32(0), keep)
         dr.scatter(out, photon, place, keep & (place < most))
         return counters + Counters(photons=one(keep))
