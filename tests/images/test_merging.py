@@ -564,14 +564,16 @@ def small_glass(lamp, **sensor):
 def test_photons_are_aimed(monkeypatch):
     """Rationale: of the lamp's directions 1 in 3,000 meets a small ball of glass, and its caustic in the
     mirror is found by merging alone. Expected: with photons aimed at glass and mirror the tiles are those
-    without; the part of the variance that is merging's is a fifth at most.
+    without (of a tenth of the brightest or more: elsewhere too few photons are not aimed for a test); the
+    part of the variance that is merging's is a fifth at most.
     """
     scene = mi.load_dict(small_glass(point()))
     a = layers_of_merges(scene)
     monkeypatch.setattr(aim, "_delta_boxes", lambda scene: [])
     b = layers_of_merges(scene, 100)
     assert a.var(0, ddof=1).mean() < 0.2 * b.var(0, ddof=1).mean()
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=4)
+    bright = st.tiles(a).mean(0) > 0.1 * st.tiles(a).mean(0).max()
+    st.assert_agree(st.compare_images(st.tiles(a)[:, bright], st.tiles(b)[:, bright]), at_least=5)
 
 
 def test_a_lens_where_photons_are_aimed(monkeypatch):
