@@ -70,15 +70,18 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
     )
 
 
-def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndarray:
+def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None, aimed=None) -> np.ndarray:
     """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use.
 
-    With ``eta``, see `oracle.log_merges`, those of the k - 1 merges follow.
+    With ``eta`` and ``aimed``, see `oracle.log_merges`, those of the k - 1 merges follow.
     """
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
     kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
-    discs = None if eta is None else [mi.Float(x) for x in eta.astype(np.float32).T]
-    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name), discs)
+    merges = None
+    if eta is not None:
+        discs = [mi.Float(x) for x in eta.astype(np.float32).T]
+        merges = discs, mi.Float((paths.second if aimed is None else aimed).astype(np.float32))
+    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name), merges)
     weights = {0: chain.hit(), 1: chain.endpoints() if paths.k == 1 else chain.next_event()}
     if paths.k > 1:
         weights |= {s: chain.inner(s) for s in range(2, paths.k)} | {paths.k: chain.splat()}
@@ -154,11 +157,13 @@ class Recursion:
     In the order of calls of ``walk.py`` and ``techniques.py``.
     """
 
-    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, eta=None):
-        self.path, self.kappa, self.h, self.eta = path, kappa, heuristic, eta
-        self._no_merges = 0 if eta is None else heuristic.zero()
+    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, merges=None):
+        self.path, self.kappa, self.h = path, kappa, heuristic
+        self.eta, self.aimed = (None, None) if merges is None else merges
+        self._no_merges = 0 if merges is None else heuristic.zero()
         self.arrival = dr.select(path.lens, kappa.arrival, mi.Float(0))
-        self.light, self._last = self._along_light()
+        self.light, self._last = self._along_light(path.second)
+        self.photons = None if merges is None else self._along_light(self.aimed)[0]
         self.camera = self._along_camera()
 
     # -- subpaths -----------------------------------------------------------------------------
@@ -176,13 +181,13 @@ class Recursion:
         )
         return mis.scatter(self.h, partial, coefficient, step, merge), isolated
 
-    def _along_light(self):
+    def _along_light(self, second):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
 
-        As in kernel.light_walk, walk._vertex and _leave.
+        ``second``: the density of its first direction. As in kernel.light_walk, walk._vertex and _leave.
         """
         x, h = self.path, self.h
-        inverse = dr.rcp(x.first * x.second)
+        inverse = dr.rcp(x.first * second)
         start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))
         partial = mis.Partial(h.start(inverse), start, self._no_merges)
         isolated = mi.Bool(True)
@@ -242,15 +247,16 @@ class Recursion:
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
         if self.eta is not None:
-            merges = h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf)
+            merges = h.scale(h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf), self.aimed / x.second)
             light_side = h.combine(light_side, dr.select(mis.is_joined(arrived, newest), 0, merges))
         return h.weight(kappa.arrival, light_side, mi.Float(0))
 
     def merge(self, m):
         """Both subpaths up to x_m (merging.merge)."""
-        x, h, light, camera = self.path, self.h, self.light[m], self.camera[self.path.k - m]
+        x, h, light, camera = self.path, self.h, self.photons[m], self.camera[self.path.k - m]
         light_side = h.scale(h.combine(light.d_vc, light.d_vm), x.to_light[m])
-        camera_side = h.scale(h.combine(camera.d_vc, camera.d_vm), x.to_camera[m])
+        arrival = h.scale(camera.d_vc, x.second / self.aimed)
+        camera_side = h.scale(h.combine(arrival, camera.d_vm), x.to_camera[m])
         return h.weight(h.start(self.eta[m]), light_side, camera_side)
 
     def hit(self):
@@ -260,7 +266,7 @@ class Recursion:
         newest = self.kappa.endpoints * x.first if x.k == 1 else connected
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
         if self.eta is not None:
-            merges = h.scale(last.d_vm, x.first * x.second)
+            merges = h.scale(last.d_vm, x.first * self.aimed)
             camera_side = h.combine(camera_side, dr.select(mis.is_joined(last, newest), 0, merges))
         return h.weight(1, mi.Float(0), camera_side)
 

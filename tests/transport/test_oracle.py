@@ -96,7 +96,8 @@ def test_recursion_agrees_with_explicit_densities(name, classes):
 def test_recursion_with_merges(name, classes):
     """Rationale: a third float per vertex and a flag must say which paths are isolated, and what the merges
     at all other vertices would do. 1,000 random paths each of k = 2 ... 7 edges, half of the vertices delta,
-    discs whose eta is spread over six orders of magnitude; otherwise as above. Expected: every weight, of
+    discs whose eta is spread over six orders of magnitude, and so are the densities of first directions with
+    which photons are aimed; otherwise as above. Expected: every weight, of
     merges too, is the oracle's to 1e-4 of its own size, and those of a path sum to 1 within 1e-4; paths that
     are not isolated have the weights that they have without merging, to the bit.
     """
@@ -104,8 +105,9 @@ def test_recursion_with_merges(name, classes):
     for k in range(2, 8):
         paths = random_paths(rng, 1000, k, delta=0.5)
         eta = (10.0 ** rng.uniform(-3, 3, (1000, k + 1))).astype(np.float32)
-        explicit = oracle.Explicit(paths, COEFFICIENTS[classes], eta)
-        weights = recursion(paths, COEFFICIENTS[classes], name, eta)
+        aimed = (10.0 ** rng.uniform(-3, 3, 1000)).astype(np.float32)
+        explicit = oracle.Explicit(paths, COEFFICIENTS[classes], eta, aimed)
+        weights = recursion(paths, COEFFICIENTS[classes], name, eta, aimed)
         found = np.where(explicit.used, weights, 0)
         keep = ~explicit.tied if name == "maximum" else np.ones(1000, dtype=bool)
         expected = explicit.weights(name)

@@ -31,7 +31,8 @@ class Emitters:
 
     What the scene's ``count`` emitters can do, decided from all of them: ``hittable``, ``direct``,
     ``traced``, ``connectible_to_sensor``: camera subpaths can hit one, next-event estimation can choose one,
-    light subpaths can start from one, one of these points can be joined with a sensor; ``unhittable``: one
+    light subpaths can start from one, one of these points can be joined with a sensor;
+    ``connectible_nearby``: one of the latter is not at infinity; ``unhittable``: one
     cannot be hit; ``finite_hittable``: one that can be hit and joined is not at infinity; ``on_shapes``: one
     is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of them do; ``beams``:
     one can be reached only by the light subpaths that it starts; ``evaluated``: one that lives, be it in
@@ -76,6 +77,7 @@ class Emitters:
         self.direct = any(t.supports_next_event for t in types)
         self.traced = any(t.supports_emission for t in types)
         self.connectible_to_sensor = any(t.connectible_to_sensor for t in types)
+        self.connectible_nearby = any(t.connectible_to_sensor and not t.at_infinity for t in types)
         joined = [h and t.connectible_to_sensor for h, t in zip(hittable, types, strict=True)]
         self.finite_hittable = any(j and not t.at_infinity for j, t in zip(joined, types, strict=True))
         self.on_shapes = any(emitter.get_shape() is not None for emitter in emitters)
@@ -181,6 +183,10 @@ class Emitters:
         if not self._starts.all:  # chosen with the probability of next-event estimation, and left
             e.weight = dr.select(self._starts.at(chosen.index, active), e.weight, 0)
         return e
+
+    def traces(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
+        """Mask of those lanes where light subpaths start from the emitter ``index``."""
+        return self._starts.at(index, active)
 
     def connection_density(self, emission: Emission, si, active):
         """Density of next-event estimation making y_0 of ``emission`` from its first hit ``si``.

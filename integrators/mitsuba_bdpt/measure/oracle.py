@@ -19,7 +19,7 @@ Edge i joins x_i and x_{i+1}. All arrays have one row per path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -179,13 +179,13 @@ def log_densities(paths: Paths) -> np.ndarray:
     return p
 
 
-def log_merges(paths: Paths, eta: np.ndarray) -> np.ndarray:
+def log_merges(paths: Paths, eta: np.ndarray, aimed: np.ndarray | None = None) -> np.ndarray:
     """log n p of merging at x_1 ... x_{k-1}, shape (n, k - 1), on isolated paths; -inf at delta events.
 
     Both subpaths make x_m, and the photon has to be in the disc: ``eta`` (n, k + 1) is the number of photons'
-    subpaths times its area.
+    subpaths times its area, ``aimed`` (n,) the density of photons' first direction in place of ``second``.
     """
-    light, camera, _ = log_steps(paths)
+    light, camera, _ = log_steps(paths if aimed is None else replace(paths, second=aimed))
     p = np.empty((len(paths.kind), max(paths.k - 1, 0)))
     for m in range(1, paths.k):
         p[:, m - 1] = np.log(eta[:, m]) + light[:, : m + 1].sum(1) + camera[:, m:].sum(1)
@@ -196,17 +196,18 @@ def log_merges(paths: Paths, eta: np.ndarray) -> np.ndarray:
 class Explicit:
     """All strategies of ``paths`` under ``coefficients``.
 
-    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite. With ``eta``, see `log_merges`, the
-    merges are further columns; they make paths that no strategy with s and t >= 1 in use makes.
+    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite. With ``eta`` and ``aimed``, see
+    `log_merges`, the merges are further columns; they make paths that no strategy with s and t >= 1 in use
+    makes.
     """
 
-    def __init__(self, paths: Paths, coefficients: Coefficients, eta: np.ndarray | None = None):
+    def __init__(self, paths: Paths, coefficients: Coefficients, eta: np.ndarray | None = None, aimed=None):
         kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
         with np.errstate(divide="ignore"):
             self.size = log_densities(paths) + np.log(kappa)
         if eta is not None:
             isolated = ~np.isfinite(self.size[:, 1 : paths.k + 1]).any(1)
-            merges = np.where(isolated[:, None], log_merges(paths, eta), -np.inf)
+            merges = np.where(isolated[:, None], log_merges(paths, eta, aimed), -np.inf)
             self.size = np.concatenate([self.size, merges], axis=1)
         self.used = np.isfinite(self.size)
         best = self.size.max(1, keepdims=True, initial=-1e300)

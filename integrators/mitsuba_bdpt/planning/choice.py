@@ -100,7 +100,7 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     Before them the best of them with s = 0 guided, if that pays.
     """
     table = _unguided(moments, alternatives)
-    if table and (guided := _guided(moments, alternatives, table[0])):
+    if guided := _guided(moments, alternatives, table):
         gain, row = guided[0]
         for more in guided[1:]:
             if more[0] >= MORE_GUIDED_GAIN * gain:
@@ -110,30 +110,35 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     return table
 
 
-def guided_gain(moments: Moments, alternatives: Alternatives, row: Prediction) -> float:
-    """By what factor a candidate takes less time to the same error, outliers included, if s = 0 is guided.
+def guided_gain(moments: Moments, alternatives: Alternatives) -> float:
+    """By what factor guiding s = 0 takes less time to the same error, outliers included; 0 where impossible.
 
-    At most; 0 where it cannot be.
+    The largest, of all numbers of samples.
     """
-    return max((gain for gain, _ in _guided(moments, alternatives, row)), default=0.0)
+    found = _guided(moments, alternatives, _unguided(moments, alternatives))
+    return max((gain for gain, _ in found), default=0.0)
 
 
-def _guided(moments: Moments, alternatives: Alternatives, row: Prediction) -> list[tuple[float, Prediction]]:
-    """The candidate of a ``row`` with each number of guided samples, after its gain, see `guided_gain`.
+def _guided(
+    moments: Moments, alternatives: Alternatives, table: list[Prediction]
+) -> list[tuple[float, Prediction]]:
+    """The best way with light subpaths and each number of guided samples, after its gain, see `guided_gain`.
 
-    None for path tracing alone, which would guide more than the pilot has seen: what light tracing joins. The
-    number of light subpaths and their coefficients are chosen before and do not depend on it: outliers would
-    hide how other candidates differ.
+    Path tracing alone would guide more than the pilot has seen: what light tracing joins. The number of light
+    subpaths and their coefficients are chosen before and do not depend on it: outliers would hide how other
+    candidates differ.
     """
-    if not alternatives.guidable or not row.candidate.light_paths:
+    lit = next((row for row in table if row.candidate.light_paths), None)
+    if not alternatives.guidable or lit is None:
         return []
-    first, *guided = moments.isolated.mean(axis=0).tolist()
+    alone, *guided = moments.isolated.mean(axis=0).tolist()
+    before = table[0].cost * (table[0].variance + alone)
     found: list[tuple[float, Prediction]] = []
     for samples, isolated in zip(GUIDED, guided, strict=True):
-        candidate = replace(row.candidate, guided=samples)
+        candidate = replace(lit.candidate, guided=samples)
         each = cost(candidate, moments.rays, alternatives.samples)
-        gain = row.cost * (row.variance + first) / (each * (row.variance + isolated))
-        found.append((gain, replace(row, candidate=candidate, cost=each)))
+        gain = before / (each * (lit.variance + isolated))
+        found.append((float(gain), replace(lit, candidate=candidate, cost=each)))
     return found
 
 

@@ -16,12 +16,13 @@ from ..scene.prepared import PreparedScene
 from ..sensors.records import Region
 from ..settings import Settings
 from ..transport import mis
+from ..transport.aim import Aim
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
-from ..transport.isolated_light import Found, Gauge
+from ..transport.isolated_light import MOMENTS, Found, Gauge
 from ..transport.kernel import trace_isolated
 from ..transport.photons import trace_guide
-from ..transport.plan import GUIDED, Plan
+from ..transport.plan import Plan
 from . import moments
 from .moments import FINE, GROUPS, Isolated, tile_of
 
@@ -43,8 +44,9 @@ def measure(
     None if no photon is found.
     """
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
+    aim = Aim.of(prepared.scene, prepared.emitters)
     made = [
-        trace_guide(kernel, Points("sobol", sequence_seed(seed, GUIDE + number)), PHOTONS)[0]
+        trace_guide(kernel, aim, Points("sobol", sequence_seed(seed, GUIDE + number)), PHOTONS)[0]
         for number in range(2)
     ]
     if made[0] is None or made[1] is None:
@@ -62,8 +64,8 @@ def measure(
     return Isolated(found, aimed / batch.size, batch.size)
 
 
-# Moments of a vertex, see `Found`; an even number, so that Dr.Jit adds them as a packet.
-_WIDTH = 1 + len(GUIDED)
+# Numbers of a row: an even one, so that Dr.Jit adds it as a packet.
+_WIDTH = MOMENTS + MOMENTS % 2
 
 
 class Sums:
@@ -78,11 +80,12 @@ class Sums:
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
         """Add what a ``lane`` found, whose camera sample has this ``position`` on the film."""
         row = moments.group(lane) * FINE**2 + tile_of(self._region, position)
-        values = mi.ArrayXd(list(found.moments))
+        values = mi.ArrayXd(found.moments + [mi.Float64(0)] * (_WIDTH - MOMENTS))
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
         dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))
 
     def evaluated(self) -> tuple[np.ndarray, int]:
         """The sums, shape (`GROUPS`, fine tiles, moments), and how many vertices could be guided."""
         dr.eval(self._sums, self._aimed)
-        return np.array(self._sums).reshape(GROUPS, FINE**2, _WIDTH), int(self._aimed[0])
+        sums = np.array(self._sums).reshape(GROUPS, FINE**2, _WIDTH)[:, :, :MOMENTS]
+        return sums, int(self._aimed[0])

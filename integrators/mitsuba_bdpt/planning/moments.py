@@ -173,10 +173,10 @@ def group(lane: Lanes) -> Lanes:
 
 @dataclass(frozen=True)
 class Isolated:
-    """Second moments of s = 0 where it can be guided, if it is not and if it is.
+    """Light that s = 0 finds where it can be guided.
 
-    ``sums`` over ``lanes`` camera samples, shape (`GROUPS`, fine tiles, 2); ``aimed``: vertices of one where
-    it can be.
+    ``sums`` of its moments (`isolated_light.Found`) over ``lanes`` camera samples, shape (`GROUPS`, fine
+    tiles, moments); ``aimed``: vertices of one where s = 0 can be guided.
     """
 
     sums: np.ndarray
@@ -199,6 +199,8 @@ def moments(
     count = len(samples.tile)
     width = samples.estimate.shape[1]
     sizes = SPLAT.of(splats.sums, "size").sum(axis=2) / splats.lanes
+    if isolated is not None:
+        sizes = sizes + isolated.sums[:, :, 0] / isolated.lanes
     groups = group(np.arange(count))
     inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
@@ -215,7 +217,7 @@ def moments(
 
     guided = np.zeros((GROUPS, 1 + len(GUIDED)))
     if isolated is not None:
-        guided = np.matmul(of_group, isolated.sums)[:, 0] * (GROUPS / isolated.lanes)
+        guided = np.matmul(of_group, isolated.sums[:, :, 1:])[:, 0] * (GROUPS / isolated.lanes)
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)

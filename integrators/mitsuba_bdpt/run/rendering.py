@@ -27,6 +27,7 @@ from ..properties import check_film, check_merging, check_not_frozen, check_vari
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis, photons
+from ..transport.aim import Aim
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.merge_radius import SHRINKING, Footprints
@@ -79,6 +80,8 @@ class Render:
         dr.make_opaque(seed)
         self.points = PassPoints(settings, sensor, seed)
         self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
+        aims = self.plan.merging or self.plan.guidable
+        self.aim = Aim.of(scene, self.prepared.emitters) if aims else None
         features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
         border = self.prepared.camera.region.border
         strategies = settings.strategy_depth, settings.merge_images
@@ -245,7 +248,7 @@ class Render:
             count = max(count // sets, 1) * sets
         kappa = coefficient(step.size / sets, factor)
         kappa, met = dr.opaque(mi.Float, kappa), dr.opaque(mi.Float, count / sets)
-        merging = Merging(footprints.radius(factor), met, kappa, wavelengths=wavelengths)
+        merging = Merging(footprints.radius(factor), met, kappa, self.aim, wavelengths=wavelengths)
         points = self.points.of_photons(step, done, changes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
             merging, counts = photons.trace(self.kernel, merging, points, count)
@@ -257,7 +260,7 @@ class Render:
         if self._guides is None:
             count = photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
             with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-                guide, counts = photons.trace_guide(self.kernel, self.points.of_guide(), count)
+                guide, counts = photons.trace_guide(self.kernel, self.aim, self.points.of_guide(), count)
             self.meter.launched(counts)
             self._guides = (guide,)
         return self._guides[0]

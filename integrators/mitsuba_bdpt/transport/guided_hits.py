@@ -31,7 +31,7 @@ _SEED = 0x5BD1E995
 
 
 @dataclass
-class Aim:
+class Advice:
     """What a guide says at a vertex: where s = 0 can be guided (``active``), and the place of its photons.
 
     ``other``: the density (solid angle, times the number of guided samples) with which it makes the walk's
@@ -54,30 +54,30 @@ def _possible(kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
     return may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
 
 
-def aim(kernel: Kernel, z: Vertex, walk: Walk, step) -> Aim:
+def aim(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
     """What the guide says at the camera vertex ``z``; ``walk`` as it was before it arrived."""
     return _asked(kernel, z, z.si.to_world(step.wo), _possible(kernel, z, walk))
 
 
-def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Aim:
+def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Advice:
     """What the guide says at the light vertex ``y``; ``other``: of the direction the light came from."""
     joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
     return _asked(kernel, y, -walk.d, y.hit & walk.only_delta & y.connectible() & ~joined)
 
 
-def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Aim:
+def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
     """As `aim`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
     possible = _possible(kernel, z, walk)
-    return Aim(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
+    return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
 
 
-def _asked(kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Aim:
+def _asked(kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
     def look(p, d):
         found = photon_guide.find(kernel.guide, p)
-        return Aim(mi.Bool(True), found, _density(kernel, p, found, d))
+        return Advice(mi.Bool(True), found, _density(kernel, p, found, d))
 
     def nothing(p, d):
-        return Aim(mi.Bool(False), mi.UInt32(0), mi.Float(0))
+        return Advice(mi.Bool(False), mi.UInt32(0), mi.Float(0))
 
     return dr.if_stmt((mi.Point3f(vertex.si.p), d), active, look, nothing, label="guide")
 

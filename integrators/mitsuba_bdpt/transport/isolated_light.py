@@ -26,6 +26,9 @@ from .photon_guide import WINDOW, Guide
 from .plan import GUIDED
 from .walk import Vertex, Walk, may_merge
 
+# How many moments a vertex has, see `Found`.
+MOMENTS = 2 + len(GUIDED)
+
 # Cosine between normals from which on a photon is taken to lie on the surface of the vertex.
 _SAME_SIDE = 0.8
 
@@ -45,9 +48,9 @@ class Gauge:
 
 @dataclass
 class Found:
-    """Second moments (of the mean of the colours) at a vertex, and 1 where s = 0 may be guided (``aimed``).
+    """Moments (of the mean of the colours) at a vertex, and 1 where s = 0 may be guided (``aimed``).
 
-    ``moments`` if it is not guided, and with each of `GUIDED` numbers of samples.
+    ``moments``: the first, and the second if s = 0 is not guided and with each number of samples (`GUIDED`).
     """
 
     moments: list[mi.Float64]
@@ -56,7 +59,7 @@ class Found:
 
 def nothing() -> Found:
     """Of a vertex where s = 0 cannot be guided."""
-    return Found([mi.Float64(0) for _ in (0, *GUIDED)], mi.UInt32(0))
+    return Found([mi.Float64(0) for _ in range(MOMENTS)], mi.UInt32(0))
 
 
 def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) -> Found:
@@ -81,7 +84,8 @@ def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) ->
         pdf = photon_guide.density(gauge.guide, z.si.p, there, y.d)
         ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)
         alone = dr.select(active, arriving * by_hit, 0)
-        return Found([alone / (1 + n * ratio) for n in (0, *GUIDED)], mi.UInt32(1))
+        first = dr.select(active, arriving, 0)
+        return Found([first, *(alone / (1 + n * ratio) for n in (0, *GUIDED))], mi.UInt32(1))
 
     return dr.if_stmt((z,), possible, measure, lambda z: nothing(), label="isolated light")
 

@@ -29,6 +29,7 @@ import mitsuba as mi
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
 from . import bsdf, mis
+from .aim import Aim
 from .contribution import Contribution, size_of
 from .inputs import Kernel
 from .merge_radius import Radius
@@ -51,12 +52,14 @@ class Merging:
     ``radius``, ``count`` of photons' subpaths that a camera subpath can meet, `Photons` (None while they are
     traced), and ``kappa``, with which merges enter all weights: all camera vertices in one disc meet the same
     photons, so that many merges are worth as much as one, see `coefficient`. Numbers are opaque ``Float``.
-    In spectral variants ``wavelengths``, a `WavelengthSets`: subpaths meet those of the same set.
+    ``aim`` of the photons, an `Aim`; in spectral variants ``wavelengths``, a `WavelengthSets`: subpaths meet
+    those of the same set.
     """
 
     radius: Radius
     count: mi.Float
     kappa: mi.Float
+    aim: Aim
     photons: Any = None
     wavelengths: WavelengthSets | None = None
 
@@ -84,7 +87,8 @@ class Photon:
 
     ``p`` position, ``d`` unit direction towards the light's side, ``n`` geometric normal, ``flux`` the
     throughput (over the number of subpaths it is the light's), ``older`` the partial sums of all alternatives
-    of fewer light vertices, in the area measure; ``edges`` up to it; ``lane`` of its subpath.
+    of fewer light vertices, in the area measure; ``aim`` the emitter's own density of the first direction
+    over that of `Aim`; ``edges`` up to it; ``lane`` of its subpath.
     """
 
     p: mi.Point3f
@@ -92,6 +96,7 @@ class Photon:
     n: mi.Normal3f
     flux: mi.Spectrum
     older: mi.Float
+    aim: mi.Float
     edges: mi.UInt32
     lane: mi.UInt32
 
@@ -100,7 +105,7 @@ class Photon:
     @staticmethod
     def zeros(count: int) -> Photon:
         """Room for so many."""
-        types = mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
+        types = mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.Float, mi.UInt32, mi.UInt32
         return Photon(*(dr.zeros(kind, count) for kind in types))
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
@@ -177,6 +182,7 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
     light_side = h.scale(photon.older, f.pdf_fwd_w)
     # Of longer paths t = 0, the oldest alternative of the camera's side, makes none.
     older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)
+    older = h.scale(older, photon.aim)  # and not as photons are aimed
     camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
     weight, shares = h.weigh(h.start(merging.weighed(z.si.p)), light_side, camera_side)
     return Contribution(value, weight, photon.edges + 1, z.edges, active, shares, "merge")

@@ -23,22 +23,24 @@ WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
 # Bits of each coordinate of a place on the curve, and of the number of a subpath: 64 together.
 _BITS, _LANE_BITS = 15, 19
 
-# Width of a lobe (tangent of half its directions' angle) over the photon's distance from the point, over its
-# last edge; the least one, and the largest, beyond which a photon says nothing.
+# Width of a lobe (tangent of half its directions' angle) over the photon's slope times its distance from the
+# point; the least one, and the largest, beyond which a photon says nothing.
 _WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
 
 
 @dataclass
 class GuidePhoton:
-    """A photon: ``p`` position, ``d`` unit direction towards the light's side, ``length`` of its last edge.
+    """A photon: ``p`` position, ``d`` unit direction towards the light's side.
 
+    ``slope``: by how much directions change over a distance; one over the length of its last edge, until a
+    `Guide` knows better.
     For `isolated_light` also ``n`` geometric normal, ``flux`` the throughput of its subpath, and ``hit`` the
     partial sum of s = 0, in the area measure. ``lane`` of its subpath, which has no other photon.
     """
 
     p: mi.Point3f
     d: mi.Vector3f
-    length: mi.Float
+    slope: mi.Float
     n: mi.Normal3f
     flux: mi.Spectrum
     hit: mi.Float
@@ -92,8 +94,31 @@ class Guide:
             scale,
             mi.Int32(WINDOW),
         )
+        guide.photons.slope = _slopes(guide)
         dr.make_opaque(guide)
         return guide
+
+
+@dr.syntax
+def _slopes(guide: Guide) -> mi.Float:
+    """The slope of each photon: of the least to others in its window the third; where fewer, what it has.
+
+    Where light is focused from several sides the others are of several kinds, of which the nearest in
+    direction are of its own.
+    """
+    index = dr.arange(mi.UInt32, dr.width(guide.place))
+    own = guide.photons.at(index)
+    first, second, third = mi.Float(dr.inf), mi.Float(dr.inf), mi.Float(dr.inf)
+    k = mi.UInt32(0)
+    while dr.hint(k < len(WINDOW), label="slopes of photons", exclude=[guide, index, own]):
+        other = photon(guide, index, k, True)
+        distance = dr.norm(other.p - own.p)
+        slope = dr.select(distance > 0, dr.norm(other.d - own.d) / distance, dr.inf)
+        first, slope = dr.minimum(first, slope), dr.maximum(first, slope)
+        second, slope = dr.minimum(second, slope), dr.maximum(second, slope)
+        third = dr.minimum(third, slope)
+        k += 1
+    return dr.select(dr.isfinite(third), third, own.slope)
 
 
 def _place(p: mi.Point3f, low: mi.Point3f, scale: mi.Float) -> mi.UInt64:
@@ -146,7 +171,7 @@ def exists(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.Bool:
 
 def _width(photon: GuidePhoton, p: mi.Point3f) -> mi.Float:
     """The width of its lobe at ``p``, 0 if it has none."""
-    width = _WIDTH * dr.norm(photon.p - p) / photon.length
+    width = _WIDTH * dr.norm(photon.p - p) * photon.slope
     return dr.select(width < _MOST, dr.maximum(width, _LEAST), 0)
 
 

@@ -8,9 +8,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling.points import Points
+from ..sampling.points import Points, Purpose
 from . import bsdf, mis
 from . import kernel as kernels
+from .aim import Aim
 from .counters import Counters, one
 from .inputs import Kernel
 from .merging import BUCKET_BITS, Merging, Photon, Photons, bucket_of, cell_at, level_of
@@ -33,31 +34,32 @@ def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple
     kernel = _kernel(kernel, points)
     kernel.merging = merging
 
-    def photon(y, walk, lanes):
+    def photon(y, walk, lanes, aimed):
         keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
         older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
-        return keep, Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, y.edges, lanes)
+        return keep, Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, y.edges, lanes)
 
-    photons, found, counters = _all(kernel, count, Photon, photon, {"isolated": True})
+    photons, found, counters = _all(kernel, merging.aim, count, Photon, photon)
     return replace(merging, photons=_sorted(merging, photons, found)), counters
 
 
-def trace_guide(kernel: Kernel, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
-    """The guide that ``count`` light subpaths make, None if they give no photon; `Counters.summed`.
+def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
+    """The guide that ``count`` light subpaths make, which set out as ``aim`` says; `Counters.summed`.
 
-    Photons are those that s = 0 might find, at the first vertex that is not delta.
+    None if they give no photon. Photons are those that s = 0 might find, at the first vertex that is not
+    delta.
     """
     kernel = _kernel(kernel, points)
     kernel.guide = None
 
-    def photon(y, walk, lanes):
+    def photon(y, walk, lanes, aimed):
         joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
         keep = y.hit & y.connectible() & ~joined & (y.edges < kernel.max_depth)
         keep &= y.partial.d_vc > 0
-        length = dr.norm(y.si.p - y.previous)
-        return keep, GuidePhoton(y.si.p, -walk.d, length, y.si.n, y.throughput, y.partial.d_vc, lanes)
+        slope = dr.rcp(dr.norm(y.si.p - y.previous))
+        return keep, GuidePhoton(y.si.p, -walk.d, slope, y.si.n, y.throughput, y.partial.d_vc, lanes)
 
-    photons, found, counters = _all(kernel, count, GuidePhoton, photon, {"only_delta": True})
+    photons, found, counters = _all(kernel, aim, count, GuidePhoton, photon)
     return Guide.of(photons, found) if found else None, counters
 
 
@@ -67,33 +69,39 @@ def _kernel(kernel: Kernel, points: Points) -> Kernel:
     return kernel
 
 
-def _all(kernel: Kernel, count: int, kind, photon, ends) -> tuple[Any, int, mi.UInt64]:
+def _all(kernel: Kernel, aim: Aim, count: int, kind, photon) -> tuple[Any, int, mi.UInt64]:
     """As `_traced`; none is left out."""
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        photons, found, counters = _traced(kernel, count, kind.zeros(capacity), photon, ends)
+        photons, found, counters = _traced(kernel, aim, count, kind.zeros(capacity), photon)
         if found <= capacity:
             return photons, found, counters
         capacity = found
 
 
-def _traced(kernel: Kernel, count: int, out, photon, ends) -> tuple[Any, int, mi.UInt64]:
+def _traced(kernel: Kernel, aim: Aim, count: int, out, photon) -> tuple[Any, int, mi.UInt64]:
     """Photons in the order of their arrival, how many there are, maybe more than fit into ``out``; counts.
 
-    ``photon(y, walk, lanes)`` says whether there is one at a vertex, and which; ``ends`` what `Side` has to
-    end subpaths.
+    ``photon(y, walk, lanes, aimed)`` says whether there is one at a vertex, and which.
     """
     capacity = dr.width(out)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
     shared = kernels.shared_by_lane(kernel, stream, mi.UInt64(lanes))
-    e = kernels.emission(kernel, stream, shared)
+    e, aimed = aim.emission(
+        kernel.emitters,
+        kernel.points.draw_2d("light", stream, Purpose.EMISSION_POINT),
+        kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
+        shared,
+    )
     walk = kernels.light_walk(kernel, e, stream, shared, True)
-    side = replace(kernels.light_side(kernel, e, stream, shared, walk), join=None, **ends)
+    merges = kernel.merging is not None
+    side = kernels.light_side(kernel, e, stream, shared, walk)
+    side = replace(side, join=None, isolated=merges, only_delta=not merges)
 
     def visit(y, counters, walk):
-        keep, found = photon(y, walk, lanes)
+        keep, found = photon(y, walk, lanes, aimed)
         keep &= bsdf.is_finite(
             y.throughput
         )  # else all that are drawn with it would be NaN; the walk counts it

@@ -62,7 +62,8 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
         h.scale(z.partial.d_vc, older),
     )
     if kernel.merging is not None:  # on paths whose last edge is not joined either
-        merges = h.scale(z.partial.d_vm, pdf_first * pdf_second)
+        emitted = kernel.merging.aim.density_at(z.hit, z.si.p, dr.normalize(z.previous - z.si.p), pdf_second)
+        merges = h.scale(z.partial.d_vm, pdf_first * emitted)
         joined = mis.is_joined(z.partial, newest)
         camera_side = h.combine(camera_side, dr.select(joined, 0, merges))
     light_side = 0
@@ -253,7 +254,8 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     if walk.isolated is not None:  # merges, on paths whose last edge is not joined either
-        merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
+        aimed = kernel.merging.aim.density(emission) / emission.pdf_second
+        merges = h.scale(h.scale(partial.d_vm, z.pdf_w * z.pdf_a), aimed)
         light_side = h.combine(light_side, dr.select(mis.is_joined(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= worth_a_ray(kernel, value, weight)

@@ -125,7 +125,7 @@ class Vertex:
     endpoint: Any = None
     endpoint_active: Any = None
     f: Any = None
-    # Set where s = 0 is guided: `Walk.guided` on arrival, and a `guided_hits.Aim`.
+    # Set where s = 0 is guided: `Walk.guided` on arrival, and a `guided_hits.Advice`.
     guided: Any = None
     aim: Any = None
 
@@ -176,7 +176,7 @@ class Side:
     with each vertex, returns the endpoint of the other side with which it is to be joined (`emitters.Direct`,
     or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no strategy does so.
     ``isolated``, ``only_delta``: the subpath ends as soon as it is not, see `Walk`. ``guide``: called with
-    each vertex, the walk before it and the step after it, returns its `guided_hits.Aim`.
+    each vertex, the walk before it and the step after it, returns its `guided_hits.Advice`.
     """
 
     name: str
