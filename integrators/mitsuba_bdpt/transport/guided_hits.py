@@ -54,7 +54,7 @@ def _possible(kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
     return may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
 
 
-def aim(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
+def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
     """What the guide says at the camera vertex ``z``; ``walk`` as it was before it arrived."""
     return _asked(kernel, z, z.si.to_world(step.wo), _possible(kernel, z, walk))
 
@@ -66,7 +66,7 @@ def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Advice:
 
 
 def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """As `aim`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
+    """As `advise`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
     possible = _possible(kernel, z, walk)
     return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
 
@@ -94,7 +94,7 @@ def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
     """
     return dr.if_stmt(
         (z, *state),
-        z.aim.active,
+        z.advice.active,
         lambda z, *state: _follow_all(kernel, z, stream, shared, add, state),
         lambda z, *state: state,
         label="guided subpaths",
@@ -146,8 +146,8 @@ def _begun(kernel: Kernel, z: Vertex, numbers: Stream, shared) -> Walk:
     h, p, points = kernel.heuristic, z.si.p, kernel.points
     u1 = points.draw_1d("camera", numbers, Purpose.LOBE, z.event)
     u2 = points.draw_2d("camera", numbers, Purpose.BSDF, z.event)
-    d, active = photon_guide.draw(kernel.guide, p, z.aim.found, u1, u2)
-    pdf, local = _density(kernel, p, z.aim.found, d), z.si.to_local(d)
+    d, active = photon_guide.draw(kernel.guide, p, z.advice.found, u1, u2)
+    pdf, local = _density(kernel, p, z.advice.found, d), z.si.to_local(d)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
     throughput = dr.select(active, z.throughput * f.value / pdf, 0)
     broken = not_finite(active, throughput)

@@ -420,10 +420,10 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
     def choose_emitter(z):
         return techniques.choose_emitter(kernel, z, sample.stream)
 
-    def aim(z, walk, step):
+    def advise(z, walk, step):
         if kernel.without_isolated:
             return guided_hits.mark(kernel, z, walk, step)
-        return guided_hits.aim(kernel, z, walk, step)
+        return guided_hits.advise(kernel, z, walk, step)
 
     return Side(
         "camera",
@@ -435,7 +435,7 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
         alpha=sink is not None and sink.alpha,
         parallel=kernel.camera.parallel,
         join=choose_emitter if kernel.plan.direct else None,
-        guide=aim if kernel.guide is not None or kernel.without_isolated else None,
+        guide=advise if kernel.guide is not None or kernel.without_isolated else None,
     )
 
 

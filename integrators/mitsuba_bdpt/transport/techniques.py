@@ -253,9 +253,10 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
-    if walk.isolated is not None:  # merges, on paths whose last edge is not joined either
-        aimed = kernel.merging.aim.density(emission) / emission.pdf_second
-        merges = h.scale(h.scale(partial.d_vm, z.pdf_w * z.pdf_a), aimed)
+    if walk.isolated is not None:  # merges or guided s = 0, on paths whose last edge is not joined either
+        merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
+        if kernel.merging is not None:
+            merges = h.scale(merges, kernel.merging.aim.density(emission) / emission.pdf_second)
         light_side = h.combine(light_side, dr.select(mis.is_joined(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     active &= worth_a_ray(kernel, value, weight)

@@ -127,7 +127,7 @@ class Vertex:
     f: Any = None
     # Set where s = 0 is guided: `Walk.guided` on arrival, and a `guided_hits.Advice`.
     guided: Any = None
-    aim: Any = None
+    advice: Any = None
 
     @property
     def edge(self) -> Any:
@@ -341,7 +341,7 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     sampled = _is_sampled(side, walk, vertex)
     step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
     if side.guide is not None:
-        vertex.aim = side.guide(vertex, walk, step)
+        vertex.advice = side.guide(vertex, walk, step)
     return step
 
 
@@ -431,7 +431,7 @@ def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, coefficient: mis.Coeffici
     isolated = _isolated(walk, vertex, coefficient, step)
     if kernel.merging is not None:
         return mis.Merge(kernel.heuristic.start(kernel.merging.weighed(vertex.si.p)), isolated)
-    return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.aim.other), isolated)
+    return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other), isolated)
 
 
 def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
@@ -443,9 +443,9 @@ def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
 
 def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
     """`Walk.guided` after the event at ``vertex``: delta events are made alike whatever led to them."""
-    if walk.guided is None or vertex.aim is None:  # guided subpaths follow delta events only
+    if walk.guided is None or vertex.advice is None:  # guided subpaths follow delta events only
         return walk.guided
-    other = dr.select(vertex.aim.other > 0, vertex.aim.other / step.pdf_fwd_w, 0)
+    other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
     return dr.select(step.delta, walk.guided, h.start(other))
 
 
