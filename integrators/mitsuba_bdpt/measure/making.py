@@ -4,8 +4,8 @@ A reference is good enough if its own error adds at most 1 % to the relMSE, raw 
 the samples per pixel that it is to judge, and of `path` in the same time where the reference is made by it.
 It is the mean of two halves with seeds of their own, rendered in turn until that is reached or the time is
 over; the halves differ by twice the standard error of their mean. What makes it stands in `Recipe`: `bdpt`
-with everything switched on, or `path` (with media `volpath`) where that converges, so that `bdpt` is judged
-by another integrator; windows in which few samples find the light have more of them; furnaces are known
+with everything switched on, with `merging` too where nothing else finds a part of the light, or `path` (with
+media `volpath`) where that converges, so that `bdpt` is judged by another integrator; windows in which few samples find the light have more of them; furnaces are known
 exactly. Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the
 difference of the halves (difference.R ...), and the provenance as JSON in the header, with what a bias check
 needs. Sums in double precision are kept in renders/, so that a further run improves a reference instead of
@@ -41,11 +41,17 @@ from .reference import Reference, load_reference, make_command, reference_path, 
 from .scenes import SceneFile, integrator_of, path_tracers
 from .showing import amount
 
+EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"}
 WAYS = {
     "path": {"type": "path"},
-    "bdpt": {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"},
+    "bdpt": EVERYTHING,
+    "merging": EVERYTHING | {"merging": True, "merging_radius": 0.25, "spp_per_pass": 64},
 }
-"""What makes references; `path` of scenes with media is `volpath`, see `_way`."""
+"""What makes references; `path` of scenes with media is `volpath`, see `_way`.
+
+Merging blurs, and the halves do not show it: its discs are a fourth of the default, 1/16 of the area, and a
+render has four passes of the most photons that a pass takes. docs/reports/merging.md has what is left.
+"""
 
 FOCUS_TIMES = 16  # of the samples, in windows
 
@@ -78,7 +84,8 @@ class Recipe:
     """How the reference of a scene is made, from the table of its name in PROJECT/references/scenes.toml:
 
         [glass_caustics]
-        by = "bdpt"                 # or "path", where that (with media: `volpath`) converges; default: "bdpt"
+        by = "bdpt"                 # the default; or "path", where that (with media: `volpath`) converges, or
+                                    # "merging", where nothing else finds a part of the light
         windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
 
         [furnace_point]
@@ -184,7 +191,8 @@ def check(job: Job) -> None:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it.
 
-    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one.
+    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one of
+    the same light.
     """
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
@@ -193,7 +201,7 @@ def make(job: Job) -> tuple[Reference, bool]:
     check_writable(path)
     reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
     stored = None if reached else job.stored
-    if stored is not None and stored.error < reference.error:
+    if stored is not None and stored.merged == reference.merged and stored.error < reference.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
     write(path, reference)
@@ -223,13 +231,14 @@ def _pixels(image):
 class Aim:
     """The renders that a reference has to judge.
 
-    Those of default `bdpt` with ``spp`` samples per pixel, and of a path tracer in the same time where that
-    converges and makes the reference.
+    Those of default `bdpt` with ``spp`` samples per pixel, with `merging` where that makes the reference, and of
+    a path tracer in the same time where that does (and converges).
     """
 
     def __init__(self, job: Job, scene, by: str):
         self.name, self.depth, spp = job.scene.name, job.depth, job.spp
-        rivals = [({"type": "bdpt"}, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
+        ours = {"type": "bdpt", "merging": by == "merging"}
+        rivals = [(ours, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
         self.images = []
         for parameters, samples in rivals:
             rival = integrator_of(parameters, job.depth)

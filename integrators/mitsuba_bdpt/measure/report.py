@@ -311,7 +311,7 @@ def budgets_table(results: Results) -> str:
 def _maker(kept) -> str:
     """What made a reference."""
     by = kept.provenance["integrator"]
-    return by if isinstance(by, str) else f"`{by['type']}`"
+    return by if isinstance(by, str) else f"`{by['type']}`" + (", `merging`" if kept.merged else "")
 
 
 def references_table(made: dict) -> str:
