@@ -5,12 +5,12 @@ the samples per pixel that it is to judge, and of `path` in the same time where 
 It is the mean of two halves with seeds of their own, rendered in turn until that is reached or the time is
 over; the halves differ by twice the standard error of their mean. What makes it stands in `Recipe`: `bdpt`
 with everything switched on, with `merging` too where nothing else finds a part of the light, or `path` (with
-media `volpath`) where that converges, so that `bdpt` is judged by another integrator; windows in which few samples find the light have more of them; furnaces are known
-exactly. Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the
-difference of the halves (difference.R ...), and the provenance as JSON in the header, with what a bias check
-needs. Sums in double precision are kept in renders/, so that a further run improves a reference instead of
-starting anew; where they are gone, it goes on from the stored image, whose rounding to half precision is far
-below its own error.
+media `volpath`) where that converges, so that `bdpt` is judged by another integrator; windows in which few
+samples find the light have more of them; furnaces are known exactly. Files lie in the project's references/:
+EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R ...), and the
+provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept in renders/,
+so that a further run improves a reference instead of starting anew; where they are gone, it goes on from the
+stored image, whose rounding to half precision is far below its own error.
 """
 
 from __future__ import annotations
@@ -191,8 +191,8 @@ def check(job: Job) -> None:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it.
 
-    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one of
-    the same light.
+    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one
+    of the same light.
     """
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
@@ -231,8 +231,8 @@ def _pixels(image):
 class Aim:
     """The renders that a reference has to judge.
 
-    Those of default `bdpt` with ``spp`` samples per pixel, with `merging` where that makes the reference, and of
-    a path tracer in the same time where that does (and converges).
+    Those of default `bdpt` with ``spp`` samples per pixel, with `merging` where that makes the reference, and
+    of a path tracer in the same time where that does (and converges).
     """
 
     def __init__(self, job: Job, scene, by: str):
