@@ -245,7 +245,8 @@ def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
 
 
 def test_recipes_say_what_makes_a_reference(here):
-    """Expected: `path` by recipe or by the command line, in place of `bdpt`; a radiance that is known."""
+    """Expected: `path` by recipe or by the command line, in place of `bdpt`; `bdpt` with merging; a radiance
+    that is known."""
     references = here / "project" / "references"
     references.mkdir()
     recipe = references / "scenes.toml"
@@ -262,6 +263,9 @@ def test_recipes_say_what_makes_a_reference(here):
     assert maker()["type"] == "path"
     (references / "room_8_4.exr").unlink()
     assert maker("--by", "bdpt")["type"] == "bdpt"
+    (references / "room_8_4.exr").unlink()
+    recipe.write_text('[room]\nby = "merging"\n')
+    assert maker()["merging"]
     recipe.write_text("[room]\nradiance = { limit = 1.0, lacks = 2.0 }\n")
     assert maker() == "known answer"
     assert (reference.read_reference(references / "room_8_4.exr").image == 0.875).all()
