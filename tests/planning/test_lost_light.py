@@ -322,7 +322,7 @@ def test_it_is_looked_for_once(monkeypatch):
     ],
 )
 def test_what_the_committed_scenes_lack(name, share, said, monkeypatch):
-    """Rationale: all of them have a lamp without area, and glass; their files say what no strategy can make.
+    """Rationale: all of them have a lamp without area, and glass; their files say what only merging finds.
     Expected: a word about those that lack more than a hundredth of the light, and none about the others.
     The share is that of 2^18 subpaths, which three seeds agree about to a tenth; 2^13 are off by a third, the
     2^15 of this test by a sixth."""

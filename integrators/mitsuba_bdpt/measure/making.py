@@ -45,12 +45,12 @@ EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "
 WAYS = {
     "path": {"type": "path"},
     "bdpt": EVERYTHING,
-    "merging": EVERYTHING | {"merging": True, "merging_radius": 0.25, "spp_per_pass": 64},
+    "merging": EVERYTHING | {"merging": True, "merging_radius": 0.125, "spp_per_pass": 64},
 }
 """What makes references; `path` of scenes with media is `volpath`, see `_way`.
 
-Merging blurs, and the halves do not show it: its discs are a fourth of the default, 1/16 of the area, and a
-render has four passes of the most photons that a pass takes. docs/reports/merging.md has what is left.
+Merging blurs, and the halves do not show it: the discs have an eighth of the default's radius, and a render
+has four passes of the most photons that one takes. docs/reports/merging.md has what is left.
 """
 
 FOCUS_TIMES = 16  # of the samples, in windows
