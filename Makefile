@@ -29,6 +29,10 @@ gallery: $(INSTALLED)
 		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
+	for scene in pool_floor lamp_in_glass_seen; do \
+		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
+			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
+	done
 
 # The pictures of docs/reports/pictures.md.
 pictures: $(INSTALLED)

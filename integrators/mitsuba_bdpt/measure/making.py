@@ -45,12 +45,14 @@ EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "
 WAYS = {
     "path": {"type": "path"},
     "bdpt": EVERYTHING,
-    "merging": EVERYTHING | {"merging": True, "merging_radius": 0.125, "spp_per_pass": 64},
+    "merging": EVERYTHING | {"merging": True, "spp_per_pass": 64},
 }
-"""What makes references; `path` of scenes with media is `volpath`, see `_way`.
+"""What makes references, see `_way`. Passes of so few samples have the most photons."""
 
-Merging blurs, and the halves do not show it: the discs have an eighth of the default's radius, and a render
-has four passes of the most photons that one takes. docs/reports/merging.md has what is left.
+MERGING_RADIUS = 0.25
+"""Of "merging" unless the recipe says another one.
+
+Merging blurs, and the halves do not show it: docs/reports/merging.md has what is left.
 """
 
 FOCUS_TIMES = 16  # of the samples, in windows
@@ -86,6 +88,7 @@ class Recipe:
         [glass_caustics]
         by = "bdpt"                 # the default; or "path", where that (with media: `volpath`) converges, or
                                     # "merging", where nothing else finds a part of the light
+        merging_radius = 0.125      # of "merging", in pixels; default: 0.25
         windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
 
         [furnace_point]
@@ -96,6 +99,7 @@ class Recipe:
     """
 
     by: str = "bdpt"
+    merging_radius: float = MERGING_RADIUS
     windows: tuple = ()
     radiance: dict | None = None
 
@@ -104,11 +108,17 @@ class Recipe:
         """That of a scene; raises ``CommandError`` for one that cannot be followed."""
         file = project.references / "scenes.toml"
         entry = table_of(file, name, (read_toml(file) if file.is_file() else {}).get(name, {}))
-        keys = {"by", "windows", "radiance"}
+        keys = {"by", "merging_radius", "windows", "radiance"}
         if unknown := sorted(set(entry) - keys):
             raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
         if entry.get("by", "bdpt") not in tuple(WAYS):  # of a list there is no hash
             raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
+        radius = entry.get("merging_radius", MERGING_RADIUS)
+        idle = "merging_radius" in entry and entry.get("by") != "merging"
+        if idle or not (_is_number(radius) and radius > 0):
+            raise CommandError(
+                f"{file}: merging_radius={radius!r} of [{name}] must be a positive number, and by='merging'"
+            )
         windows = entry.get("windows", [])
         if not isinstance(windows, list) or not all(map(_is_window, windows)):
             raise CommandError(
@@ -121,7 +131,7 @@ class Recipe:
             raise CommandError(
                 f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks, numbers"
             )
-        return Recipe(entry.get("by", "bdpt"), tuple(map(tuple, windows)), known)
+        return Recipe(entry.get("by", "bdpt"), radius, tuple(map(tuple, windows)), known)
 
 
 @dataclass(frozen=True)
@@ -238,7 +248,7 @@ class Aim:
     def __init__(self, job: Job, scene, by: str):
         self.name, self.depth, spp = job.scene.name, job.depth, job.spp
         ours = {"type": "bdpt", "merging": by == "merging"}
-        rivals = [(ours, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
+        rivals = [(ours, spp)] + [(_way(job.scene, Recipe(by)), TWICE * spp)] * (by == "path")
         self.images = []
         for parameters, samples in rivals:
             rival = integrator_of(parameters, job.depth)
@@ -265,9 +275,11 @@ class Aim:
         )
 
 
-def _way(scene: SceneFile, by: str) -> dict:
-    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`."""
-    return {"type": path_tracers(scene.has_media)[0]} if by == "path" else WAYS[by]
+def _way(scene: SceneFile, recipe: Recipe) -> dict:
+    """Parameters of what makes the reference of a scene; `path` of scenes with media is `volpath`."""
+    if recipe.by == "path":
+        return {"type": path_tracers(scene.has_media)[0]}
+    return WAYS[recipe.by] | ({"merging_radius": recipe.merging_radius} if recipe.by == "merging" else {})
 
 
 def _same(stored: Reference, **wanted) -> bool:
@@ -298,14 +310,14 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     """As `_known`, by an integrator; False if the time was over first."""
-    by = job.by or recipe.by
-    parameters = _way(job.scene, by) | {"max_depth": job.depth}
+    recipe = replace(recipe, by=job.by or recipe.by)
+    parameters = _way(job.scene, recipe) | {"max_depth": job.depth}
     integrator = mi.load_dict(parameters)
     sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
     scene = job.scene.load(job.resolution, sampler)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(job, scene, by)
+    aim = Aim(job, scene, recipe.by)
     windows = [Window(job, share, sampler) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=sampler):
