@@ -29,12 +29,20 @@ gallery: $(INSTALLED)
 		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
+	for scene in pool_floor lamp_in_glass_seen; do \
+		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
+			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
+	done
 
 # The pictures of docs/reports/pictures.md.
 pictures: $(INSTALLED)
 	mkdir -p docs/images
 	$(VENV)/bin/python scripts/equal_time.py veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
+	for scene in glass_caustics pool_floor lamp_in_glass_seen; do \
+		$(VENV)/bin/python scripts/equal_time.py $$scene --spp 64 -o docs/images/$${scene}_merging.png \
+			-i bdpt path "bdpt merging=true" || exit 1; \
+	done
 	$(VENV)/bin/python scripts/equal_time.py lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py fog_caustic --spp 64 -o docs/images/fog_caustic_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py veach_mis --spp 16 -o docs/images/veach_mis_heuristics.png \

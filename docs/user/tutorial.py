@@ -149,4 +149,5 @@ for sensor, view in ((0, "wall"), (2, "floor through water")):
 
 # %% [markdown]
 # On the floor a few fireflies determine the relMSE of both, the long render's too: no figure there means much, which
-# is typical of paths that are found by chance only.
+# is typical of paths that are found by chance only. With `merging=True` it comes out smooth, blurred by about a pixel
+# (docs/reports/merging.md); `scenes/pool_floor.xml` has the sun in place of the lamp, and nothing else finds it.

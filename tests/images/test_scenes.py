@@ -46,6 +46,7 @@ CLOSED_ROOMS = [
     "fog_caustic",
     "fog_lamp_in_glass",
     "fog_lamp",
+    "lamp_in_glass_seen",
 ]
 # Extinction, per unit of length, of the medium around the sensor and of those in bodies seen from outside.
 FOGS = {
@@ -159,11 +160,27 @@ def test_cornell_box_is_the_one_of_mitsuba():
     assert np.abs(images[0] - images[1]).mean() < 2e-3 * images[1].mean()
 
 
-@pytest.mark.parametrize("name", ["lamp_behind_glass", "projector_through_glass"])
+@pytest.mark.parametrize(
+    "name", ["lamp_behind_glass", "projector_through_glass", "lamp_in_glass_seen", "pool_floor"]
+)
 def test_delta_lamps_behind_glass_are_black_under_path(name):
     """Every light path starts at a point and goes through glass, so `path` finds exactly nothing."""
     image = np.array(mi.render(load(name, resolution=32), spp=16))
     assert (image == 0).all()
+
+
+@pytest.mark.parametrize("name, share", [("pool_floor", 0.942), ("lamp_in_glass_seen", 0.0605)])
+def test_what_only_merging_finds(name, share):
+    """The share of the light that a render without `merging` has not: means of six renders as here.
+
+    Tolerance: 0.01 and 0.003; the shares of single renders have standard deviations of 0.003 and 0.0005, but
+    for one with a bright sample near a corner.
+    """
+    scene = load(name, integrator="bdpt", resolution=32)
+    ours = {"type": "bdpt", "max_depth": scene.integrator().max_depth}
+    ways = [mi.load_dict(ours | {"merging": merging}) for merging in (False, True)]
+    mean = [np.mean(mi.render(scene, integrator=way, spp=64, seed=1)) for way in ways]
+    assert 1.0 - mean[0] / mean[1] == pytest.approx(share, abs=0.01 if share > 0.5 else 0.003)
 
 
 def test_projector_shines_through_its_ball_only():

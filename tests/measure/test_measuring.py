@@ -245,7 +245,8 @@ def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
 
 
 def test_recipes_say_what_makes_a_reference(here):
-    """Expected: `path` by recipe or by the command line, in place of `bdpt`; a radiance that is known."""
+    """Expected: `path` by recipe or by the command line, in place of `bdpt`; `bdpt` with merging; a radiance
+    that is known."""
     references = here / "project" / "references"
     references.mkdir()
     recipe = references / "scenes.toml"
@@ -262,6 +263,12 @@ def test_recipes_say_what_makes_a_reference(here):
     assert maker()["type"] == "path"
     (references / "room_8_4.exr").unlink()
     assert maker("--by", "bdpt")["type"] == "bdpt"
+    (references / "room_8_4.exr").unlink()
+    recipe.write_text('[room]\nby = "merging"\n')
+    assert maker()["merging_radius"] == 0.25
+    (references / "room_8_4.exr").unlink()
+    recipe.write_text('[room]\nby = "merging"\nmerging_radius = 0.5\n')
+    assert maker()["merging_radius"] == 0.5
     recipe.write_text("[room]\nradiance = { limit = 1.0, lacks = 2.0 }\n")
     assert maker() == "known answer"
     assert (reference.read_reference(references / "room_8_4.exr").image == 0.875).all()
@@ -271,6 +278,8 @@ def test_recipes_say_what_makes_a_reference(here):
         ("window = 1", "window is not a key of"),
         ("windows = 3", "windows=3 of .* must be lists of four shares"),
         ('windows = [3, "x"]', "must be lists of four shares"),
+        ('by = "merging"\nmerging_radius = 0', "merging_radius=0 of .* must be a positive number"),
+        ("merging_radius = 0.5", "must be a positive number, and by='merging'"),
         ("by = []", r"by=\[\] of .* must be one of"),
         ("radiance = 3", "radiance=3 of .* must have the keys limit and lacks, numbers"),
         ("radiance = { limit = true, lacks = 'x' }", "must have the keys limit and lacks, numbers"),

@@ -264,6 +264,24 @@ def test_a_better_reference_stays(project, job):
     assert making.make(job(2))[1]
 
 
+def test_a_reference_with_merging_replaces_one_without(project, job):
+    """Rationale: they differ by light, so that it does not count which has less noise. Expected: a short run
+    by merging replaces a better reference without; of two with merging the better one stays."""
+    name = "lamp_behind_glass"
+    plain, _ = making.make(job(5, name, by="bdpt"))
+    assert not plain.merged and not reference_of(project, 5, name).merged
+    made, reached = making.make(job(5, name, seconds=0))
+    assert not reached and made.merged and made.error > plain.error
+    assert reference_of(project, 5, name).merged
+    made, _ = making.make(job(5, name))
+    stored = replace(made, provenance=made.provenance | {"sampler": "another"})
+    reference.write(reference.reference_path(project, name, 8, 5), stored)
+    for sums in project.renders.glob("*.npz"):
+        sums.unlink()
+    kept, reached = making.make(job(5, name, seconds=0))
+    assert not reached and kept.provenance["sampler"] == "another"
+
+
 def test_sums_stay_finite_and_say_what_they_are_of(folder, capsys):
     """Expected: a value that is not finite is refused before it is added; sums of something else are not
     used, and it is said."""

@@ -129,10 +129,10 @@ def _declare_reference(parser) -> None:
     _add_resolution(parser)
     add("--max-depth", type=_depth, help="default: that of presets/benchmark.toml, else of the scene's file")
     text = (
-        "what renders it, path (with media: volpath) only where that converges; default: as "
-        "references/scenes.toml says, else bdpt"
+        "what renders it, path (with media: volpath) only where that converges, merging (bdpt with it) where "
+        "nothing else finds all light; default: as references/scenes.toml says, else bdpt"
     )
-    add("--by", choices=("path", "bdpt"), help=text)
+    add("--by", choices=("path", "bdpt", "merging"), help=text)
 
 
 def _declare_compare(parser) -> None:

@@ -4,13 +4,13 @@ A reference is good enough if its own error adds at most 1 % to the relMSE, raw 
 the samples per pixel that it is to judge, and of `path` in the same time where the reference is made by it.
 It is the mean of two halves with seeds of their own, rendered in turn until that is reached or the time is
 over; the halves differ by twice the standard error of their mean. What makes it stands in `Recipe`: `bdpt`
-with everything switched on, or `path` (with media `volpath`) where that converges, so that `bdpt` is judged
-by another integrator; windows in which few samples find the light have more of them; furnaces are known
-exactly. Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the
-difference of the halves (difference.R ...), and the provenance as JSON in the header, with what a bias check
-needs. Sums in double precision are kept in renders/, so that a further run improves a reference instead of
-starting anew; where they are gone, it goes on from the stored image, whose rounding to half precision is far
-below its own error.
+with everything switched on, with `merging` too where nothing else finds a part of the light, or `path` (with
+media `volpath`) where that converges, so that `bdpt` is judged by another integrator; windows in which few
+samples find the light have more of them; furnaces are known exactly. Files lie in the project's references/:
+EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R ...), and the
+provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept in renders/,
+so that a further run improves a reference instead of starting anew; where they are gone, it goes on from the
+stored image, whose rounding to half precision is far below its own error.
 """
 
 from __future__ import annotations
@@ -41,11 +41,19 @@ from .reference import Reference, load_reference, make_command, reference_path, 
 from .scenes import SceneFile, integrator_of, path_tracers
 from .showing import amount
 
+EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"}
 WAYS = {
     "path": {"type": "path"},
-    "bdpt": {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"},
+    "bdpt": EVERYTHING,
+    "merging": EVERYTHING | {"merging": True, "spp_per_pass": 64},
 }
-"""What makes references; `path` of scenes with media is `volpath`, see `_way`."""
+"""What makes references, see `_way`. Passes of so few samples have the most photons."""
+
+MERGING_RADIUS = 0.25
+"""Of "merging" unless the recipe says another one.
+
+Merging blurs, and the halves do not show it: docs/reports/merging.md has what is left.
+"""
 
 FOCUS_TIMES = 16  # of the samples, in windows
 
@@ -78,7 +86,9 @@ class Recipe:
     """How the reference of a scene is made, from the table of its name in PROJECT/references/scenes.toml:
 
         [glass_caustics]
-        by = "bdpt"                 # or "path", where that (with media: `volpath`) converges; default: "bdpt"
+        by = "bdpt"                 # the default; or "path", where that (with media: `volpath`) converges, or
+                                    # "merging", where nothing else finds a part of the light
+        merging_radius = 0.125      # of "merging", in pixels; default: 0.25
         windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
 
         [furnace_point]
@@ -89,6 +99,7 @@ class Recipe:
     """
 
     by: str = "bdpt"
+    merging_radius: float = MERGING_RADIUS
     windows: tuple = ()
     radiance: dict | None = None
 
@@ -97,11 +108,17 @@ class Recipe:
         """That of a scene; raises ``CommandError`` for one that cannot be followed."""
         file = project.references / "scenes.toml"
         entry = table_of(file, name, (read_toml(file) if file.is_file() else {}).get(name, {}))
-        keys = {"by", "windows", "radiance"}
+        keys = {"by", "merging_radius", "windows", "radiance"}
         if unknown := sorted(set(entry) - keys):
             raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
         if entry.get("by", "bdpt") not in tuple(WAYS):  # of a list there is no hash
             raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
+        radius = entry.get("merging_radius", MERGING_RADIUS)
+        idle = "merging_radius" in entry and entry.get("by") != "merging"
+        if idle or not (_is_number(radius) and radius > 0):
+            raise CommandError(
+                f"{file}: merging_radius={radius!r} of [{name}] must be a positive number, and by='merging'"
+            )
         windows = entry.get("windows", [])
         if not isinstance(windows, list) or not all(map(_is_window, windows)):
             raise CommandError(
@@ -114,7 +131,7 @@ class Recipe:
             raise CommandError(
                 f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks, numbers"
             )
-        return Recipe(entry.get("by", "bdpt"), tuple(map(tuple, windows)), known)
+        return Recipe(entry.get("by", "bdpt"), radius, tuple(map(tuple, windows)), known)
 
 
 @dataclass(frozen=True)
@@ -184,7 +201,8 @@ def check(job: Job) -> None:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it.
 
-    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one.
+    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one
+    of the same light.
     """
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
@@ -193,7 +211,7 @@ def make(job: Job) -> tuple[Reference, bool]:
     check_writable(path)
     reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
     stored = None if reached else job.stored
-    if stored is not None and stored.error < reference.error:
+    if stored is not None and stored.merged == reference.merged and stored.error < reference.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
     write(path, reference)
@@ -223,13 +241,14 @@ def _pixels(image):
 class Aim:
     """The renders that a reference has to judge.
 
-    Those of default `bdpt` with ``spp`` samples per pixel, and of a path tracer in the same time where that
-    converges and makes the reference.
+    Those of default `bdpt` with ``spp`` samples per pixel, with `merging` where that makes the reference, and
+    of a path tracer in the same time where that does (and converges).
     """
 
     def __init__(self, job: Job, scene, by: str):
         self.name, self.depth, spp = job.scene.name, job.depth, job.spp
-        rivals = [({"type": "bdpt"}, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
+        ours = {"type": "bdpt", "merging": by == "merging"}
+        rivals = [(ours, spp)] + [(_way(job.scene, Recipe(by)), TWICE * spp)] * (by == "path")
         self.images = []
         for parameters, samples in rivals:
             rival = integrator_of(parameters, job.depth)
@@ -256,9 +275,11 @@ class Aim:
         )
 
 
-def _way(scene: SceneFile, by: str) -> dict:
-    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`."""
-    return {"type": path_tracers(scene.has_media)[0]} if by == "path" else WAYS[by]
+def _way(scene: SceneFile, recipe: Recipe) -> dict:
+    """Parameters of what makes the reference of a scene; `path` of scenes with media is `volpath`."""
+    if recipe.by == "path":
+        return {"type": path_tracers(scene.has_media)[0]}
+    return WAYS[recipe.by] | ({"merging_radius": recipe.merging_radius} if recipe.by == "merging" else {})
 
 
 def _same(stored: Reference, **wanted) -> bool:
@@ -289,14 +310,14 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     """As `_known`, by an integrator; False if the time was over first."""
-    by = job.by or recipe.by
-    parameters = _way(job.scene, by) | {"max_depth": job.depth}
+    recipe = replace(recipe, by=job.by or recipe.by)
+    parameters = _way(job.scene, recipe) | {"max_depth": job.depth}
     integrator = mi.load_dict(parameters)
     sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
     scene = job.scene.load(job.resolution, sampler)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(job, scene, by)
+    aim = Aim(job, scene, recipe.by)
     windows = [Window(job, share, sampler) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=sampler):

@@ -44,6 +44,12 @@ class Reference:
         """Its own relMSE."""
         return rel_mse(self.image + self.difference, self.image)
 
+    @property
+    def merged(self) -> bool:
+        """Whether it has the light that only `merging` finds, blurred by a little."""
+        made_by = self.provenance["integrator"]
+        return isinstance(made_by, dict) and made_by.get("merging", False)
+
     def share_of(self, image, trim: float) -> float:
         """What its own error adds to ``rel_mse(image, self.image, trim)``."""
         return reference_rel_mse(self.difference, image, self.image, trim)
