@@ -100,7 +100,7 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
         "what points take off it):"
     )
     lines = [head]
-    shown: set[tuple[str, str, int]] = set()
+    shown: set[tuple[str, str, int, str]] = set()
     for row in table:
         candidate = row.candidate
         served, guided = (

@@ -160,7 +160,7 @@ def tile_of(region: Region, position: mi.Point2f) -> mi.UInt32:
     """The number of the fine tile at a ``position`` on the film."""
     uv = dr.clip(region.to_uv(position), 0, 1)
     xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
-    return xy.y * FINE + xy.x
+    return mi.UInt32(xy.y * FINE + xy.x)
 
 
 def group(lane: Lanes) -> Lanes:

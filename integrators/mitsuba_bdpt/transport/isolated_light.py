@@ -91,8 +91,8 @@ def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) ->
 
 
 def _mean(colours: mi.Spectrum) -> mi.Float:
-    colours = mi.unpolarized_spectrum(colours)
-    return sum(colours) / len(colours)
+    found = mi.unpolarized_spectrum(colours)
+    return mi.Float(sum(found) / len(found))
 
 
 @dr.syntax
