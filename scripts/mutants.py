@@ -727,7 +727,7 @@ MUTANTS = (
         "transport/techniques.py",
         "light_side, active = other, active & ~joined",
         "light_side = other",
-        ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-1]",),
+        ("tests/images/test_guided_hits.py::test_a_lamp_below_the_plate",),
     ),
     Mutant(
         "merging: delta events leave d_vm as it is",

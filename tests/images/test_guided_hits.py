@@ -157,6 +157,16 @@ def test_parameters(parameters):
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
+def test_a_lamp_below_the_plate():
+    """Rationale: from the floor the guide also makes directions straight to the lamp, on paths that next-event
+    estimation joins; photons come back from the plate. Expected: the same tiles as without.
+    """
+    scene = mi.load_dict(under_glass(ball(0.1) | {"center": [0.5, 0.0, 0.2]}))
+    a = images(scene, 128, 8, decisions=guided(4))
+    b = images(scene, 128, 8, first=100, photon_guiding="never")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
 def test_small_lamps_without_fireflies():
     """Rationale: a camera ray that leaves the floor meets a lamp of a tenth of the size a hundredth as often.
     Expected: the means agree, and the variance of pixels is less than a tenth of that without.
