@@ -739,8 +739,8 @@ MUTANTS = (
     Mutant(
         "merging: a path is isolated again after an edge that is joined",
         "transport/walk.py",
-        "isolated = walk.isolated & (step.delta",
-        "isolated = (step.delta",
+        "return walk.isolated & (step.delta",
+        "return (step.delta",
         ("tests/images/test_merging.py::test_joined_paths_are_not_merged",),
     ),
     Mutant(

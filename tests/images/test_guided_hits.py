@@ -158,8 +158,8 @@ def test_parameters(parameters):
 
 
 def test_a_lamp_below_the_plate():
-    """Rationale: from the floor the guide also makes directions straight to the lamp, on paths that next-event
-    estimation joins; photons come back from the plate. Expected: the same tiles as without.
+    """Rationale: from the floor the guide also makes directions straight to the lamp, on paths that s = 1
+    joins; photons come back from the plate. Expected: the same tiles as without.
     """
     scene = mi.load_dict(under_glass(ball(0.1) | {"center": [0.5, 0.0, 0.2]}))
     a = images(scene, 128, 8, decisions=guided(4))
