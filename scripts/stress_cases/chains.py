@@ -171,7 +171,7 @@ class Recursion:
     def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, i, isolated):
         is_delta = self.path.delta[i]
         isolated &= is_delta | ~mis.is_joined(partial, coefficient)
-        merge = None if self.eta is None else mis.Merge(self.eta[i], isolated)
+        merge = None if self.eta is None else mis.Merge(self.h.start(self.eta[i]), isolated)
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
             pdf_fwd_w=dr.select(is_delta, 0, pdf_fwd_w),

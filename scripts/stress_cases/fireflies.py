@@ -37,7 +37,7 @@ def _explained(name: str) -> Outcome:
     """The worst samples of a scene found anew."""
     depth = benchmark_depth(name)
     scene = load_scene(name, resolution=RESOLUTION)
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "photon_guiding": "never"})
     target = _target(name, depth)
     found = []
     for seed in range(1, SEEDS + 1):

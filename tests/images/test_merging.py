@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import views
 import welch as st
-from mitsuba_bdpt.run import rendering, schedule
+from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import aim, merging, photons, wavelength_sets
 from mitsuba_bdpt.transport.inputs import Kernel
@@ -350,7 +350,7 @@ def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
     0.02 for the perspective, in which edges look smaller than the middle; standard errors of the ball: 0.03.
     """
     monkeypatch.setattr(rendering, "coefficient", lambda *_: 1.0)
-    monkeypatch.setattr(schedule, "FEWEST_PHOTONS", 1 << 18)
+    monkeypatch.setattr("mitsuba_bdpt.transport.photons.FEWEST_PHOTONS", 1 << 18)
     scene, expected = small(shape)
     pixel = Footprints.of(scene, scene.sensors()[0]).angle * np.linalg.norm(CAMERA)
     found = images(scene, 16, 8, merging=True, merging_radius=radius / pixel).mean()

@@ -590,6 +590,8 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         space=None,
         light_media=None,
         merging=None,
+        guide=None,
+        without_isolated=False,
         sensor_medium=None,
         scatters=True,
     )
@@ -654,6 +656,19 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
     return columns(result, world.n)
 
 
+class Unaimed:
+    """A stand-in for `aim.Aim`: photons set out by the emitter's own density."""
+
+    def emission(self, emitters, u_point, u_direction, shared):
+        return emitters.sample_emission(u_point, u_direction, shared, mi.Bool(True)), mi.Float(1)
+
+    def density(self, emission, number=None):
+        return emission.pdf_second
+
+    def density_at(self, hit, p, d, pdf_second):
+        return pdf_second
+
+
 def traced_photons(world: World, k_, merges: merging.Merging, shared, monkeypatch) -> merging.Merging:
     """The photons of one light subpath for each path, traced, sorted and kept by the unchanged code."""
     k_.bound = lambda *_: SimpleNamespace(**vars(k_))
@@ -674,8 +689,8 @@ def record_merges(world: World, monkeypatch):
         mask[0] = possible(kernel_, z, walk)
         return mask[0]
 
-    def recorded_merge(kernel_, z, stream):
-        out, m = merge(kernel_, z, stream), world.k - int(z.edges[0])
+    def recorded_merge(kernel_, z, *more):
+        out, m = merge(kernel_, z, *more), world.k - int(z.edges[0])
         out.active = out.active & mask[0]
         world.merged[m] = out
         world.demands.append(~out.active | ((out.s == m + 1) & (out.t == world.k - m)))
@@ -742,7 +757,7 @@ def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, 
         centre, angle, low, high, count = (0.2, -0.1, 0.3), 1e-3, 2.5e-4, 2e-3, 10.0 ** (3 + k / 2)
         radius = Radius(mi.Point3f(*centre), *(mi.Float(x) for x in (0.0, angle, low, high)))
         with monkeypatch.context() as patch:
-            merges = merging.Merging(radius, mi.Float(count), mi.Float(share))
+            merges = merging.Merging(radius, mi.Float(count), mi.Float(share), Unaimed())
             weights = kernel_weights(world, kappa, name, patch, merges)
         distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
         eta = count * np.pi * np.clip(angle * distance, low, high) ** 2

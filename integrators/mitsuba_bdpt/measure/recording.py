@@ -147,7 +147,7 @@ def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it, largest first.
 
     They are all samples larger than ``least`` (of the image's shape) in one of the colours. Raises
-    ``CommandError`` for a film of other colours, and for `merging`.
+    ``CommandError`` for a film of other colours, for `merging`, and where s = 0 is guided.
     """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -157,6 +157,8 @@ def render(scene, integrator, least, spp: int, seed: int):
     outliers = []
 
     def trace(traced, image, batch, points, of):
+        if traced.guide is not None:
+            raise CommandError("paths that are guided are not looked at; set photon_guiding=never")
         launch = Launch(copy(traced), batch, points, of, int(film.crop_size()[0]))
         collector = Collector(image._film, least, kernel.shared_by(traced, batch, points).lanes)
         counts = kernel.trace(traced, collector, batch, points, of)

@@ -77,12 +77,13 @@ class Prediction:
     """The predicted efficiency of a candidate.
 
     ``cost`` of a sample (path tracing alone: 1); its ``variance`` as relMSE, before what points take off that
-    of all candidates.
+    of all candidates, without isolated light where s = 0 can be guided; ``gain``: see `guided_gain`.
     """
 
     candidate: Configuration
     cost: float
     variance: float
+    gain: float = 1.0
 
     @property
     def time(self) -> float:
@@ -138,7 +139,7 @@ def _guided(
         candidate = replace(lit.candidate, guided=samples)
         each = cost(candidate, moments.rays, alternatives.samples)
         gain = before / (each * (lit.variance + isolated))
-        found.append((float(gain), replace(lit, candidate=candidate, cost=each)))
+        found.append((float(gain), replace(lit, candidate=candidate, cost=each, gain=float(gain))))
     return found
 
 

@@ -116,6 +116,11 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
             f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections}{guided} "
             f"({row.cost:.2f}, {row.variance:.3g})"
         )
+    if table[0].candidate.guided:
+        lines.append(
+            f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of isolated paths, which none of "
+            "these figures has"
+        )
     lines.append(
         f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
         f"most {LIGHT_GAIN:g} times as long as the best"

@@ -21,13 +21,13 @@ from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.isolated_light import MOMENTS, Found, Gauge
 from ..transport.kernel import trace_isolated
-from ..transport.photons import trace_guide
+from ..transport.photons import photons_of, trace_guide
 from ..transport.plan import Plan
 from . import moments
 from .moments import FINE, GROUPS, Isolated, tile_of
 
 # Camera samples that look for vertices where s = 0 can be guided: most of their subpaths end at once. Light
-# subpaths that give the photons to measure with, and as many that give those of the guide.
+# subpaths that give the photons to measure with, and at most so many that give those of the guide.
 LANES, PHOTONS = 1 << 14, 1 << 16
 
 # An estimate of s = 0 may be as many times as large as what arrives as a render has samples, over this: what
@@ -46,8 +46,8 @@ def measure(
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
     aim = Aim.of(prepared.scene, prepared.emitters)
     made = [
-        trace_guide(kernel, aim, Points("sobol", sequence_seed(seed, GUIDE + number)), PHOTONS)[0]
-        for number in range(2)
+        trace_guide(kernel, aim, Points("sobol", sequence_seed(seed, GUIDE + number)), count)[0]
+        for number, count in enumerate((PHOTONS, min(photons_of(int(samples)), PHOTONS)))
     ]
     if made[0] is None or made[1] is None:
         return None

@@ -214,8 +214,8 @@ def _called(emitter: mi.Emitter) -> str:
 
 def _remedy(emitters: Iterable[mi.Emitter]) -> str:
     if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
-        return "give the sun a disk: sunsky, an envmap, or an area light far away"
-    return "give it a small area: an area light on a small sphere or disk"
+        return "set merging, or give the sun a disk: sunsky, an envmap, or an area light far away"
+    return "set merging, or give it a small area: an area light on a small sphere or disk"
 
 
 def _shared(prepared: PreparedScene, generator: PCG32) -> Shared:

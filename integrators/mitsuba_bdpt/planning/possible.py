@@ -164,6 +164,10 @@ def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
     return ""
 
 
+# Edges of an isolated path at least: lamp, glass, a vertex, the sensor.
+SHORTEST = 3
+
+
 def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, direct: bool) -> str:
     """Why s = 0 cannot be guided, or gains nothing by it; empty if neither."""
     if prepared.space is not None:
@@ -172,6 +176,8 @@ def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, dire
         return "strategy images show each strategy by itself, and it is another s=0"
     if not hit:
         return "no emitter that a ray can hit"
+    if settings.max_depth < SHORTEST:
+        return f"max_depth={settings.max_depth} allows no such path"
     if prepared.emitters.contrast <= EVEN:
         return "s=0 finds an even sky by itself"
     return _why_not_merging(prepared.emitters, prepared.delta, direct)

@@ -37,7 +37,7 @@ from ..transport.plan import Plan
 from ..transport.wavelength_sets import SETS
 from .pass_points import PassPoints
 from .progress import Progress
-from .schedule import REPLICATES, Step, batches, passes_since, photons_of, schedule
+from .schedule import REPLICATES, Step, batches, passes_since, schedule
 from .snapshot import Snapshot, identity
 from .statistics import rays
 from .work import Meter
@@ -240,7 +240,8 @@ class Render:
         """The photons of a pass, whose radius follows from the passes done of the same image or replicate."""
         done = passes_since(self.passes, step.done)
         factor = self._radius_in_pixels(done)
-        count = photons_of(step.size * int(self.prepared.camera.region.size.prod()))
+        pixels = int(self.prepared.camera.region.size.prod())
+        count = photons.photons_of_pass(step.size * pixels, pixels, factor)
         changes = self.planner.changes
         sets, wavelengths = 1, None
         if mi.is_spectral:
@@ -258,7 +259,7 @@ class Render:
     def _guide(self) -> Guide | None:
         """What guides s = 0 in all passes, traced before the first; None if there are no photons."""
         if self._guides is None:
-            count = photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
+            count = photons.photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
             with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
                 guide, counts = photons.trace_guide(self.kernel, self.aim, self.points.of_guide(), count)
             self.meter.launched(counts)

@@ -100,16 +100,6 @@ def passes_since(passes: tuple[int, ...], done: int) -> int:
     return count
 
 
-# Photons' subpaths of a pass: one for so many of its samples, within these limits. More make merges no less
-# noisy in most scenes: the noise is that of the camera's subpaths.
-SAMPLES_PER_PHOTON, FEWEST_PHOTONS, MOST_PHOTONS = 4, 1 << 12, 1 << 18
-
-
-def photons_of(samples: int) -> int:
-    """Photons' subpaths of a pass of so many ``samples``."""
-    return min(max(samples // SAMPLES_PER_PHOTON, FEWEST_PHOTONS), MOST_PHOTONS)
-
-
 def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):
     """Cut a pass into bands of rows that one kernel launch can take."""
     limit = _most_samples(settings)

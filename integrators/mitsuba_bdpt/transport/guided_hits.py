@@ -43,9 +43,9 @@ class Advice:
     other: mi.Float
 
 
-def _numbers(stream: Stream, number: mi.UInt32) -> Stream:
-    """The random numbers of the guided subpath of this ``number`` at each vertex."""
-    seed = sobol.mix(stream.seed ^ (_SEED + number))
+def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
+    """The random numbers of the guided subpath of this ``number`` at the vertex of this ``event``."""
+    seed = sobol.mix(stream.seed ^ sobol.mix(_SEED + event) ^ number)
     return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED), {})
 
 
@@ -109,7 +109,7 @@ def _follow_all(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
         label="guided subpaths of a vertex",
         exclude=[kernel, z, stream, shared, add],
     ):
-        state = _follow_one(kernel, z, _numbers(stream, number), shared, add, state)
+        state = _follow_one(kernel, z, _numbers(stream, z.event, number), shared, add, state)
         number += 1
     return state
 

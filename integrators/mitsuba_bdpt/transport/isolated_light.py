@@ -69,7 +69,7 @@ def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) ->
     def measure(z):
         place = photon_guide.find(gauge.photons, z.si.p)
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
-        chosen, total, radius = _draw(gauge.photons, z, place, word)
+        chosen, total, radius = _draw(gauge.photons, z, place, word, kernel.max_depth - z.edges)
         active = total > 0
         y = photon_guide.photon(gauge.photons, place, chosen, active)
         f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(y.d), active, kernel.traits)
@@ -96,10 +96,10 @@ def _mean(colours: mi.Spectrum) -> mi.Float:
 
 
 @dr.syntax
-def _draw(photons: Guide, z: Vertex, place: mi.UInt32, word: mi.UInt32):
-    """One of the photons near ``z`` in proportion to its flux: its number in the window, their total, R.
+def _draw(photons: Guide, z: Vertex, place: mi.UInt32, word: mi.UInt32, most: mi.UInt32):
+    """One of the photons near ``z``, of ``most`` edges, in proportion to its flux, and those it stands for.
 
-    R is the geometric mean of the window's distances: half of the photons are nearer.
+    Its number in the window, their total, and R: the geometric mean of the window's distances.
     """
     k, logs = mi.UInt32(0), mi.Float(0)
     while dr.hint(k < len(WINDOW), label="distances of a window", exclude=[photons, z, place]):
@@ -110,11 +110,11 @@ def _draw(photons: Guide, z: Vertex, place: mi.UInt32, word: mi.UInt32):
 
     k = mi.UInt32(0)
     chosen, total = mi.UInt32(0), mi.Float(0)
-    while dr.hint(k < len(WINDOW), label="photons of a disc", exclude=[photons, z, place, radius]):
+    while dr.hint(k < len(WINDOW), label="photons of a disc", exclude=[photons, z, place, radius, most]):
         y = photon_guide.photon(photons, place, k, True)
         near = (dr.norm(y.p - z.si.p) <= radius) & (dr.dot(y.n, z.si.n) > _SAME_SIDE)
-        near &= photon_guide.exists(photons, place, k)
-        size = dr.select(near, size_of(y.flux), 0)
+        near &= photon_guide.exists(photons, place, k) & (y.edges <= most)
+        size = dr.select(near, size_of(y.flux) * dr.gather(mi.Float, photons.stands_for, k), 0)
         total += size
         u, word = sequential(word)
         chosen = dr.select(u * total < size, k, chosen)

@@ -11,6 +11,7 @@ whatever it is nothing is biased.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +20,10 @@ import mitsuba as mi
 _NEAR = 4
 _FAR = (6, 12, 25, 60)
 WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
+
+# How many places each stands for.
+_BETWEEN = [b - a for a, b in pairwise(WINDOW)]
+STANDS_FOR = tuple((a + b) / 2 for a, b in pairwise([_BETWEEN[0], *_BETWEEN, _BETWEEN[-1]]))
 
 # Bits of each coordinate of a place on the curve, and of the number of a subpath: 64 together.
 _BITS, _LANE_BITS = 15, 19
@@ -34,8 +39,9 @@ class GuidePhoton:
 
     ``slope``: by how much directions change over a distance; one over the length of its last edge, until a
     `Guide` knows better.
-    For `isolated_light` also ``n`` geometric normal, ``flux`` the throughput of its subpath, and ``hit`` the
-    partial sum of s = 0, in the area measure. ``lane`` of its subpath, which has no other photon.
+    For `isolated_light` also ``n`` geometric normal, ``flux`` the throughput of its subpath, ``hit`` the
+    partial sum of s = 0, in the area measure, and ``edges`` of its path. ``lane`` of its subpath, which has
+    no other photon.
     """
 
     p: mi.Point3f
@@ -44,6 +50,7 @@ class GuidePhoton:
     n: mi.Normal3f
     flux: mi.Spectrum
     hit: mi.Float
+    edges: mi.UInt32
     lane: mi.UInt32
 
     # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
@@ -51,7 +58,7 @@ class GuidePhoton:
     @staticmethod
     def zeros(count: int) -> GuidePhoton:
         """Room for so many."""
-        types = mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32
+        types = mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
         return GuidePhoton(*(dr.zeros(kind, count) for kind in types))
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> GuidePhoton:
@@ -65,7 +72,8 @@ class GuidePhoton:
 class Guide:
     """``photons`` in the order of their ``place`` on the curve, so many as ``count``; and its box.
 
-    ``low`` corner of the box, ``scale`` places over length; ``offsets`` see `WINDOW`.
+    ``low`` corner of the box, ``scale`` places over length; ``offsets`` see `WINDOW`, ``stands_for`` see
+    `STANDS_FOR`.
     """
 
     photons: GuidePhoton
@@ -74,6 +82,7 @@ class Guide:
     low: mi.Point3f
     scale: mi.Float
     offsets: mi.Int32
+    stands_for: mi.Float
 
     @staticmethod
     def of(photons: GuidePhoton, count: int) -> Guide:
@@ -93,6 +102,7 @@ class Guide:
             low,
             scale,
             mi.Int32(WINDOW),
+            mi.Float(STANDS_FOR),
         )
         guide.photons.slope = _slopes(guide)
         dr.make_opaque(guide)
@@ -180,7 +190,7 @@ def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Poi
     k = dr.minimum(mi.UInt32(u1 * len(WINDOW)), len(WINDOW) - 1)
     chosen = photon(guide, found, k, True)
     a = dr.square(_width(chosen, p)) / 2
-    m = dr.minimum(2 * u2.x * a / (a + 2 - 2 * u2.x), 2)  # 1 - cos of the angle
+    m = dr.minimum(2 * u2.x * a / (a + 2 * (1 - u2.x)), 2)  # 1 - cos of the angle
     sin, cos = dr.sincos(2 * dr.pi * u2.y)
     across = dr.sqrt(dr.maximum(m * (2 - m), 0))
     local = mi.Vector3f(across * cos, across * sin, 1 - m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -22,8 +23,25 @@ from .walk import may_merge, newest_coefficient, random_walk
 # Photons that memory is taken for at first, over the number of subpaths: few subpaths have more.
 _CAPACITY = 0.5
 
+# Photons' subpaths of a pass, or of a render's guide: one for so many of its samples, within these limits.
+# More make merges no less noisy in most scenes: the noise is that of the camera's subpaths.
+SAMPLES_PER_PHOTON, FEWEST_PHOTONS, MOST_PHOTONS = 4, 1 << 12, 1 << 18
+
+# So many of a pass at most for each disc of its radius that the film has room for: merges of more are slow.
+_PER_DISC = 64
+
 # Bits of a path's edges, and of the number of its subpath, in the key by which photons are sorted.
 _EDGES_BITS, _LANE_BITS = 12, 32
+
+
+def photons_of(samples: int) -> int:
+    """Photons' subpaths of a pass, or a render, of so many ``samples``."""
+    return min(max(samples // SAMPLES_PER_PHOTON, FEWEST_PHOTONS), MOST_PHOTONS)
+
+
+def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
+    """The same of a pass with merging on so many ``pixels``, in discs of this ``radius`` (pixels)."""
+    return max(min(photons_of(samples), int(_PER_DISC * pixels / (math.pi * radius**2))), _PER_DISC)
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
@@ -57,7 +75,7 @@ def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[G
         keep = y.hit & y.connectible() & ~joined & (y.edges < kernel.max_depth)
         keep &= y.partial.d_vc > 0
         slope = dr.rcp(dr.norm(y.si.p - y.previous))
-        return keep, GuidePhoton(y.si.p, -walk.d, slope, y.si.n, y.throughput, y.partial.d_vc, lanes)
+        return keep, GuidePhoton(y.si.p, -walk.d, slope, y.si.n, y.throughput, y.partial.d_vc, y.edges, lanes)
 
     photons, found, counters = _all(kernel, aim, count, GuidePhoton, photon)
     return Guide.of(photons, found) if found else None, counters
