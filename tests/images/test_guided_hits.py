@@ -220,8 +220,8 @@ def test_the_pilot_guides_where_it_pays():
     [
         ([9.0, 8.0, 7.0, 6.0], 0),
         ([9.0, 0.5, 0.4, 0.3], GUIDED[0]),
-        ([9.0, 4.0, 1.0, 0.9], GUIDED[1]),
-        ([9.0, 4.0, 2.0, 0.2], GUIDED[2]),
+        ([19.0, 4.0, 1.5, 1.4], GUIDED[1]),
+        ([19.0, 4.0, 2.5, 0.2], GUIDED[2]),
     ],
 )
 def test_how_many_samples(isolated, chosen):

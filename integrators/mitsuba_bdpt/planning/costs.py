@@ -21,8 +21,8 @@ COSTS = {
     # In a scene with media, a pair that is evaluated by the lane of a packet that has most of them: others
     # wait for it, and long subpaths differ. (Six scenes: 0.13 to 0.28.)
     "packets": 0.18,
-    "guide": 2.0,  # a vertex where s = 0 is guided
-    "aimed": 3.5,  # each guided sample of it
+    "guide": 3.0,  # a vertex where s = 0 is guided
+    "aimed": 7.0,  # each guided sample of it
     "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
 }
 
