@@ -36,8 +36,8 @@ LIGHT_GAIN = 1.15
 MORE_GAIN = 1.02
 
 # Guiding s = 0 by one sample has to gain this factor, outliers included. It gains by fewer outliers alone,
-# which many renders do not have. (In `ring_caustic` and `thin_lens` pilots say 2.4 and 2.0: by the mean raw error
-# of five renders guiding is 1.4 and 0.8 times as efficient, by the trimmed one 0.8 and 0.5 times.)
+# which many renders do not have. (In `ring_caustic` and `thin_lens` pilots say 2.4 and 2.0: by the mean raw
+# error of five renders guiding is 1.4 and 0.8 times as efficient, by the trimmed one 0.8 and 0.5 times.)
 GUIDE_GAIN = 3.0
 
 # A larger number of guided samples has to gain this factor over a smaller one: what guiding cannot help is in
