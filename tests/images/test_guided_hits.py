@@ -2,6 +2,9 @@
 
 import json
 import math
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -15,10 +18,23 @@ from mitsuba_bdpt.transport import photon_guide
 from mitsuba_bdpt.transport.photon_guide import Guide, GuidePhoton
 from mitsuba_bdpt.transport.plan import GUIDED
 from snapshots import ROUNDING
-from test_merging import CASES, ball, bumpy, glass, images, matte, mirror, point, transform, under_glass
+from test_merging import (
+    CASES,
+    CHANGES,
+    ball,
+    bumpy,
+    glass,
+    images,
+    matte,
+    mirror,
+    point,
+    transform,
+    under_glass,
+)
 
 import drjit as dr  # isort: skip
 
+SCENES = Path(__file__).parents[2] / "scenes"
 LENS = {"aperture_radius": 0.8}
 
 # Of a lamp that the plate does not mirror into the camera.
@@ -153,6 +169,48 @@ def test_parameters(parameters):
     scene = mi.load_dict(under_glass(ball()))
     a = images(scene, 128, 8, photon_guiding="always", **parameters)
     b = images(scene, 128, 8, first=100, photon_guiding="never")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+
+
+@cache
+def unchanged():
+    return images(under_glass(ball()), 128, 8, photon_guiding="never")
+
+
+@pytest.mark.parametrize("change", ["crop window", "border", "features", "instance"])
+def test_what_makes_no_difference(change):
+    """Expected: the same tiles as without guiding and the change (in the pixels that both have); the instance
+    is of the plate.
+    """
+    more = CHANGES[change]
+    changed = under_glass(ball())
+    changed["sensor"]["film"] |= more.get("film", {})
+    if change == "instance":
+        plate = changed.pop("plate")
+        changed["group"] = {"type": "shapegroup", "plate": plate}
+        changed["plates"] = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    a = images(changed, 128, 8, first=100, decisions=guided(4), **more.get("bdpt", {}))
+    b = unchanged()
+    if change == "crop window":
+        b = b[:, 6:10, 4:12]
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=2)
+
+
+@pytest.mark.parametrize("how", ["guided", "merging"])
+def test_glass_caustics_under_a_large_lamp(how):
+    """Rationale: a scene with two balls, whose lamp is made eight times as wide, so that s = 0 finds it.
+    Expected: the same tiles as without either; of merging in discs of a quarter of a pixel.
+    """
+    tree = ElementTree.parse(SCENES / "glass_caustics.xml")
+    lamp = next(s for s in tree.iter("shape") if s.find("emitter") is not None)
+    scale = lamp.find("transform/scale")
+    scale.set("value", str(8 * float(scale.get("value"))))
+    scene = mi.load_string(ElementTree.tostring(tree.getroot(), "unicode"), resolution=32)
+    parameters = {"guided": {"decisions": guided(4)}, "merging": {"merging": True, "merging_radius": 0.25}}[
+        how
+    ]
+    a = images(scene, 64, 8, max_depth=8, **parameters)
+    b = images(scene, 64, 8, first=100, max_depth=8, photon_guiding="never")
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
