@@ -51,7 +51,7 @@ def test_parts_cover_the_samples_with_seeds_of_their_own():
 
 
 @pytest.mark.parametrize(
-    "name, merges", [("cornell_box", False), ("fog_lamp", False), ("smallvcm_cornell_lamp", True)]
+    "name, merges", [("cornell_box", False), ("fog_lamp", False), ("smallvcm_cornell_point", True)]
 )
 def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, merges):
     """Expected: the image is that of the same parts rendered here one after the other and joined, also with
