@@ -248,7 +248,7 @@ class Aim:
     def __init__(self, job: Job, scene, by: str):
         self.name, self.depth, spp = job.scene.name, job.depth, job.spp
         ours = {"type": "bdpt", "merging": by == "merging"}
-        rivals = [(ours, spp)] + [(_way(job.scene, Recipe(by)), TWICE * spp)] * (by == "path")
+        rivals = [(ours, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
         self.images = []
         for parameters, samples in rivals:
             rival = integrator_of(parameters, job.depth)
@@ -275,11 +275,14 @@ class Aim:
         )
 
 
-def _way(scene: SceneFile, recipe: Recipe) -> dict:
-    """Parameters of what makes the reference of a scene; `path` of scenes with media is `volpath`."""
-    if recipe.by == "path":
+def _way(scene: SceneFile, by: str, merging_radius: float = MERGING_RADIUS) -> dict:
+    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`.
+
+    ``merging_radius``: that of "merging", in pixels.
+    """
+    if by == "path":
         return {"type": path_tracers(scene.has_media)[0]}
-    return WAYS[recipe.by] | ({"merging_radius": recipe.merging_radius} if recipe.by == "merging" else {})
+    return WAYS[by] | ({"merging_radius": merging_radius} if by == "merging" else {})
 
 
 def _same(stored: Reference, **wanted) -> bool:
@@ -310,14 +313,14 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     """As `_known`, by an integrator; False if the time was over first."""
-    recipe = replace(recipe, by=job.by or recipe.by)
-    parameters = _way(job.scene, recipe) | {"max_depth": job.depth}
+    by = job.by or recipe.by
+    parameters = _way(job.scene, by, recipe.merging_radius) | {"max_depth": job.depth}
     integrator = mi.load_dict(parameters)
     sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
     scene = job.scene.load(job.resolution, sampler)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(job, scene, recipe.by)
+    aim = Aim(job, scene, by)
     windows = [Window(job, share, sampler) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=sampler):
