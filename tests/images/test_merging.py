@@ -144,7 +144,7 @@ def test_floor_under_glass(light):
         assert not images(scene, 4, 1).any()
 
 
-def test_blur_goes_as_the_square_of_the_radius():
+def test_blur_goes_as_the_square_of_the_radius(monkeypatch):
     """Rationale: the blur is that of a disc, and vanishes with it. The lamp is near to the plate, so that the
     floor's irradiance is strongly curved.
 
@@ -152,6 +152,7 @@ def test_blur_goes_as_the_square_of_the_radius():
     (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4, with a standard error of 0.5; between 3 and 7 (of the radius
     itself it would be 2.5, of its cube 8.3).
     """
+    monkeypatch.setattr(photons, "_PER_DISC", 1 << 18)
     scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
         images(scene, 128, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
@@ -350,7 +351,8 @@ def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
     0.02 for the perspective, in which edges look smaller than the middle; standard errors of the ball: 0.03.
     """
     monkeypatch.setattr(rendering, "coefficient", lambda *_: 1.0)
-    monkeypatch.setattr("mitsuba_bdpt.transport.photons.FEWEST_PHOTONS", 1 << 18)
+    monkeypatch.setattr(photons, "FEWEST_PHOTONS", 1 << 18)
+    monkeypatch.setattr(photons, "_PER_DISC", 1 << 18)
     scene, expected = small(shape)
     pixel = Footprints.of(scene, scene.sensors()[0]).angle * np.linalg.norm(CAMERA)
     found = images(scene, 16, 8, merging=True, merging_radius=radius / pixel).mean()
@@ -503,6 +505,15 @@ def test_which_photons_are_near():
     z = SimpleNamespace(si=SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1)))
     found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
     assert found == [True, True, False, True, False, True, False]
+
+
+def test_discs_hold_few_photons():
+    """Rationale: merges of very many photons are slow. Expected: a pass has one photon's subpath for four of its
+    samples, and no more than 64 for each disc that its film has room for.
+    """
+    assert photons.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 18
+    assert photons.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
+    assert photons.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
 
 
 def test_no_photon_is_dropped(monkeypatch):

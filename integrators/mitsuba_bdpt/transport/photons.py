@@ -41,7 +41,7 @@ def photons_of(samples: int) -> int:
 
 def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
     """The same of a pass with merging on so many ``pixels``, in discs of this ``radius`` (pixels)."""
-    return max(min(photons_of(samples), int(_PER_DISC * pixels / (math.pi * radius**2))), _PER_DISC)
+    return min(photons_of(samples), max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64))
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
