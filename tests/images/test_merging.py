@@ -508,7 +508,7 @@ def test_which_photons_are_near():
 
 
 def test_discs_hold_few_photons():
-    """Rationale: merges of very many photons are slow. Expected: a pass has one photon's subpath for four of its
+    """Rationale: merges of very many photons are slow. Expected: one photon's subpath for four of a pass's
     samples, and no more than 64 for each disc that its film has room for.
     """
     assert photons.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 18
