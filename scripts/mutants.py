@@ -830,8 +830,8 @@ MUTANTS = (
     Mutant(
         "merging: t = 0 takes photons for not aimed",
         "transport/techniques.py",
-        "h.scale(h.scale(partial.d_vm, z.pdf_w * z.pdf_a), aimed)",
-        "h.scale(h.scale(partial.d_vm, z.pdf_w * z.pdf_a), 1)",
+        "merges = h.scale(merges, kernel.merging.aim.density(emission) / emission.pdf_second)",
+        "pass",
         ("tests/images/test_merging.py::test_a_lens_where_photons_are_aimed",),
     ),
     Mutant(
