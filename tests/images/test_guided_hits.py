@@ -295,7 +295,7 @@ def test_how_many_samples(isolated, chosen):
     possible = [Configuration.weighted(w, 1, "none") for w in WEIGHTINGS if w.light and not w.inner]
     table = choice.choose(moments, Alternatives(possible, True, guidable=True))
     assert table[0].candidate.guided == chosen
-    gain = choice.guided_gain(moments, Alternatives(possible, True, guidable=True))
+    gain = choice.guided_gain(moments, Alternatives(possible, True, guidable=True), table)
     skipped = choice.left_out(table, gain)
     assert bool(skipped) == (not chosen) and all("gains" in row["why"] for row in skipped)
     assert not choice.choose(moments, Alternatives(possible, True))[0].candidate.guided

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 # Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
 # deviation (24 seeds) is 0.06 for a block of glass that fills the view, and 0.07, 0.18, 0.28 and 0.31 in the
-# six scenes of scenes/ with such light: enough to tell what is `WORTH_A_WORD`, not for a number to rely on.
-# A look takes 60 to 90 ms on two busy cores, 0.3 to 0.4 s where its kernels have to be compiled.
+# first four scenes with such light: enough to tell what is `WORTH_A_WORD`, not for a number to rely
+# on. A look takes 60 to 90 ms on two busy cores, 0.3 to 0.4 s where its kernels have to be compiled.
 SUBPATHS, COMPARED = 1 << 13, 1 << 11
 
 # Edges after which a subpath of delta events ends: through twelve panes, or reflected as often within glass.

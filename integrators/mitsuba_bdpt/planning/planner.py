@@ -113,7 +113,7 @@ class Planner:
         if not moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
             table = []
         if table:
-            gain = choice.guided_gain(moments, alternatives)
+            gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
             self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table, gain, name))
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)

@@ -30,6 +30,7 @@ from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
 from . import bsdf, mis
 from .aim import Aim
+from .columns import Columns
 from .contribution import Contribution, size_of
 from .inputs import Kernel
 from .merge_radius import Radius
@@ -82,7 +83,7 @@ def coefficient(samples: float, radius: float) -> float:
 
 
 @dataclass
-class Photon:
+class Photon(Columns):
     """A light vertex that may be merged.
 
     ``p`` position, ``d`` unit direction towards the light's side, ``n`` geometric normal, ``flux`` the
@@ -100,17 +101,9 @@ class Photon:
     edges: mi.UInt32
     lane: mi.UInt32
 
-    # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
-
     @staticmethod
-    def zeros(count: int) -> Photon:
-        """Room for so many."""
-        types = mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.Float, mi.UInt32, mi.UInt32
-        return Photon(*(dr.zeros(kind, count) for kind in types))
-
-    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
-        """Those of these numbers."""
-        return Photon(*(dr.gather(type(column), column, index, active) for column in vars(self).values()))
+    def types():
+        return mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.Float, mi.UInt32, mi.UInt32
 
 
 @dataclass

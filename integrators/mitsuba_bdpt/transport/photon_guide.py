@@ -16,6 +16,8 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 
+from .columns import Columns
+
 # Places of the photons of a window, from that of the point on.
 _NEAR = 4
 _FAR = (6, 12, 25, 60)
@@ -34,7 +36,7 @@ _WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
 
 
 @dataclass
-class GuidePhoton:
+class GuidePhoton(Columns):
     """A photon: ``p`` position, ``d`` unit direction towards the light's side.
 
     ``slope``: by how much directions change over a distance; one over the length of its last edge, until a
@@ -53,19 +55,9 @@ class GuidePhoton:
     edges: mi.UInt32
     lane: mi.UInt32
 
-    # By hand: Dr.Jit takes the types of fields for those of the first variant that asked.
-
     @staticmethod
-    def zeros(count: int) -> GuidePhoton:
-        """Room for so many."""
-        types = mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
-        return GuidePhoton(*(dr.zeros(kind, count) for kind in types))
-
-    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> GuidePhoton:
-        """Those of these numbers."""
-        return GuidePhoton(
-            *(dr.gather(type(column), column, index, active) for column in vars(self).values())
-        )
+    def types():
+        return mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
 
 
 @dataclass

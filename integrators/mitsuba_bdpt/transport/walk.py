@@ -374,7 +374,8 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     if side.adjoint:
         first = where_lit(kernel, first, is_lit(kernel, vertex))
     coefficient = newest_coefficient(kernel, first, walk.edges)
-    merge = _merge(kernel, walk, vertex, coefficient, step)
+    isolated, only_delta = _isolated(walk, vertex, coefficient, step), None
+    merge = _merge(kernel, walk, vertex, isolated)
     partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
 
     throughput = vertex.throughput * step.weight
@@ -383,7 +384,6 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
-    isolated, only_delta = _isolated(walk, vertex, coefficient, step), None
     if side.isolated and isolated is not None:
         active &= isolated
     if side.only_delta:
@@ -421,21 +421,20 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     return _traced(kernel, after, ray, passes)
 
 
-def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
-    """The `mis.Merge` at ``vertex``; ``coefficient`` of the class that joins the edge to it.
+def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, isolated):
+    """The `mis.Merge` at ``vertex``; ``isolated``: `Walk.isolated` after its event.
 
     Where s = 0 is guided, on light subpaths what stands for it: the density of the direction they came from.
     """
     if mis.is_absent(walk.partial.d_vm):
         return None
-    isolated = _isolated(walk, vertex, coefficient, step)
     if kernel.merging is not None:
         return mis.Merge(kernel.heuristic.start(kernel.merging.weighed(vertex.si.p)), isolated)
     return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other), isolated)
 
 
 def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
-    """`Walk.isolated` after the event at ``vertex``; ``coefficient`` as of `_merge`."""
+    """`Walk.isolated` after the event at ``vertex``; ``coefficient`` of what joins the edge to it."""
     if walk.isolated is None:
         return None
     return walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
