@@ -24,6 +24,7 @@ HEURISTICS = ("balance", "power", "maximum", "uniform")
 SKIP = ("auto", "impossible", "none")
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
 GUIDING = ("auto", "always", "never")
+EMISSION_GUIDING = ("auto", "never")
 CONNECTIONS = ("auto", "all", "one", "none")
 POINTS = ("sobol", "sampler", "independent")
 
@@ -150,6 +151,13 @@ class Settings:
         camera), which are fireflies otherwise; unbiased. ``auto``: where the pilot finds that it pays.
         ``always``: wherever it is possible. ``never``.""",
         choices=GUIDING,
+    )
+    emission_guiding: str = _parameter(
+        "auto",
+        "when emission is guided",
+        """Guide the emission of light subpaths to where they matter, unbiased: by tables that the pilot learns
+        from its own samples. ``auto``: where it finds that it pays. ``never``.""",
+        choices=EMISSION_GUIDING,
     )
     decisions: tuple[Any, ...] | None = _converted(
         "",

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UnsupportedError, UsageError
+from ..geometry.flat import is_flat
 from ..geometry.mitsubas_choices import (
     TEXTURE_SAMPLED,
     check_densities,
@@ -17,11 +18,12 @@ from ..geometry.mitsubas_choices import (
 )
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
 from ..host.introspection import children, named, number, own_parameters
+from .emission_tables import EmissionGuide, Place
 from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
 from .surfaces import CURVES, Surfaces, refuse_curves, spheres_of
-from .tables import Mask, look_up, table
+from .tables import Mask, look_up, rows, table
 
 _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
 
@@ -51,6 +53,32 @@ class _Sphere:
         )
 
 
+@dataclass
+class _Table:
+    """What the table of an area light's emission means.
+
+    Of a flat one (``flat`` 1) directions about its normal in the frame ``s``, ``t``, ``n``, which must not
+    depend on who asks: a frame made of a normal is mirrored by the sign of a zero. Of others directions in
+    the world.
+    """
+
+    s: mi.Vector3f | tuple = (1, 0, 0)
+    t: mi.Vector3f | tuple = (0, 1, 0)
+    n: mi.Vector3f | tuple = (0, 0, 1)
+    flat: mi.Float | float = 0.0
+
+    @staticmethod
+    def of(emitter) -> _Table:
+        shape = emitter.get_shape()
+        if not is_flat(shape):
+            return _Table()
+        frame = mi.Frame3f(mi.Vector3f(shape.sample_position(0, mi.Point2f(0.5)).n))
+        return _Table(*(dr.slice(axis) for axis in (frame.s, frame.t, frame.n)), flat=1.0)
+
+    def frame(self) -> mi.Frame3f:
+        return mi.Frame3f(self.s, self.t, self.n)
+
+
 class AreaEmitters(Group):
     """Area lights.
 
@@ -59,13 +87,18 @@ class AreaEmitters(Group):
     for textured lights that are sampled by shape and for spheres.
     """
 
-    hittable = True
+    hittable = guidable = True
 
     @classmethod
     def of(cls, emitter) -> type[Group]:
         return cls if _tells_its_points(emitter) else HitOnlyEmitters
 
+    @classmethod
+    def tables(cls, emitter) -> int:
+        return 1
+
     def __init__(self, emitters, context: Context):
+        self._emitters = emitters
         spheres = spheres_of(emitters)
         pairs = list(zip(emitters, spheres, strict=True))
         by_texture = [e and not context.ask_shapes and is_sampled_by_texture(e, s) for e, s in pairs]
@@ -147,17 +180,65 @@ class AreaEmitters(Group):
         """`Surfaces.upright`."""
         return self._surfaces.upright(ps, index, active)
 
+    # -- directions of emission -------------------------------------------------------------
+
+    def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
+        other = super().placed(guide, whole)
+        other._tables = table(rows(self._emitters, _Table(), _Table.of))
+        return other
+
+    def place(self, index, p, d, active) -> Place:
+        known = look_up(self._tables, index, active)
+        flat = mi.warp.cosine_hemisphere_to_square(known.frame().to_local(d))
+        return Place(mi.UInt32(0), dr.select(known.flat > 0, flat, mi.warp.uniform_sphere_to_square(d)))
+
+    def _direction_pdf_w(self, index, cos, d, active):
+        """Density of the direction ``d`` of emission, of the cosine ``cos`` with the shading normal."""
+        own = dr.maximum(cos, 0) * dr.inv_pi
+        if self.guide is None:
+            return own
+        flat, least = look_up(self._tables, index, active).flat > 0, self._least(index, active)
+        # Curved lamps: directions in the world, turned to the side of the normal.
+        density = self.guide.density(index, self.place(index, None, d, active), active)
+        turned = self.guide.density(index, self.place(index, None, -d, active), active & ~flat)
+        curved = least * own + (1 - least) * dr.select(cos > 0, (density + turned) * dr.inv_four_pi, 0)
+        return dr.select(flat, own * density, curved)
+
+    def _least(self, index, active):
+        """The share of directions of a curved lamp that are not by its table, 1 of one without."""
+        return dr.select(self.guide.is_guided(index, active), self.guide.least, 1)
+
+    def _sample_direction(self, index, si, u, active):
+        """A direction of emission (world) and its density; the emitting point is ``si``."""
+        if self.guide is None:
+            local = mi.warp.square_to_cosine_hemisphere(u)
+            return si.to_world(local), local, mi.warp.square_to_cosine_hemisphere_pdf(local)
+        known = look_up(self._tables, index, active)
+        flat, least = known.flat > 0, self._least(index, active)
+        by_table = u.x >= least
+        x = dr.select(by_table, (u.x - least) / (1 - least), u.x / least)
+        warped, density = self.guide.warp(
+            index, mi.UInt32(0), mi.Point2f(dr.select(flat, u.x, x), u.y), active
+        )
+        local = mi.warp.square_to_cosine_hemisphere(warped)
+        of_flat = known.frame().to_world(local)
+        of_table = mi.warp.square_to_uniform_sphere(warped)
+        of_table = dr.mulsign(of_table, dr.dot(si.sh_frame.n, of_table))
+        own = si.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, u.y)))
+        d = dr.select(flat, of_flat, dr.select(by_table, of_table, own))
+        of_flat_pdf = mi.warp.square_to_cosine_hemisphere_pdf(local) * density
+        pdf_w = self._direction_pdf_w(index, dr.dot(si.sh_frame.n, d), d, active)
+        return d, si.to_local(d), dr.select(flat, of_flat_pdf, pdf_w)
+
     # -- emission ---------------------------------------------------------------------------
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
         ps, n = self._surfaces.sample(chosen, u_point, shared, active)
-        local = mi.warp.square_to_cosine_hemisphere(u_direction)
         si = mi.SurfaceInteraction3f(ps, shared.wavelengths)
         si.t = mi.Float(0)
         si.shape = chosen.emitter.get_shape()
-        si.wi = local
-        d = si.to_world(local)
-        pdf_a, pdf_w = ps.pdf, mi.warp.square_to_cosine_hemisphere_pdf(local)
+        d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)
+        pdf_a = ps.pdf
         cos = dr.abs(dr.dot(n, d))
         radiance = chosen.emitter.eval(si, active)
         return Emission(
@@ -176,7 +257,7 @@ class AreaEmitters(Group):
         )
 
     def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
-        return dr.maximum(dr.dot(emission.si.sh_frame.n, d), 0) * dr.inv_pi
+        return self._direction_pdf_w(chosen.index, dr.dot(emission.si.sh_frame.n, d), d, active)
 
     def connection_density(self, chosen: Chosen, emission: Emission, si, active):
         # Area measure times the squared distance: the solid-angle density at the hit times the geometric
@@ -205,7 +286,8 @@ class AreaEmitters(Group):
             to_geometric = dr.select(cos != dr.abs(cos_shading), dr.abs(cos_shading) / cos, 1)
         pdf_w = shading_pdf_w * to_geometric * pmf
         pdf_a = self.pdf_a(chosen.emitter, chosen.index, ds, n, active)
-        emitted = pmf * pdf_a * dr.maximum(cos_shading, 0) * dr.inv_pi
+        direction = self._direction_pdf_w(chosen.index, cos_shading, -ds.d, active)
+        emitted = pmf * pdf_a * direction
         return Direct(
             weight=weight_over(to_geometric * pmf, weight, shading_pdf_w),
             pdf_w=pdf_w,
@@ -243,7 +325,7 @@ class AreaEmitters(Group):
         ds.n = mi.Normal3f(si.n)
         pdf_w = chosen.pmf * self.direct_pdf_w(chosen.emitter, chosen.index, hit.previous, ds, active)
         pdf_a = self.pdf_a(chosen.emitter, chosen.index, si, si.n, active)
-        direction = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0) * dr.inv_pi
+        direction = self._direction_pdf_w(chosen.index, mi.Frame3f.cos_theta(si.wi), -ds.d, active)
         return pdf_w * hit.to_area(ds), chosen.pmf * pdf_a, direction
 
 

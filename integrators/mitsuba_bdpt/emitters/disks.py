@@ -2,11 +2,13 @@
 
 One disk covers the scene. On a large ground few of its subpaths meet what matters, so where the scene has
 details, shapes that are small beside it and lie together, a part of the subpaths starts on a disk that covers
-these. The density is that of the mixture, wherever a strategy asks for it.
+these. The density is that of the mixture, wherever a strategy asks for it. Where emission is guided (see
+`emission_tables`), tables do the same for details that are not smaller than their cells.
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -77,34 +79,59 @@ class Disks:
         found = details(each, box) if box.valid() else None
         self.details = BoundingSphere.about(found) if found is not None else None
 
-    def start(self, d, u):
-        """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
-        center, radius, aimed = self.scene.center, self.scene.radius, None
+    def guided(self, side: int) -> Disks:
+        """These for emission that tables of ``side`` x ``side`` cells guide."""
+        other = copy(self)
+        if self.details is not None and dr.slice(self.details.radius) * side >= dr.slice(self.scene.radius):
+            other.details = None
+        return other
+
+    def start(self, d, u, warp=None):
+        """A point from which a subpath along ``d`` starts, and its density (area across ``d``).
+
+        ``warp`` gives numbers that a guide distributes for uniform ones, and their density, on the scene's
+        disk.
+        """
+        center, radius, aimed, guided = self.scene.center, self.scene.radius, None, 1
         if self.details is not None:
             aimed = u.x < AIMED
             u = mi.Point2f(dr.select(aimed, u.x / AIMED, (u.x - AIMED) / (1 - AIMED)), u.y)
             along = dr.dot(self.details.center - center, d)
             center = dr.select(aimed, self.details.center - along * d, center)
             radius = dr.select(aimed, self.details.radius, radius)
-        disk = mi.warp.square_to_uniform_disk_concentric(u)
         frame = mi.Frame3f(d)
+        if warp is not None:
+            frame = _frame(d)
+            warped, guided = warp(u)
+            u = warped if aimed is None else dr.select(aimed, u, warped)
+        disk = mi.warp.square_to_uniform_disk_concentric(u)
         p = center + radius * (frame.s * disk.x + frame.t * disk.y) - self.scene.radius * d
-        return p, self._pdf_a(p, d, aimed)
+        return p, self._pdf_a(p, d, aimed, guided)
 
-    def pdf_a(self, p, d):
+    def place(self, p, d):
+        """The numbers for which a subpath along ``d`` that passes ``p`` starts on the scene's disk."""
+        frame, offset = _frame(d), (p - self.scene.center) / self.scene.radius
+        disk = mi.Point2f(dr.dot(frame.s, offset), dr.dot(frame.t, offset))
+        return mi.warp.uniform_disk_to_square_concentric(disk)
+
+    def pdf_a(self, p, d, guided=1):
         """Density with which a subpath along ``d`` passes ``p`` (area across ``d``).
 
-        Without details ``p`` is taken to be a point of the scene, else it may be anywhere.
+        Without details ``p`` is taken to be a point of the scene, else it may be anywhere. ``guided``: how
+        many times as dense as uniform points are there on the scene's disk.
         """
-        return self._pdf_a(p, d, None)
+        return self._pdf_a(p, d, None, guided)
 
-    def _pdf_a(self, p, d, aimed):
+    def _pdf_a(self, p, d, aimed, guided):
+        scene = self.scene.pdf_a()
+        if not isinstance(guided, int):
+            scene = scene * guided
         if self.details is None:
-            return self.scene.pdf_a()
+            return scene
         in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
         if aimed is not None:  # on the rim of its disk a point may be outside by rounding
             in_scene, in_details = in_scene | ~aimed, in_details | aimed
-        return dr.select(in_scene, (1 - AIMED) * self.scene.pdf_a(), 0) + dr.select(
+        return dr.select(in_scene, (1 - AIMED) * scene, 0) + dr.select(
             in_details, AIMED * self.details.pdf_a(), 0
         )
 
@@ -117,6 +144,18 @@ class Disks:
         if self.details is not None:
             passed |= self.details.is_passed(p, d)
         return passed & (dr.dot(p - self.scene.center, d) >= -self.scene.radius)
+
+
+# An odd rotation: frames are mirrored where directions have z = 0 in its axes, which those of users have not.
+_ODD = np.linalg.qr(np.array([[0.61, -0.34, 0.29], [0.17, 0.83, -0.41], [-0.53, 0.26, 0.71]]))[0].tolist()
+
+
+def _frame(d) -> mi.Frame3f:
+    """A frame about ``d`` that does not depend on rounding for directions along axes."""
+    x, y, z = (mi.Vector3f(*axis) for axis in _ODD)
+    turned = mi.Frame3f(mi.Vector3f(dr.dot(x, d), dr.dot(y, d), dr.dot(z, d)))
+    s, t = (v.x * x + v.y * y + v.z * z for v in (turned.s, turned.t))
+    return mi.Frame3f(s, t, d)
 
 
 def boxes(scene) -> list:

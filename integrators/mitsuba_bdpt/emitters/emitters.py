@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UsageError
 from ..geometry import rounding
 from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
+from .emission_tables import EmissionGuide, EmissionTables, cell_at, side_of
 from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party, needs_evaluation
@@ -39,6 +42,8 @@ class Emitters:
     another scene, makes it necessary to record kernels without symbolic loops, calls and branches.
     ``left_out``: what single ones cannot take part in, and why. ``groups`` that the scene has; ``disks``
     where light subpaths from infinity start, if any do; ``shape_errors`` of the scene, for rays.
+    ``table_count``: tables that guide emission (`emission_tables`), ``side`` of those that know the `cell` of
+    an emission (else 0).
     """
 
     def __init__(self, scene: mi.Scene):
@@ -48,7 +53,7 @@ class Emitters:
         types = [group_of(emitter) for emitter in emitters]
         weights = [number(emitter.sampling_weight()) for emitter in emitters]
         self._summarize(emitters, types, weights)
-        self.groups, self.disks = (), None
+        self.groups, self.disks, self.side, self.first = (), None, 0, None
         if not emitters:
             return
         make_parameters_opaque([*emitters, *filter(None, (e.get_shape() for e in emitters))])
@@ -62,6 +67,7 @@ class Emitters:
             group([e if t is group else None for e, t in zip(emitters, types, strict=True)], context)
             for group in present
         )
+        self._of_groups = [[i for i, t in enumerate(types) if t is group] for group in present]
         self._group = mi.UInt32([present.index(t) for t in types])
         self._starts = Mask([t.supports_emission for t in types])
         self._lights = Mask([t.supports_next_event for t in types])
@@ -87,6 +93,7 @@ class Emitters:
         far = sum(w for w, t in of_groups if t.at_infinity)
         self.far_share = far / sum(w for w, t in of_groups if t.supports_emission) if far > 0 else 0.0
         self.evaluated = any(needs_evaluation(name) for name in registered_emitters())
+        self.tables = [t.tables(e) for e, t in zip(emitters, types, strict=True)]
         self.left_out: list[tuple[str, str]] = [
             text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)
         ]
@@ -108,6 +115,54 @@ class Emitters:
     def contrast(self) -> float:
         """The largest `infinite.contrast`: infinite unless all light comes from environments."""
         return max((contrast(emitter) for emitter in self.scene.emitters()), default=math.inf)
+
+    # -- guided emission --------------------------------------------------------------------
+
+    @property
+    def table_count(self) -> int:
+        """How many tables guide the emission of all emitters."""
+        return sum(self.tables)
+
+    def placed(self, tables: EmissionTables | None = None) -> Emitters:
+        """A copy that knows the `cell` of an emission, and is guided by ``tables`` if there are some.
+
+        Raises ``UsageError`` for tables of other emitters.
+        """
+        other = copy(self)
+        other.side = side_of(self.table_count) if tables is None else tables.side
+        densities = None if tables is None else tables.densities()
+        if densities is not None and len(densities) != self.table_count:
+            raise UsageError(
+                f"decisions: emission has {len(densities)} tables, but the scene's emitters need "
+                f"{self.table_count}; use what a render of this scene has recorded"
+            )
+        first = []
+        for index, own in enumerate(self.tables):
+            before = sum(self.tables[:index])
+            used = own > 0 and (densities is None or bool((densities[before : before + own] != 1).any()))
+            first.append(1 + before if used else 0)
+        other.first = mi.UInt32(first)
+        dr.make_opaque(other.first)
+        guide = None if tables is None else EmissionGuide(tables, other.first)
+        guided = [[guide is not None and first[i] > 0 for i in own] for own in self._of_groups]
+        other.groups = tuple(
+            group.placed(guide if any(own) else None, all(own))
+            for group, own in zip(self.groups, guided, strict=True)
+        )
+        other.disks = next((group.disks for group in other.groups if group.at_infinity), None)
+        return other
+
+    def cell(self, index: mi.UInt32, p, d, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """Number of the cell in which emissions of the emitters ``index`` lie that pass ``p`` along ``d``.
+
+        Among those of all tables, and whether their emitter has any. Asked of copies that `placed` has made.
+        """
+        first = dr.gather(mi.UInt32, self.first, index, active)
+        place = self._ask(
+            lambda group, mask: group.place(index, p, d, mask), self._supporting("guidable"), index, active
+        )
+        table = dr.select(first > 0, first - 1 + place.bin, 0)
+        return table * self.side**2 + cell_at(place.u, self.side), first > 0
 
     # -- selection and dispatch -------------------------------------------------------------
 
@@ -240,6 +295,7 @@ class Emitters:
         )
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
+        direct.index = chosen.index
         if self.shape_errors.small:
             direct.met = rounding.met(chosen.emitter.get_shape())
         return direct
@@ -251,6 +307,16 @@ class Emitters:
         emitter = si.emitter(self.scene)
         return emitter.eval(si, active)
 
+    def _index_of(self, emitter, active):
+        return dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)
+
+    def hit_cell(self, si, previous, active) -> tuple[mi.UInt32, mi.Bool]:
+        """`cell` of the emitter point that was hit, see `hit_densities`."""
+        emitter = si.emitter(self.scene)
+        active = active & (emitter != dr.zeros(mi.EmitterPtr))
+        d = dr.select(si.is_valid(), dr.normalize(previous - si.p), mi.Vector3f(si.wi))
+        return self.cell(self._index_of(emitter, active), previous, d, active)
+
     def hit_densities(self, si, previous, active):
         """Densities with which light-side strategies make the hit emitter point.
 
@@ -261,7 +327,7 @@ class Emitters:
         """
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))
-        index = dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)
+        index = self._index_of(emitter, active)
         chosen = self._chosen(index, active)
         chosen.emitter = emitter
         before = dr.zeros(mi.Interaction3f)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import drjit as dr
@@ -9,6 +10,7 @@ import mitsuba as mi
 
 from ..geometry import rays, rounding
 from ..host.introspection import named
+from .emission_tables import EmissionGuide, Place
 from .records import Chosen, Direct, Emission, Hit
 
 
@@ -33,6 +35,7 @@ class Group:
     `is_hittable` does not say otherwise); ``supports_next_event``, next-event estimation can choose it;
     ``supports_emission``, light subpaths can start from it; ``connectible_to_sensor``, a point that emission
     has chosen can be joined with a sensor; ``at_infinity``, its light subpaths start there, on its ``disks``.
+    ``guidable``, tables can guide its emission, by a ``guide`` where one does.
     ``limits`` says why it does not support all. Methods of what a group does not support are never called.
     Lanes that are not ``active`` are of other groups: what is returned for them has no meaning.
     """
@@ -42,7 +45,9 @@ class Group:
     supports_emission = True
     connectible_to_sensor = True
     at_infinity = False
+    guidable = False
     limits = ""
+    guide: EmissionGuide | None = None
 
     @classmethod
     def of(cls, emitter) -> type[Group]:
@@ -63,6 +68,27 @@ class Group:
         """What this one cannot take part in, and why."""
         names = ["s=1"] * (not cls.supports_next_event) + ["light subpaths"] * (not cls.supports_emission)
         return [(f"{name} of emitter {named(emitter)}", cls.limits) for name in names]
+
+    @classmethod
+    def tables(cls, emitter) -> int:
+        """How many tables guide the emission of this one, see `emission_tables`."""
+        return 0
+
+    def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
+        """A copy that knows the `place` of an emission, guided by ``guide`` (None: by none).
+
+        ``whole``: it guides all emitters of the group.
+        """
+        other = copy(self)
+        other.guide = guide
+        return other
+
+    def place(self, index: mi.UInt32, p, d, active) -> Place:
+        """Where in their tables emissions of the emitters ``index`` lie that pass ``p`` along ``d``.
+
+        Asked of copies that `placed` has made.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no place")
 
     # -- emission ---------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from ..geometry import rays
 from ..geometry.to_world import check_rotation
 from ..host.introspection import own_parameters
 from .disks import Disks
+from .emission_tables import SKY_BINS, EmissionGuide, Place, cell_at
 from .group import Context, Group, emitting_point, free_emission, weight_over
 from .records import Chosen, Direct, Emission, Hit
 from .tables import Mask, rows
@@ -28,7 +29,7 @@ class InfiniteEmitters(Group):
     same, whatever the lit vertex. ``disks``: where light subpaths start.
     """
 
-    hittable = at_infinity = True
+    hittable = at_infinity = guidable = True
 
     @classmethod
     def of(cls, emitter) -> type[Group]:
@@ -40,9 +41,42 @@ class InfiniteEmitters(Group):
     def is_hittable(cls, emitter) -> bool:
         return not _is_directional(emitter)
 
+    @classmethod
+    def tables(cls, emitter) -> int:
+        return 1 if _is_directional(emitter) else SKY_BINS**2
+
     def __init__(self, emitters, context: Context):
         self.disks = Disks(context.scene)
         self._directional = Mask(rows(emitters, None, _is_directional))
+
+    # -- points of emission -----------------------------------------------------------------
+
+    def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
+        other = super().placed(guide, whole)
+        if whole:
+            other.disks = self.disks.guided(guide.side)
+        return other
+
+    def _bin(self, index, d, active):
+        """In which table of an emitter light along ``d`` is."""
+        directional = self._directional.at(index, active)
+        return dr.select(directional, 0, cell_at(mi.warp.uniform_sphere_to_square(d), SKY_BINS))
+
+    def place(self, index, p, d, active) -> Place:
+        return Place(self._bin(index, d, active), self.disks.place(p, d))
+
+    def _point_pdf_a(self, index, p, d, active):
+        """Density with which a subpath along ``d`` passes ``p`` (area across ``d``)."""
+        if self.guide is None:
+            return self.disks.pdf_a(p, d)
+        return self.disks.pdf_a(p, d, self.guide.density(index, self.place(index, p, d, active), active))
+
+    def _sample_point(self, index, d, u, active):
+        """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
+        if self.guide is None:
+            return self.disks.start(d, u)
+        which = self._bin(index, d, active)
+        return self.disks.start(d, u, lambda u: self.guide.warp(index, which, u, active))
 
     # -- emission ---------------------------------------------------------------------------
 
@@ -52,7 +86,7 @@ class InfiniteEmitters(Group):
         ds, weight = chosen.emitter.sample_direction(it, u_direction, active)
         directional = self._directional.at(chosen.index, active)
         d = -ds.d
-        p, pdf_a = self.disks.start(d, u_point)
+        p, pdf_a = self._sample_point(chosen.index, d, u_point, active)
         weight = dr.select(ds.pdf == 0, 0, weight / pdf_a)
         pdf_w = dr.select(directional, 1, ds.pdf)
         si = emitting_point(p, shared)
@@ -62,7 +96,7 @@ class InfiniteEmitters(Group):
         return emission
 
     def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
-        return self.disks.pdf_a(p, d)
+        return self._point_pdf_a(chosen.index, p, d, active)
 
     def connection_density(self, chosen: Chosen, emission: Emission, si, active):
         return mi.Float(emission.pdf_first)
@@ -91,13 +125,13 @@ class InfiniteEmitters(Group):
             anchor=rays.free_anchor(ds.p),
             infinite=mi.Bool(True),
             delta=directional,
-            emission_ratio=self.disks.pdf_a(si.p, ds.d),
+            emission_ratio=self._point_pdf_a(chosen.index, si.p, -ds.d, active),
         )
 
     def hit_densities(self, chosen: Chosen, hit: Hit, active):
         ds = hit.direction()
         pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
-        return pdf_w, mi.Float(pdf_w), self.disks.pdf_a(hit.previous.p, ds.d)
+        return pdf_w, mi.Float(pdf_w), self._point_pdf_a(chosen.index, hit.previous.p, -ds.d, active)
 
 
 def _is_directional(emitter) -> bool:

@@ -11,6 +11,7 @@ from ..errors import UsageError
 from ..geometry import rays
 from ..geometry.to_world import check_angles
 from ..host.introspection import named, own_parameters
+from .emission_tables import Place
 from .group import Context, Group, emitting_point, free_emission, weight_over
 from .projectors import Projectors
 from .records import Chosen, Direct, Emission
@@ -40,6 +41,12 @@ class PositionEmitters(Group):
     Emission: y_0 is the position; the direction is uniform in a cone, or a projector's own (solid angle).
     """
 
+    guidable = True
+
+    @classmethod
+    def tables(cls, emitter) -> int:
+        return 0 if emitter.class_name() == "Projector" else 1
+
     def __init__(self, emitters, context: Context):
         self._cones = table(rows(emitters, _Cone(), lambda emitter: _CONES[emitter.class_name()](emitter)))
         projects = rows(emitters, None, lambda emitter: emitter.class_name() == "Projector")
@@ -49,17 +56,28 @@ class PositionEmitters(Group):
     def _direction_pdf_w(self, index, d, active):
         """Density of the emission into the direction ``d`` (solid angle)."""
         pdf_w = dr.gather(mi.Float, self._cones.pdf_w, index, active)
+        if self.guide is not None:
+            pdf_w *= self.guide.density(index, self.place(index, None, d, active), active)
         if self._projectors is None:
             return pdf_w
         projector = self._is_projector.at(index, active)
         return dr.select(projector, self._projectors.pdf_w(index, d, projector), pdf_w)
 
+    def place(self, index, p, d, active) -> Place:
+        cone = look_up(self._cones, index, active)
+        local = mi.Vector3f(dr.dot(cone.x, d), dr.dot(cone.y, d), dr.dot(cone.z, d))
+        return Place(mi.UInt32(0), mi.warp.uniform_cone_to_square(local, cone.cos_cutoff))
+
     # -- emission ---------------------------------------------------------------------------
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
         cone = look_up(self._cones, chosen.index, active)
-        local = mi.warp.square_to_uniform_cone(u_direction, cone.cos_cutoff)
-        d, pdf_w = cone.x * local.x + cone.y * local.y + cone.z * local.z, cone.pdf_w
+        u, pdf_w = u_direction, cone.pdf_w
+        if self.guide is not None:
+            u, density = self.guide.warp(chosen.index, mi.UInt32(0), u, active)
+            pdf_w *= density
+        local = mi.warp.square_to_uniform_cone(u, cone.cos_cutoff)
+        d = cone.x * local.x + cone.y * local.y + cone.z * local.z
         if self._projectors is not None:
             mask = self._is_projector.at(chosen.index, active)
             projected, density = self._projectors.sample(chosen.index, u_direction, mask)

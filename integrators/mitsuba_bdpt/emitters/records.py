@@ -57,7 +57,7 @@ class Direct:
     none so small that the ray asks for it, see `rounding.SMALL`); ``emission_ratio`` is
     pdf_first pdf_second / (density of y_0 in the measure of pdf_first, times the squared distance; 1 at
     infinity), to be multiplied by the geometric cosine at the camera vertex: the ratio of the densities of
-    s = 2 and s = 1, but for that with which the camera subpath made the vertex.
+    s = 2 and s = 1, but for that with which the camera subpath made the vertex; ``index`` of the emitter.
     """
 
     weight: mi.Spectrum
@@ -68,6 +68,7 @@ class Direct:
     delta: mi.Bool
     emission_ratio: mi.Float
     met: mi.UInt32 | None = None
+    index: mi.UInt32 | None = None
 
 
 @dataclass

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..emitters.emission_tables import EmissionTables
 from ..transport.plan import GUIDED
 from .configuration import WEIGHTINGS, Configuration
 from .costs import cost
@@ -89,6 +90,12 @@ class Prediction:
     def time(self) -> float:
         """To a certain error, in a unit of its own."""
         return self.cost * self.variance
+
+    def with_emission(self, tables: EmissionTables) -> Prediction:
+        """The same with light subpaths that ``tables`` guide, if there are some."""
+        if not self.candidate.light_paths:
+            return self
+        return replace(self, candidate=replace(self.candidate, emission=tables))
 
     def decided(self, first_pass: int, mean: float) -> Decision:
         """The decision for the candidate from the pass ``first_pass`` on; ``mean`` of the image."""

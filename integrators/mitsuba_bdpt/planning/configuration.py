@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from ..emitters.emission_tables import EmissionTables
 from ..transport.plan import Plan
 
 
@@ -45,6 +46,7 @@ class Configuration:
     The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
     of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: samples
     by which s = 0 is at a vertex; with `merging`, not 0 if vertices are merged though s = 0 finds that light.
+    ``emission``: what guides that of light subpaths.
     """
 
     light_paths: float
@@ -52,6 +54,7 @@ class Configuration:
     kappa_light: float
     kappa_direct: float
     guided: int = field(default=0, kw_only=True)
+    emission: EmissionTables | None = field(default=None, kw_only=True)
 
     @classmethod
     def weighted(cls, weighting: Weighting, served: int, connections: str) -> Configuration:
@@ -87,6 +90,7 @@ class Configuration:
             kappa_direct=self.kappa_direct,
             guided=max(self.guided, full.guided) if full.guidable and not full.merging else 0,
             merging=full.merging and (self.guided > 0 or not full.guidable),
+            emission=self.emission if full.teachable and light else None,
         )
         served = self.camera_paths_per_light_path if adopted.light else 1
         return replace(adopted, camera_paths_per_light_path=served)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeGuard
 
+from ..emitters.emission_tables import EmissionTables
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
 from ..transport.plan import GUIDED
@@ -20,7 +21,17 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 LARGEST = 1e30
 
 # Entries of a record, see `Decision.record`.
-ENTRIES = ("pass", "light_paths", "connections", "guided", "coefficients", "cost", "variance", "mean")
+ENTRIES = (
+    "pass",
+    "light_paths",
+    "connections",
+    "guided",
+    "emission",
+    "coefficients",
+    "cost",
+    "variance",
+    "mean",
+)
 
 
 @dataclass(frozen=True)
@@ -44,7 +55,8 @@ class Decision(Configuration):
         They have six digits: further ones depend on the order in which a pilot's lanes were added up.
         """
         cost, variance, mean = (float(f"{number:.6g}") for number in (cost, variance, mean))
-        return cls(**asdict(chosen), first_pass=first_pass, cost=cost, variance=variance, mean=mean)
+        what = {f.name: getattr(chosen, f.name) for f in fields(Configuration)}
+        return cls(**what, first_pass=first_pass, cost=cost, variance=variance, mean=mean)
 
     @property
     def threshold(self) -> float:
@@ -58,6 +70,7 @@ class Decision(Configuration):
             "light_paths": self.light_paths,
             "connections": self.connections,
             "guided": self.guided,
+            "emission": None if self.emission is None else self.emission.record(),
             "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
             "cost": self.cost,
             "variance": self.variance,
@@ -127,8 +140,14 @@ def _read_decision(entry: Any) -> Decision:
     guided = entry.get("guided", 0)  # which records of older versions lack
     if isinstance(guided, bool) or guided not in (0, *GUIDED):
         raise ValueError(f"guided={guided!r}")
+    emission = entry.get("emission")
     return Decision(
-        light_paths=light_paths, connections=connections, first_pass=first_pass, guided=guided, **numbers
+        light_paths=light_paths,
+        connections=connections,
+        first_pass=first_pass,
+        guided=guided,
+        emission=None if emission is None else EmissionTables.read(emission),
+        **numbers,
     )
 
 

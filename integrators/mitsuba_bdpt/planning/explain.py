@@ -59,6 +59,7 @@ def explain(
                 p.guided,
             ),
             (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
+            (_aimed(p), p.emission is not None),
         )
         if on
     ]
@@ -89,6 +90,15 @@ def explain(
     if lost_by_pilot:
         lines.append(f"not finite: {lost_by_pilot} values of the pilot, which decided from the rest")
     return "\n".join(lines + _pilot(settings, table, certainty))
+
+
+def _aimed(p: Plan) -> str:
+    if p.emission is None:
+        return ""
+    return (
+        f"guided emission (light subpaths are aimed; the pilot predicts that {p.emission.left:.0%} of their "
+        "part of the squared error is left)"
+    )
 
 
 def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> list[str]:

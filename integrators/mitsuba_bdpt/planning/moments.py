@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 # small_casters/point_sphere splats would seem an eighth as noisy as they are.)
 FINE, TILES = 32, 8
 
+# The same for what is heard of emissions.
+HEARD_TILES = 4
+
 # Independent parts of the pilot, among which outliers are looked for.
 GROUPS = 16
 
@@ -51,7 +54,7 @@ OWN_GAIN = 0.3
 
 # Fields of `Moments` that have a row for each group, and all of its arrays.
 _OF_GROUPS = ("base", "rare", "light", "draw", "isolated")
-_ARRAYS = (*_OF_GROUPS, "gain")
+_ARRAYS = (*_OF_GROUPS, "gain", "emission")
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,8 @@ class Moments:
     part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
     weighting, is what the points of a net leave of the rest of ``base``. ``isolated``, shape (`GROUPS`,
     numbers): the variance of paths on which s = 0 can be guided, which are in no other, if it is not, and
-    with each of `plan.GUIDED` numbers of samples. ``mean`` of the image (mean of the
+    with each of `plan.GUIDED` numbers of samples. ``emission``: what was heard of emissions, see
+    `_of_tiles` (nothing: no cells). ``mean`` of the image (mean of the
     colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
     ``rays`` and connections per camera sample and kind, with one light subpath each, the number of ``bsdfs``,
     ``far``, the share of light subpaths that start at infinity, and the sky's ``evenness``, its mean radiance
@@ -75,6 +79,7 @@ class Moments:
     draw: np.ndarray
     isolated: np.ndarray
     gain: np.ndarray
+    emission: np.ndarray
     mean: float
     rays: dict[str, float]
     lanes: int
@@ -190,11 +195,12 @@ def moments(
     splats: Splats,
     rays: dict[str, float],
     isolated: Isolated | None = None,
+    heard: np.ndarray | None = None,
 ) -> Moments:
     """The moments of a pilot of independent ``samples``, and ``nets``.
 
     ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample;
-    ``isolated`` light is in no sample.
+    ``isolated`` light is in no sample. ``heard``: see `emission.Listener`.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
@@ -227,11 +233,33 @@ def moments(
         light=summed(samples.light, "light"),
         draw=summed(samples.draw),
         isolated=guided,
+        emission=_of_tiles(heard, samples, sizes.sum(axis=0)),
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,
         lanes=count + (len(nets.tile) if nets else 0),
     )
+
+
+def _of_tiles(heard: np.ndarray | None, samples: Samples, splats: np.ndarray) -> np.ndarray:
+    """What was heard of emissions relative to the brightness of its place, `HEARD_TILES` in each direction.
+
+    Shape (2, cells, classes), per sample; no cells if nothing was listened to. ``splats``: shares of the fine
+    tiles of an image's brightness.
+    """
+    if heard is None:
+        return np.zeros((2, 0, 0))
+
+    def over_tiles(values: np.ndarray) -> np.ndarray:
+        many = FINE // HEARD_TILES
+        return values.reshape(HEARD_TILES, many, HEARD_TILES, many).sum(axis=(1, 3)).ravel()
+
+    last = samples.estimate[:, -1]
+    counts = over_tiles(np.bincount(samples.tile, minlength=FINE**2).astype(float))
+    brightness = over_tiles(np.bincount(samples.tile, last, FINE**2)) / np.maximum(counts, 1)
+    brightness += over_tiles(splats) * HEARD_TILES**2
+    norms = brightness**2 + 0.01 * brightness.mean() ** 2
+    return np.einsum("htck,t->hck", heard, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
 
 
 def _other(estimate: np.ndarray) -> np.ndarray:

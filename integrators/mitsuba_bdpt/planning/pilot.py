@@ -48,7 +48,7 @@ from ..transport.counters import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.plan import Plan
-from . import isolated, moments
+from . import emission, isolated, moments
 from .configuration import WEIGHTINGS, Weighting
 from .moments import FINE, GROUPS, PER_PIXEL, Isolated, Moments, tile_of
 from .rows import SAMPLE, SPLAT, SUMS, Layout
@@ -100,12 +100,22 @@ class Pilot:
     """Sink (see `sink`) of a pilot's contributions, in a scene with or without ``media``.
 
     Those of a ``batch``, in which of camera samples that follow one another each `PER_PIXEL` are of the same
-    pixel, in nets each `batch.NETS` times `batch.NET`.
+    pixel, in nets each `batch.NETS` times `batch.NET`. A ``listener`` hears where their paths are emitted.
     """
 
     alpha = False
 
-    def __init__(self, region: Region, batch: Batch, rarest: float, media: bool = False):
+    def __init__(
+        self,
+        region: Region,
+        batch: Batch,
+        rarest: float,
+        media: bool = False,
+        listener: emission.Listener | None = None,
+    ):
+        self._listener = listener
+        # Of a splat over that of a camera sample.
+        self._weight = batch.size / batch.lanes
         self._region, self._lanes, self._media = region, batch.lanes, media
         self._first_net = batch.pixels * batch.samples
         self._least = dr.opaque(mi.Float64, 1 / rarest)
@@ -120,7 +130,9 @@ class Pilot:
 
     def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
         """Add a contribution with t >= 2."""
-        own, squares = self._parts(self._size(c), c)
+        size = self._size(c)
+        self._hear(c, size, start.position, c.active)
+        own, squares = self._parts(size, c)
         new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
@@ -130,10 +142,13 @@ class Pilot:
         """Join the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c: Contribution, seen: Contribution, total: dict[str, Row]) -> dict[str, Row]:
-            own, squares = self._parts(self._size(c), c)
+            size = self._size(c)
+            own, squares = self._parts(size, c)
             unshadowed = own
             if kernel.space is not None:  # its weight was not known before
-                own, squares = self._parts(self._size(seen), seen)
+                c, size = seen, self._size(seen)
+                own, squares = self._parts(size, seen)
+            self._hear(replace(c, emission=lane.emission), size, start.position, seen.active)
             found = {"visible": own, **squares}
             new = {n: [dr.select(seen.active, x, 0) for x in v] for n, v in found.items()}
             new = {"unshadowed": unshadowed} | new
@@ -162,6 +177,7 @@ class Pilot:
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
         _add(self._splats, SPLAT, found, row, size > 0)
+        self._hear(c, size * np.sqrt(self._weight), c.position, c.active)
         return Counters()
 
     def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
@@ -172,6 +188,11 @@ class Pilot:
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
         return Counters()
+
+    def _hear(self, c: Contribution, size: mi.Float64, position: mi.Point2f, active: mi.Bool):
+        if self._listener is not None:
+            lane = dr.arange(mi.UInt32, self._lanes)
+            self._listener.hear(c, position, lane, dr.square(size), active & (size > 0))
 
     def evaluate(self, counts: mi.UInt64):
         """Run what was recorded, and ``counts`` with it."""
@@ -191,7 +212,8 @@ class Pilot:
         evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
         rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
         rays["aimed"] = isolated.aimed if isolated else 0.0
-        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, isolated)
+        heard = self._listener.evaluated() if self._listener is not None else None
+        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, isolated, heard)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of this weighted ``size`` adds.
@@ -273,7 +295,11 @@ def measure(
     if everything.guidable:
         found = isolated.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
         kernel.without_isolated = found is not None
-    region = prepared.camera.region
+    region, listener = prepared.camera.region, None
+    if everything.teachable and everything.emission is None:
+        kernel.emitters, kernel.tells_emission = kernel.emitters.placed(), True
+        cells = kernel.emitters.table_count * kernel.emitters.side**2
+        listener = emission.Listener(region, cells)
     pixels = int(region.size.prod())
     stratified = settings.points != "independent"
     nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
@@ -281,7 +307,7 @@ def measure(
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
-    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None)
+    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None, listener)
     # What is not in nets are independent numbers: the squared mean follows from products of samples.
     points = Points("sobol" if stratified else "independent", seed)
     counts = trace(kernel, pilot, batch, points, samples)

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -13,12 +14,13 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from ..emitters.emission_tables import EmissionTables, side_of
 from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
-from . import budget, choice, even_sky, pilot
+from . import budget, choice, emission, even_sky, pilot
 from .candidates import candidates
 from .decision import Decision, replayed
 from .explain import words
@@ -31,6 +33,13 @@ FIRST_REPEAT = 32
 
 # Share of a render after which none is asked any more: what is left has to pay for it.
 LATEST_REPEAT = 1 / 4
+
+# Where path tracing alone is the best without tables, a second pilot is asked with them, if they promise to
+# make light subpaths better than it by this factor.
+AIMED_GAIN = 1.15
+
+# Tables that a later pilot has taught replace earlier ones if they leave this part of what those leave.
+BETTER_TABLES = 0.95
 
 # Why a pilot that was asked decides nothing.
 SAW_NOTHING = "it saw nothing, or no finite value"
@@ -78,6 +87,8 @@ class Planner:
         self._pixels = int(prepared.camera.region.size.prod())
         self.full = self.plan = budget.first_plan(plan(prepared, settings), settings, self._pixels)
         self.threshold, self.changes, self.decided = None, 0, Decided()
+        # What the newest pilot with tables of emission has found, where there was one.
+        self._with_tables: Moments | None = None
 
     def begin(self, passes: tuple[int, ...]) -> bool:
         """Adopt what the scene alone decides, before the first pass.
@@ -106,41 +117,80 @@ class Planner:
     def ask(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Ask a pilot and adopt what it says; returns its predictions, the best first."""
         samples = self._expected(passes)
-        moments = self._measured(budget.lanes(samples), samples)
+        found, before = self._measured(samples), self.decided.moments
+        moments = found if before is None else before.joined(found)
         self.decided = replace(self.decided, moments=moments)
         alternatives = self._alternatives(samples)
         table = choice.choose(moments, alternatives)
         if not moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
             table = []
         if table:
+            table, learnt = self._aimed(table, moments, samples)
             gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
-            self.adopt(table[0].decided(len(passes), moments.mean), choice.left_out(table, gain, name))
+            left_out = choice.left_out(table, gain, name) + emission.left_out(table[0].candidate, learnt)
+            self.adopt(table[0].decided(len(passes), moments.mean), left_out)
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
         return table
 
-    def _measured(self, count: int, samples: int) -> Moments:
-        """What a pilot of ``count`` samples finds (see `pilot.measure`), joined with those before.
+    def _aimed(
+        self, table: list[choice.Prediction], moments: Moments, samples: int
+    ) -> tuple[list[choice.Prediction], emission.Learnt | None]:
+        """The ``table`` of a pilot with what it teaches about emission, where that pays; and what that is."""
+        self._with_tables = None
+        if not moments.emission.size:
+            return table, None
+        learnt = self._learnt(moments, samples)
+        lit = min((row.time for row in table if row.candidate.light_paths), default=math.inf)
+        is_lit = table[0].candidate.light_paths > 0
+        if learnt.tables is None or (not is_lit and lit * learnt.whole * AIMED_GAIN > table[0].time):
+            return table, learnt
+        tables, before = learnt.tables, self.plan.emission
+        if before is not None:
+            left = emission.left_by(before, moments.emission)
+            tables = tables if emission.left_by(tables, moments.emission) < BETTER_TABLES * left else before
+        if not is_lit:
+            found = self._measured(samples, tables)
+            aimed = choice.choose(found, self._alternatives(samples))
+            if not found.mean > 0 or not aimed or not aimed[0].candidate.light_paths:
+                return table, learnt
+            self._with_tables, table = found, aimed
+        return [row.with_emission(tables) for row in table], learnt
+
+    def _learnt(self, moments: Moments, samples: int) -> emission.Learnt:
+        """What the pilots teach about emission, remembered of the first (20 ms under a sky)."""
+        emitters = self._prepared.emitters
+
+        def learn() -> emission.Learnt:
+            return emission.learn(moments.emission, side_of(emitters.table_count), emitters.tables)
+
+        if self.decided.pilots.asked > 1:
+            return learn()
+        return self._findings.find("emission", (self._settings, self.pilot_seed, samples), learn)[0]
+
+    def _measured(self, samples: int, tables: EmissionTables | None = None) -> Moments:
+        """What a pilot for a render of so many ``samples`` finds (see `pilot.measure`), with these tables.
 
         Where the same one was traced in an earlier render, and nothing was edited since, that is remembered:
         it would find the same.
         """
-        pilots, before = self.decided.pilots, self.decided.moments
+        count, pilots = budget.lanes(samples), self.decided.pilots
         pilots = pilots._replace(asked=pilots.asked + 1)
         self.decided = replace(self.decided, pilots=pilots)
         stands_for = samples / count
+        plan = replace(self.full, emission=tables)
 
         def trace() -> Moments:
             seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.asked)
             flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
             with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
-                return pilot.measure(self._prepared, self.full, self._settings, seed, count, stands_for)
+                return pilot.measure(self._prepared, plan, self._settings, seed, count, stands_for)
 
-        key = self._settings, self.pilot_seed, pilots.asked, count, stands_for
+        key = self._settings, self.pilot_seed, pilots.asked, count, stands_for, tables
         found, is_known = self._findings.find("pilots", key, trace)
         pilots = pilots._replace(remembered=pilots.remembered + is_known)
         self.decided = replace(self.decided, pilots=pilots)
-        return found if before is None else before.joined(found)
+        return found
 
     def replay(self, passes: tuple[int, ...]):
         """Adopt the decision that the parameters give for the next pass, if there is one."""
@@ -177,7 +227,8 @@ class Planner:
 
     def certainty(self, passes: tuple[int, ...]) -> float:
         """`choice.certainty` of what the pilots decided."""
-        return choice.certainty(self.decided.moments, self._alternatives(self._expected(passes)))
+        moments = self._with_tables or self.decided.moments
+        return choice.certainty(moments, self._alternatives(self._expected(passes)))
 
     def lost_by_pilots(self) -> int:
         """Values of the pilots that were not finite, and counted as zero."""

@@ -8,6 +8,7 @@ from enum import Enum
 import mitsuba as mi
 import numpy as np
 
+from ..emitters.emission_tables import MOST_CELLS, SIDES, side_of
 from ..emitters.emitters import Emitters
 from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
@@ -68,6 +69,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     contradiction = prepared.light_media.contradiction if prepared.light_media else ""
     if contradiction and (splat or endpoints or arrival or inner):
         splat = endpoints = arrival = inner = skip("t=0, t=1, (1,1), inner", "impossible", contradiction)
+    light = bool(splat or endpoints or arrival or inner)
+    why = _why_not_guided_emission(emitters, settings) if light else ""
+    teachable = light and (skip("guided emission", *why) if why else True)
     return Plan(
         hit=hit,
         direct=direct,
@@ -75,7 +79,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         endpoints=endpoints,
         arrival=arrival,
         connections=connections if inner else "none",
-        camera_paths_per_light_path=round(1 / light_paths) if splat or arrival or endpoints or inner else 1,
+        camera_paths_per_light_path=round(1 / light_paths) if light else 1,
         kappa_light=1.0 if settings.skip == "none" else 0.25,
         kappa_direct=1.0,
         roulette=settings.skip != "none" and not settings.strategy_images,
@@ -84,7 +88,23 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         merging=merging,
         guided=GUIDED[0] if guidable and not merging and settings.photon_guiding == "always" else 0,
         guidable=guidable,
+        teachable=teachable,
     )
+
+
+def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str] | None:
+    """The level and why emission cannot be guided; None if it can."""
+    if settings.emission_guiding == "never":
+        return "by hand", "emission_guiding=never"
+    if not emitters.table_count:
+        return (
+            "impossible",
+            "no emitter's directions can be guided: projectors and directionalarea have their own",
+        )
+    if not side_of(emitters.table_count):
+        most = MOST_CELLS // SIDES[-1] ** 2
+        return "impossible", f"{emitters.table_count} tables would be needed, and {most} are the most"
+    return None
 
 
 def _defaults(settings: Settings) -> tuple[float, str]:

@@ -18,7 +18,7 @@ from ..settings import Settings
 from .progress import Progress
 
 # Of what a snapshot holds; another number with every change of that.
-FORMAT = 5
+FORMAT = 6
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:

@@ -24,7 +24,8 @@ class Contribution:
     vertices ``t``, ``active``; ``shares`` see `mis.ByClass`, ``kind`` the class among `mis.CLASSES`;
     ``position`` on the film in pixels, None where it adds to the lane's own pixel (t >= 2); ``counted`` what
     was done for it. In scenes with media ``value`` and ``weight`` are those of an edge without any until
-    `visibility.seen` has looked; it needs the ``sides``: what `mis.Heuristic.weigh` takes.
+    `visibility.seen` has looked; it needs the ``sides``: what `mis.Heuristic.weigh` takes. ``emission``: what
+    `Emitters.cell` says of the path, where a pilot asks for it.
     """
 
     value: mi.Spectrum
@@ -37,6 +38,7 @@ class Contribution:
     position: mi.Point2f | None = None
     counted: Counters = field(default_factory=Counters)
     sides: Any = None
+    emission: tuple[mi.UInt32, mi.Bool] | None = None
 
     def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""

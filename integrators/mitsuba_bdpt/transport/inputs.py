@@ -61,7 +61,10 @@ class Kernel:
 
     def __init__(self, prepared, plan: Plan, settings: Settings, heuristic: mis.Heuristic):
         u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
-        self.scene, self.camera, self.emitters = prepared.scene, prepared.camera, prepared.emitters
+        self.scene, self.camera = prepared.scene, prepared.camera
+        self.emitters = (
+            prepared.emitters if plan.emission is None else prepared.emitters.placed(plan.emission)
+        )
         self.plan, self.heuristic = plan, heuristic
         self.shape_errors = prepared.emitters.shape_errors
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
@@ -89,6 +92,8 @@ class Kernel:
         self.guide = None
         # Whether s = 0 makes no paths on which it might be guided: a pilot knows those by `isolated_light`.
         self.without_isolated = False
+        # Whether contributions say where their path is emitted, see `Contribution.emission`.
+        self.tells_emission = False
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch, with the batch's ``points``.

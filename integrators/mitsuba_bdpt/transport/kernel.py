@@ -106,11 +106,15 @@ from .walk import Side, Walk, not_finite, random_walk
 
 @dataclass
 class Lane:
-    """What a lane's camera subpaths share: the map of samples, time and wavelengths, light vertices."""
+    """What a lane's camera subpaths share: the map of samples, time and wavelengths, light vertices.
+
+    In a pilot also where the light subpath was emitted, see `Contribution.emission`.
+    """
 
     place: Places
     shared: Shared
     path: stored_vertices.LightPath
+    emission: tuple[mi.UInt32, mi.Bool] | None = None
 
 
 @dataclass
@@ -207,10 +211,10 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     stream = kernel.points.stream("light", place_in_sequence, index)
     shared = shared_by_lane(kernel, stream, place_in_sequence)
     path = stored_vertices.allocate_light_path(kernel, dr.width(index))
-    counters = Counters()
+    counters, emitted = Counters(), None
     if kernel.plan.light:
-        path, counters = _light_subpath(kernel, sink, stream, shared, path)
-    return Lane(place, shared, path), counters
+        path, counters, emitted = _light_subpath(kernel, sink, stream, shared, path)
+    return Lane(place, shared, path, emitted), counters
 
 
 def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
@@ -235,21 +239,30 @@ def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
 # -- the light subpath ------------------------------------------------------------------------
 
 
-def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_vertices.LightPath, Counters]:
-    """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections."""
+def _light_subpath(kernel: Kernel, sink, stream, shared, path):
+    """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections.
+
+    Returns the latter, what was counted, and in a pilot where it was emitted.
+    """
     plan = kernel.plan
     e = emission(kernel, stream, shared)
+    emitted = kernel.emitters.cell(e.index, e.si.p, e.d, mi.Bool(True)) if kernel.tells_emission else None
     counters = Counters()
+
+    def splat(c):
+        """Hand a contribution with t <= 1 to the sink."""
+        c = contribution.drop_non_finite(replace(c, emission=emitted))
+        return c.counted + sink.splat(kernel, c, shared)
+
     if plan.endpoints:
-        c = techniques.join_endpoints(kernel, e, stream, mi.Bool(True))
-        counters += _splat(kernel, sink, c, shared)
+        counters += splat(techniques.join_endpoints(kernel, e, stream, mi.Bool(True)))
 
     def visit(vertex, state, walk):
         path, counters = state
         if plan.arrival:
-            counters += _splat(kernel, sink, techniques.hit_sensor(kernel, e, vertex, walk), shared)
+            counters += splat(techniques.hit_sensor(kernel, e, vertex, walk))
         if plan.splat:
-            counters += _splat(kernel, sink, techniques.splat(kernel, vertex, stream), shared)
+            counters += splat(techniques.splat(kernel, vertex, stream))
         if plan.connections != "none":
             stored_vertices.store_light_vertex(kernel, vertex, path)
         return path, counters
@@ -263,7 +276,8 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path) -> tuple[stored_v
     state = path, counted_by_light(plan, kernel.space)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters += counted + walk.counted(active)
-    return path, counters + Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
+    counters += Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
+    return path, counters, emitted
 
 
 def emission(kernel: Kernel, stream, shared):
@@ -330,12 +344,6 @@ def light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
         join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
         guide=None if walk.only_delta is None else lambda y, walk, _: guided_hits.look_back(kernel, y, walk),
     )
-
-
-def _splat(kernel: Kernel, sink, c, shared) -> Counters:
-    """Hand a contribution with t <= 1 to the sink."""
-    c = contribution.drop_non_finite(c)
-    return c.counted + sink.splat(kernel, c, shared)
 
 
 # -- its camera subpaths ----------------------------------------------------------------------

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..emitters.emission_tables import EmissionTables
+
 # Numbers of guided samples at a vertex among which a pilot chooses.
 GUIDED = (1, 4, 8)
 
@@ -18,7 +20,8 @@ class Plan:
     ``kappa_direct``: kappa of s=1.
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: by how many samples
-    s = 0 is guided at a vertex; ``guidable``: whether a pilot may say that it pays.
+    s = 0 is guided at a vertex; ``guidable``: whether a pilot may say that it pays; ``emission``: what guides
+    that of light subpaths, ``teachable``: whether a pilot may say that it pays.
     """
 
     hit: bool
@@ -36,6 +39,8 @@ class Plan:
     merging: bool = False
     guided: int = 0
     guidable: bool = False
+    emission: EmissionTables | None = None
+    teachable: bool = False
 
     @property
     def light(self) -> bool:

@@ -78,7 +78,8 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
             camera_side = h.combine(camera_side, other)
     weight, shares = h.weigh(kernel.kappa.hit, light_side, camera_side)
     value = _known(z.throughput * radiance, pdf_connect, pdf_first, pdf_second)
-    return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit")
+    emission = emitters.hit_cell(z.si, z.previous, active) if kernel.tells_emission else None
+    return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
 
 
 def _known(value, *pdfs):
@@ -129,10 +130,10 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     ray = dr.select(e.infinite, to_infinity, to_point)
     counted = Counters(shadow_s1=one(active))
     sight = Sight(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
+    emission = kernel.emitters.cell(e.index, z.si.p, -e.d, active) if kernel.tells_emission else None
     ends = mi.UInt32(1), k
-    return seen(
-        kernel, Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides), sight
-    )
+    c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
+    return seen(kernel, c, sight)
 
 
 def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:

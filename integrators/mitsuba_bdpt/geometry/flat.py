@@ -1,0 +1,37 @@
+"""Which shapes have one normal."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from ..host.introspection import own_parameters
+
+# Of unit normals: 1 - cos up to which they are one.
+_SAME = 1e-6
+
+
+def is_flat(shape: mi.Shape) -> bool:
+    """Whether a shape has one normal, shading normals included; false where that is not known."""
+    if shape.shape_type() in (mi.ShapeType.Rectangle.value, mi.ShapeType.Disk.value):
+        return True
+    if shape.shape_type() != mi.ShapeType.Mesh.value:
+        return False
+    # Of parameters: a shape that Python first met as an emitter's has no methods of meshes.
+    params = own_parameters(shape)
+    faces, vertices, normals = (
+        np.array(params[name], dtype=kind).reshape(-1, 3)
+        for name, kind in (("faces", np.int64), ("vertex_positions", float), ("vertex_normals", float))
+    )
+    if not len(faces) or faces.max() >= len(vertices):
+        return False
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    return _are_one(np.cross(b - a, c - a)) and (not len(normals) or _are_one(normals[faces].reshape(-1, 3)))
+
+
+def _are_one(normals: np.ndarray) -> bool:
+    length = np.linalg.norm(normals, axis=1)
+    if not (length > 0).any():
+        return False
+    unit = normals[length > 0] / length[length > 0, None]
+    return bool((unit @ unit[0] > 1 - _SAME).all())
