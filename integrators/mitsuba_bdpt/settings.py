@@ -155,8 +155,8 @@ class Settings:
     emission_guiding: str = _parameter(
         "auto",
         "when emission is guided",
-        """Guide the emission of light subpaths to where they matter, unbiased: by tables that the pilot learns
-        from its own samples. ``auto``: where it finds that it pays. ``never``.""",
+        """Guide the emission of light subpaths to where they matter, by tables that the pilot learns from its
+        own samples; unbiased. ``auto``: where it finds that it pays. ``never``.""",
         choices=EMISSION_GUIDING,
     )
     decisions: tuple[Any, ...] | None = _converted(

@@ -11,7 +11,10 @@ from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import numpy as np
+from mitsuba_bdpt.emitters.emission_tables import SKY_BINS, cell_at
+from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import rays
+from mitsuba_bdpt.geometry.flat import is_flat
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points, Purpose
 from mitsuba_bdpt.transport import bsdf, kernel, techniques
@@ -93,6 +96,45 @@ def densities(si, to_light, to_camera):
     return forward, plugin.pdf(ctx, bsdf.with_wi(si, to_camera), to_light)
 
 
+class Tables:
+    """Densities of emission that tables guide, in closed form; frames and what is flat are the package's."""
+
+    def __init__(self, scene, tables):
+        self.tables, self.least, self.side = tables.densities(), tables.least, tables.side
+        world = Emitters(scene)
+        self.emitters, self.counts, self.disks = scene.emitters(), world.tables, world.disks
+
+    def second(self, number, own, x1, d):
+        """That of x_1 from the emitter ``number``, whose ``own`` density it is without tables."""
+        emitter, name = self.emitters[number], self.emitters[number].class_name()
+        shape, v = emitter.get_shape(), mi.Vector3f(*(mi.Float(np.float32(x)) for x in d.T))
+        if not self.counts[number]:
+            return own
+        if name == "SpotLight":
+            turn = mi.traverse(emitter)["to_world"]
+            cutoff = dr.cos(dr.deg2rad(mi.Float(mi.traverse(emitter)["cutoff_angle"])))
+            local = dr.normalize(turn.inverse() @ v)
+            return own * self._density(number, mi.warp.uniform_cone_to_square(local, cutoff))
+        if name == "PointLight":
+            return own * self._density(number, mi.warp.uniform_cone_to_square(v, mi.Float(-1)))
+        if shape is None:
+            p = mi.Point3f(*(mi.Float(np.float32(x)) for x in x1.T))
+            u = mi.warp.uniform_sphere_to_square(v)
+            bins = 0 if name == "DirectionalEmitter" else cell_at(u, SKY_BINS)
+            return own * self._density(number, self.disks.place(p, v), bins)
+        if is_flat(shape):
+            n = mi.Vector3f(shape.sample_position(0, mi.Point2f(0.5)).n)
+            u = mi.warp.cosine_hemisphere_to_square(mi.Frame3f(n).to_local(v))
+            return own * self._density(number, u)
+        both = sum(self._density(number, mi.warp.uniform_sphere_to_square(w)) for w in (v, -v))
+        return self.least * own + (1 - self.least) * (own > 0) * both / (4 * np.pi)
+
+    def _density(self, number, u, bins=0):
+        first = sum(self.counts[:number])
+        cells = np.minimum((np.clip(np.array(u), 0, 1) * self.side).astype(int), self.side - 1)
+        return self.tables[first + np.array(bins), cells[1], cells[0]]
+
+
 class Capture(Observer):
     """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer.
 
@@ -102,10 +144,12 @@ class Capture(Observer):
     def __init__(self, scene, integrator, lanes: int, seed: int):
         self.scene, self.lanes = scene, lanes
         render = rendering.Render(scene, scene.sensors()[0], integrator.settings, seed, 1)
+        render.replay()  # what is decided by hand, if anything is
         self.world, self.plan = render.prepared, render.plan
         self.depth = integrator.settings.max_depth
         self.lamps, self.camera = lamps_of(scene), Camera.of(scene.sensors()[0])
-        self.disks = disks_of(self.world.emitters.disks)
+        self.disks = disks_of(render.kernel.emitters.disks)
+        self.tables = None if self.plan.emission is None else Tables(scene, self.plan.emission)
         self.walked = {"light": Walked(), "camera": Walked()}
         self.found, self.endpoint = {}, {}
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False):
@@ -275,6 +319,8 @@ class Capture(Observer):
             x1, leaving, cos = x[of, 1], d[of, 0], cos_light[of, 0]
             first[of] = lamp.first(leaving)
             second[of] = lamp.second(cos, x1, leaving, self.disks)
+            if self.tables is not None:
+                second[of] = self.tables.second(number, second[of], x1, leaving)
             direct[of] = lamp.direct(cos, dist2[of, 0], x1, leaving)
             if lamp.kind in (ENVIRONMENT, DIRECTIONAL) and x.shape[1] == 2:
                 second[of] *= self.disks.covers(x1, leaving)

@@ -194,41 +194,40 @@ class AreaEmitters(Group):
 
     def _direction_pdf_w(self, index, cos, d, active):
         """Density of the direction ``d`` of emission, of the cosine ``cos`` with the shading normal."""
-        own = dr.maximum(cos, 0) * dr.inv_pi
-        if self.guide is None:
+        own, guide = dr.maximum(cos, 0) * dr.inv_pi, self.guide
+        if guide is None:
             return own
-        flat, least = look_up(self._tables, index, active).flat > 0, self._least(index, active)
-        # Curved lamps: directions in the world, turned to the side of the normal.
-        density = self.guide.density(index, self.place(index, None, d, active), active)
-        turned = self.guide.density(index, self.place(index, None, -d, active), active & ~flat)
-        curved = least * own + (1 - least) * dr.select(cos > 0, (density + turned) * dr.inv_four_pi, 0)
-        return dr.select(flat, own * density, curved)
+        flat, least = look_up(self._tables, index, active).flat > 0, self._least(guide, index, active)
+        density = guide.density(index, self.place(index, None, d, active), active)
+        turned = guide.density(index, self.place(index, None, -d, active), active & ~flat)
+        by_table = dr.select(cos > 0, (density + turned) * dr.inv_four_pi, 0)
+        return dr.select(flat, own * density, least * own + (1 - least) * by_table)
 
-    def _least(self, index, active):
+    def _least(self, guide: EmissionGuide, index, active):
         """The share of directions of a curved lamp that are not by its table, 1 of one without."""
-        return dr.select(self.guide.is_guided(index, active), self.guide.least, 1)
+        return dr.select(guide.is_guided(index, active), guide.least, 1)
 
     def _sample_direction(self, index, si, u, active):
-        """A direction of emission (world) and its density; the emitting point is ``si``."""
-        if self.guide is None:
+        """A direction of emission from ``si``, in the world and in its frame, and its density."""
+        guide = self.guide
+        if guide is None:
             local = mi.warp.square_to_cosine_hemisphere(u)
             return si.to_world(local), local, mi.warp.square_to_cosine_hemisphere_pdf(local)
         known = look_up(self._tables, index, active)
-        flat, least = known.flat > 0, self._least(index, active)
+        flat, least = known.flat > 0, self._least(guide, index, active)
+        # A curved lamp's table is of directions in the world, turned to the side of the normal.
         by_table = u.x >= least
         x = dr.select(by_table, (u.x - least) / (1 - least), u.x / least)
-        warped, density = self.guide.warp(
-            index, mi.UInt32(0), mi.Point2f(dr.select(flat, u.x, x), u.y), active
-        )
-        local = mi.warp.square_to_cosine_hemisphere(warped)
-        of_flat = known.frame().to_world(local)
-        of_table = mi.warp.square_to_uniform_sphere(warped)
-        of_table = dr.mulsign(of_table, dr.dot(si.sh_frame.n, of_table))
         own = si.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, u.y)))
-        d = dr.select(flat, of_flat, dr.select(by_table, of_table, own))
-        of_flat_pdf = mi.warp.square_to_cosine_hemisphere_pdf(local) * density
+        u = mi.Point2f(dr.select(flat, u.x, x), u.y)
+        warped, density = guide.warp(index, mi.UInt32(0), u, active)
+        turned = mi.warp.square_to_uniform_sphere(warped)
+        turned = dr.mulsign(turned, dr.dot(si.sh_frame.n, turned))
+        local = mi.warp.square_to_cosine_hemisphere(warped)
+        d = dr.select(flat, known.frame().to_world(local), dr.select(by_table, turned, own))
         pdf_w = self._direction_pdf_w(index, dr.dot(si.sh_frame.n, d), d, active)
-        return d, si.to_local(d), dr.select(flat, of_flat_pdf, pdf_w)
+        of_flat = mi.warp.square_to_cosine_hemisphere_pdf(local) * density
+        return d, si.to_local(d), dr.select(flat, of_flat, pdf_w)
 
     # -- emission ---------------------------------------------------------------------------
 

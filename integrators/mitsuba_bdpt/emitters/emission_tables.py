@@ -14,6 +14,7 @@ from __future__ import annotations
 import base64
 import zlib
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -64,7 +65,7 @@ class EmissionTables:
         return asdict(self)
 
     @staticmethod
-    def read(record) -> EmissionTables:
+    def read(record: Any) -> EmissionTables:
         """What was `record`-ed; raises ``ValueError`` or ``TypeError`` for anything else."""
         if not isinstance(record, dict) or set(record) != {"side", "least", "left", "levels"}:
             raise TypeError(f"emission={record!r} is no table of emission")
@@ -103,7 +104,7 @@ class Place:
 def cell_at(u: mi.Point2f, side: int) -> mi.UInt32:
     """The number of the cell at ``u`` in a table of ``side`` x ``side``."""
     at = mi.Point2u(dr.clip(u, 0, _BELOW_ONE) * side)
-    return dr.minimum(at.y, side - 1) * side + dr.minimum(at.x, side - 1)
+    return mi.UInt32(dr.minimum(at.y, side - 1) * side + dr.minimum(at.x, side - 1))
 
 
 class EmissionGuide:

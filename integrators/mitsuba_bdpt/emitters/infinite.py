@@ -53,7 +53,7 @@ class InfiniteEmitters(Group):
 
     def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
         other = super().placed(guide, whole)
-        if whole:
+        if guide is not None and whole:
             other.disks = self.disks.guided(guide.side)
         return other
 
@@ -73,10 +73,11 @@ class InfiniteEmitters(Group):
 
     def _sample_point(self, index, d, u, active):
         """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
-        if self.guide is None:
+        guide = self.guide
+        if guide is None:
             return self.disks.start(d, u)
         which = self._bin(index, d, active)
-        return self.disks.start(d, u, lambda u: self.guide.warp(index, which, u, active))
+        return self.disks.start(d, u, lambda u: guide.warp(index, which, u, active))
 
     # -- emission ---------------------------------------------------------------------------
 

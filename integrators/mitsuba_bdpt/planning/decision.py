@@ -21,17 +21,8 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 LARGEST = 1e30
 
 # Entries of a record, see `Decision.record`.
-ENTRIES = (
-    "pass",
-    "light_paths",
-    "connections",
-    "guided",
-    "emission",
-    "coefficients",
-    "cost",
-    "variance",
-    "mean",
-)
+WAY = ("light_paths", "connections", "guided", "emission", "coefficients")
+ENTRIES = ("pass", *WAY, "cost", "variance", "mean")
 
 
 @dataclass(frozen=True)

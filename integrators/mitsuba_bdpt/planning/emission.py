@@ -26,7 +26,6 @@ import numpy as np
 
 from ..emitters.emission_tables import EmissionTables
 from ..sensors.records import Region
-from ..transport import mis
 from ..transport.contribution import Contribution
 from .configuration import Configuration
 from .moments import HEARD_TILES, group
@@ -47,7 +46,7 @@ PAYS = 0.9
 WORST = 0.02
 
 # Tables of an emitter that has less than this part in what all save are left out: looking densities up takes
-# time at every vertex. (In `ring_caustic` those of the sky have 0.004, and the render took 1.2 times as long.)
+# time at every vertex. (In `ring_caustic` those of the sky have 0.004.)
 PART = 0.01
 
 # Steps towards the fixed point.
@@ -62,15 +61,17 @@ class Listener:
         self._sums = dr.zeros(mi.Float64, HALVES * HEARD_TILES**2 * cells * CLASSES)
         dr.make_opaque(self._sums)
 
-    def hear(self, c: Contribution, position: mi.Point2f, lane: mi.UInt32, square: mi.Float64, active):
+    def hear(
+        self, c: Contribution, position: mi.Point2f, lane: mi.UInt32, square: mi.Float64, active: mi.Bool
+    ):
         """Add a contribution of this squared size to the ``position`` on the film, where ``active``."""
-        hit, direct, light, inner = (c.shares[i] for i in range(len(mis.CLASSES)))
+        hit, direct, light, inner = c.shares  # pyright: ignore[reportGeneralTypeIssues]
         odds = dr.log2((light + inner) / (hit + direct)) / 2 + CLASSES / 2
         kind = mi.UInt32(dr.clip(odds, 0, CLASSES - 1))
         uv = dr.clip(self._region.to_uv(position), 0, 1)
         xy = dr.minimum(mi.Point2u(uv * HEARD_TILES), HEARD_TILES - 1)
         part = (group(lane) % HALVES) * HEARD_TILES**2 + xy.y * HEARD_TILES + xy.x
-        cell, known = c.emission
+        cell, known = c.emission  # pyright: ignore[reportGeneralTypeIssues]
         place = (part * self.cells + cell) * CLASSES + kind
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, square, place, active & known)
 
@@ -81,8 +82,10 @@ class Listener:
 
 @dataclass(frozen=True)
 class Learnt:
-    """``tables`` that gain, or None, and what they leave: of the second moments of all strategies (``whole``),
-    and of those whose light subpath chooses the emission (``left``)."""
+    """What a pilot has taught: ``tables`` that gain, or None, and what they leave of second moments.
+
+    ``left`` of those of strategies whose light subpath chooses the emission, ``whole`` of those of all.
+    """
 
     tables: EmissionTables | None
     left: float = 1.0
@@ -125,7 +128,7 @@ def _leave_alone(densities: np.ndarray, squares: np.ndarray, counts: Sequence[in
 
 
 def left_out(chosen: Configuration, learnt: Learnt | None) -> list[dict[str, str]]:
-    """Why what was ``learnt`` is not used by the ``chosen`` way to render, as in ``statistics["skipped"]``."""
+    """Why what was ``learnt`` is not used by the ``chosen`` way, as in ``statistics["skipped"]``."""
     if learnt is None or chosen.emission is not None:
         return []
     why = f"in the pilot tables leave {learnt.left:.0%} of light subpaths' part of the squared error"

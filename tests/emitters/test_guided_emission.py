@@ -1,0 +1,338 @@
+"""Guided emission: whatever the tables say, every place that asks for a density says the one sampled with.
+
+Tables are random, of neighbours that differ by up to 50. They change which subpaths are made and how much
+each carries, and so nothing on the mean.
+"""
+
+import json
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import scene_parts as parts
+from mitsuba_bdpt.emitters.emission_tables import MOST_CELLS, SIDES, EmissionTables, cell_at, side_of
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.errors import UsageError
+from mitsuba_bdpt.geometry.flat import is_flat
+from mitsuba_bdpt.host.jit import evaluated_mode
+from scipy import stats
+
+COUNT, LEVEL = 200_000, 1e-4
+
+
+def random_tables(emitters, seed=1, least=0.25):
+    """Tables whose densities are between 1/50 and 1 of the largest, up to their mean."""
+    side = side_of(emitters.table_count)
+    densities = np.random.default_rng(seed).random((emitters.table_count, side, side)) ** 4 + 0.02
+    return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), least, 0.5)
+
+
+def emissions(emitters, name="", seed=11):
+    """`COUNT` emissions, of all emitters."""
+    u = [mi.Float(v) for v in np.random.default_rng(seed).random((4, COUNT), dtype=np.float32)]
+    like = dr.zeros(mi.Interaction3f)
+    like.time = mi.Float(0.3)
+    with evaluated_mode(name == "timed_sunsky"):
+        e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+        dr.eval(e)
+    return e
+
+
+def column(x):
+    x = np.array(x, dtype=np.float64)
+    shape = (COUNT,) if x.ndim < 2 else (x.shape[0], COUNT)
+    return np.array(np.broadcast_to(x, shape))
+
+
+def guidable():
+    """The emitters of `scene_parts` that have tables."""
+    parts.register_plugins()
+    return [name for name in parts.EMITTERS if parts.plugin_of(parts.EMITTERS[name]()) in GUIDED]
+
+
+GUIDED = ("area", "point", "spot", "directional", "constant", "envmap", "sunsky", "timed_sunsky")
+
+
+def scene_of(name, **others):
+    parts.register_plugins()
+    ball = {"type": "sphere", "center": [0.3, 0.5, 0], "radius": 0.5}
+    return mi.load_dict({"type": "scene", "ball": ball, "lamp": parts.EMITTERS[name]()} | others)
+
+
+def test_every_emitter_is_looked_at():
+    """Expected: all emitters that have tables are among those of this module."""
+    with_tables = {name for name in parts.EMITTERS if Emitters(scene_of(name)).table_count}
+    assert with_tables == set(guidable())
+
+
+@pytest.mark.parametrize("name", guidable())
+def test_light_leaves_as_without_tables(name):
+    """Rationale: a weight that is not over the density sampled with would brighten some directions.
+
+    Expected: the light that leaves into each of 64 bins (of directions; of places seen along them, for light
+    from infinity) is that of emissions without tables. Statistic: a normal test per bin, Sidak, 1e-4.
+    """
+    emitters = Emitters(scene_of(name))
+    bins, weights = [], []
+    for seed, made in ((11, emitters), (12, emitters.placed(random_tables(emitters)))):
+        e = emissions(made, name, seed)
+        d = column(e.d)
+        place = column(e.si.p) - np.array([[0.3], [0.5], [0.0]])
+        along = place - np.sum(place * d, axis=0) * d if emitters.at_infinity else d
+        far = np.abs(along) > 0.4
+        bins.append(((along > 0) * [[1], [2], [4]]).sum(0) * 8 + (far * [[1], [2], [4]]).sum(0))
+        weights.append(column(e.weight)[0])
+    sums = [[np.bincount(b, w**k, 64) / COUNT for k in (1, 2)] for b, w in zip(bins, weights, strict=True)]
+    error = np.sqrt(sum(square - mean**2 for mean, square in sums) / COUNT)
+    used = error > 0
+    z = (np.abs(sums[0][0] - sums[1][0])[used]) / error[used]
+    p = 2 * stats.norm.sf(z)
+    assert used.sum() >= 4
+    assert -np.expm1(len(p) * np.log1p(-p.min())) > LEVEL, (z.max(), np.flatnonzero(used)[z.argmax()])
+
+
+@pytest.mark.parametrize("name", guidable())
+def test_all_strategies_state_one_density(name):
+    """Rationale: emission, t = 0, next-event estimation and hits ask in different ways.
+
+    Expected: for emissions that meet a plane, all state the density sampled with, but for those within
+    rounding of the edge of a cell (fewer than 1e-3; a texture's or a sun's edges: 1e-2).
+    """
+    emitters = Emitters(scene_of(name))
+    guided = emitters.placed(random_tables(emitters))
+    e = emissions(guided, name)
+    far = e.si.p + e.d * 3
+    stated = column(e.pdf_second)
+    made = column(dr.max(e.weight)) > 0
+    with evaluated_mode(name == "timed_sunsky"):
+        direction = column(guided.direction_density(e, far, e.d, mi.Bool(True)))
+    assert np.mean(np.abs(direction - stated)[made] > 1e-3 * stated[made]) < 1e-3
+    own, known = guided.cell(e.index, far, e.d, mi.Bool(True))
+    assert column(dr.select(known, 1.0, 0.0)).all()
+    assert column(own).max() < emitters.table_count * guided.side**2
+
+
+def lit_from(name, guided, count=20_000):
+    """Next-event estimation for points about the emitter: its samples, the points, and what is hit there."""
+    u = [mi.Float(v) for v in np.random.default_rng(4).random((5, count), dtype=np.float32)]
+    at = dr.zeros(mi.SurfaceInteraction3f, count)
+    at.p = mi.Point3f(u[0] - 0.5, u[1] + 1.2, u[2] - 0.5)
+    at.time = mi.Float(0.3)
+    return at, guided.sample_direct(at, mi.Point2f(u[3], u[4]), mi.Bool(True))
+
+
+@pytest.mark.parametrize("name", [n for n in guidable() if n != "timed_sunsky"])
+def test_next_event_estimation_and_hits_state_the_same(name):
+    """Expected: the ratio of densities that next-event estimation states is the one of what a ray from its
+    point hits there, and both change with the tables as the density of the cell says. Tolerance: 2e-3, for
+    all but the edges of cells, texels and the sun (2 %).
+    """
+    scene = scene_of(name)
+    emitters = Emitters(scene)
+    tables = random_tables(emitters)
+    guided = emitters.placed(tables)
+    at, direct = lit_from(name, guided)
+    _, plain = lit_from(name, emitters)
+    wide = len(np.array(at.p).T)
+
+    def values(x):
+        return np.broadcast_to(np.array(x, dtype=np.float64), wide)
+
+    def changed(after, before):
+        with np.errstate(all="ignore"):  # where nothing is emitted
+            return values(after) / values(before)
+
+    lit = values(dr.max(direct.weight)) > 0
+    assert lit.sum() > 1000
+    ratio = changed(direct.emission_ratio, plain.emission_ratio)
+    cell, _ = guided.cell(direct.index, at.p, -direct.d, mi.Bool(True))
+    shape = scene.emitters()[0].get_shape()
+    if shape is None or is_flat(shape):
+        expected = tables.densities().ravel()[values(cell).astype(int)]
+        assert np.mean(np.abs(ratio - expected)[lit] > 2e-3 * expected[lit]) < 2e-2
+    if not emitters.hittable:
+        return
+    hit = scene.ray_intersect(mi.Ray3f(at.p, direct.d, 0.3, mi.Color0f()))
+    seen = (values(dr.select(hit.emitter(scene) != dr.zeros(mi.EmitterPtr), 1.0, 0.0)) > 0) & lit
+    assert seen.sum() > 1000
+    after, before = (x.hit_densities(hit, at.p, mi.Bool(True))[2] for x in (guided, emitters))
+    off = np.abs(changed(after, before) - ratio) > 2e-3 * ratio
+    assert off[seen].mean() < 2e-2
+    _, known = guided.hit_cell(hit, at.p, mi.Bool(True))
+    assert values(known)[seen].all()
+
+
+@pytest.mark.parametrize("n", [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, -0.0], [0.6, 0.8, 0.0]])
+def test_frames_do_not_depend_on_who_asks(n):
+    """Rationale: a frame made of a normal is mirrored by the sign of a zero, and a table with it.
+
+    Expected: the place of a direction is the same for directions and normals that differ by rounding.
+    """
+    turn = mi.ScalarTransform4f().look_at([0, 0, 0], n, [0.3, 0.2, 0.9])
+    lamp = {"type": "rectangle", "to_world": turn, "emitter": {"type": "area"}}
+    sun = {"type": "directional", "direction": n}
+    for light in ({"lamp": lamp}, {"sun": sun}):
+        ball = {"type": "sphere", "radius": 2.0}
+        made = Emitters(mi.load_dict({"type": "scene", "ball": ball} | light)).placed()
+        towards = np.array([n] * 7) + np.vstack([np.zeros(3), 1e-7 * np.eye(3), -1e-7 * np.eye(3)])
+        d = dr.normalize(mi.Vector3f(*(mi.Float(np.float32(v)) for v in towards.T)))
+        if "lamp" in light:  # not the middle, where all cells meet
+            d = dr.normalize(d + mi.Vector3f(0.21, -0.17, 0.11))
+        cell, _ = made.cell(mi.UInt32(0), mi.Point3f(0.3, -0.4, 0.5), d, mi.Bool(True))
+        assert len(set(np.array(cell).tolist())) == 1
+
+
+def test_what_is_flat():
+    """Expected: rectangles, disks and meshes of one normal; not balls, cubes, and bent planes."""
+    shapes = {
+        "rectangle": ({"type": "rectangle"}, True),
+        "disk": ({"type": "disk"}, True),
+        "sphere": ({"type": "sphere"}, False),
+        "cube": ({"type": "cube"}, False),
+        "cylinder": ({"type": "cylinder"}, False),
+    }
+    for name, (shape, flat) in shapes.items():
+        assert is_flat(mi.load_dict(shape)) == flat, name
+    for name in ("flat mesh", "smooth mesh"):  # of many faces, without and with normals at vertices
+        scene = scene_of(name)
+        assert not is_flat(scene.emitters()[0].get_shape()), name
+    plane = mi.Mesh("plane", 4, 2, has_vertex_normals=False)
+    params = mi.traverse(plane)
+    params["vertex_positions"] = [0, 0, 0, 1, 0, 0, 1, 1, 0, 0, 1, 0]
+    params["faces"] = [0, 1, 2, 0, 2, 3]
+    params.update()
+    assert is_flat(plane)
+    params["vertex_positions"] = [0, 0, 0, 1, 0, 0, 1, 1, 0, 0, 1, 0.1]
+    params.update()
+    assert not is_flat(plane)
+
+
+def test_only_what_gains_is_looked_up():
+    """Rationale: looking densities up takes time at every vertex. Expected: of emitters whose tables are
+    uniform, no group has a guide, and a lamp beside a guided one emits as by itself.
+    """
+    scene = scene_of("constant", more=parts.EMITTERS["rectangle"]())
+    emitters = Emitters(scene)
+    tables = random_tables(emitters)
+    densities = tables.densities()
+    sky = next(i for i, e in enumerate(scene.emitters()) if e.get_shape() is None)
+    first = sum(emitters.tables[:sky])
+    densities[first : first + emitters.tables[sky]] = 1
+    guided = emitters.placed(EmissionTables.of(densities, 0.25, 0.5))
+    groups = {type(group).__name__: group.guide for group in guided.groups}
+    assert groups["InfiniteEmitters"] is None and groups["AreaEmitters"] is not None
+    assert guided.disks is emitters.disks
+
+
+@pytest.mark.parametrize("radius, kept", [(0.02, True), (1.0, False)])
+def test_details_smaller_than_a_cell_keep_their_disk(radius, kept):
+    """Expected: emissions towards small things on a large ground are half of all, with tables as without."""
+    ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(10)}
+    thing = {"type": "sphere", "center": [3, 2, radius], "radius": radius}
+    sun = {"type": "directional", "direction": [0.1, 0.2, -1]}
+    emitters = Emitters(mi.load_dict({"type": "scene", "ground": ground, "thing": thing, "sun": sun}))
+    assert emitters.disks.details is not None
+    uniform = random_tables(emitters)
+    guided = emitters.placed(uniform)
+    assert (guided.disks.details is not None) == kept
+    e = emissions(guided)
+    d = column(e.d)
+    away = column(e.si.p) - np.array([[3], [2], [radius]])
+    near = np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < 1.8 * radius
+    assert (0.4 < near.mean() < 0.6) == kept
+
+
+# -- tables ---------------------------------------------------------------------------------------------
+
+
+def test_tables_come_back_from_json():
+    """Expected: the same tables; densities within half of a step of 2^(1/16), of mean 1."""
+    densities = np.random.default_rng(3).random((5, 8, 8)) + 0.1
+    densities /= densities.mean(axis=(1, 2), keepdims=True)
+    tables = EmissionTables.of(densities, 0.25, 0.5)
+    again = EmissionTables.read(json.loads(json.dumps(tables.record())))
+    assert again == tables and hash(again) == hash(tables)
+    np.testing.assert_allclose(again.densities(), densities, rtol=0.045)
+    np.testing.assert_allclose(again.densities().mean(axis=(1, 2)), 1)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"side": 5},
+        {"side": True},
+        {"least": 0},
+        {"least": "1"},
+        {"left": 2},
+        {"levels": "not text of base64"},
+        {"levels": 3},
+        {"levels": ""},
+        {"more": 1},
+    ],
+    ids=str,
+)
+def test_other_json_is_refused(change):
+    """Expected: ``ValueError`` or ``TypeError`` that names what is wrong."""
+    record = EmissionTables.of(np.ones((1, 8, 8)), 0.25, 0.5).record() | change
+    with pytest.raises((ValueError, TypeError), match="emission"):
+        EmissionTables.read(record)
+
+
+def test_levels_that_unpack_to_too_much_are_refused():
+    """Rationale: a few bytes of packed zeros are gigabytes. Expected: refused."""
+    tables = EmissionTables.of(np.ones((MOST_CELLS // 16 + 1, 4, 4)), 0.25, 0.5)
+    with pytest.raises(ValueError, match="cells"):
+        EmissionTables.read(tables.record())
+
+
+def test_tables_of_another_scene_are_refused():
+    """Expected: an error that says how many tables this scene's emitters need."""
+    emitters = Emitters(scene_of("constant"))
+    with pytest.raises(UsageError, match="has 1 tables.* need 16"):
+        emitters.placed(EmissionTables.of(np.ones((1, 16, 16)), 0.25, 0.5))
+
+
+@pytest.mark.parametrize("count", [0, 1, 32, 33, 128, 129, 512, 513])
+def test_sizes_of_tables(count):
+    """Expected: no more than `MOST_CELLS` cells, and the most that fit."""
+    side = side_of(count)
+    if not 0 < count <= MOST_CELLS // SIDES[-1] ** 2:
+        assert side == 0
+        return
+    assert count * side**2 <= MOST_CELLS
+    assert all(count * other**2 > MOST_CELLS for other in SIDES if other > side)
+
+
+def test_warped_numbers_are_distributed_as_the_tables_say():
+    """Expected: of stratified numbers each cell gets its share, within a few of `COUNT`; the stated density
+    is that of the cell in which the number is; the order of neighbours stays.
+    """
+    emitters = Emitters(scene_of("rectangle"))
+    tables = random_tables(emitters)
+    guided = emitters.placed(tables)
+    side, n = tables.side, 512
+    x, y = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n)
+    u = mi.Point2f(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)))
+    warped, density = guided.groups[0].guide.warp(mi.UInt32(0), mi.UInt32(0), u, mi.Bool(True))
+    cell = np.array(cell_at(warped, side))
+    shares = np.bincount(cell, minlength=side**2) / n**2
+    expected = tables.densities().ravel() / side**2
+    # A cell's edges cut rows and columns of numbers anywhere.
+    np.testing.assert_allclose(shares, expected, atol=4 / n * np.sqrt(expected.max()))
+    stated = tables.densities().ravel()[cell]
+    assert np.mean(np.abs(np.array(density) - stated) > 1e-4 * stated) < 1e-3
+    rows = np.array(warped.y).reshape(n, n)
+    assert (np.diff(rows, axis=0) >= 0).all()
+    assert (np.diff(np.array(warped.x).reshape(n, n)[0]) >= 0).all()
+
+
+def test_a_copy_leaves_the_emitters_alone():
+    """Expected: emitters that tables were made for emit as before."""
+    emitters = Emitters(scene_of("sphere"))
+    before = column(emissions(emitters).pdf_second)
+    guided = emitters.placed(random_tables(emitters))
+    assert (column(emissions(guided).pdf_second) != before).mean() > 0.9
+    np.testing.assert_array_equal(column(emissions(emitters).pdf_second), before)
+    assert replace(random_tables(emitters), left=0.7) != random_tables(emitters)

@@ -1,0 +1,395 @@
+"""Guided emission: unbiased with any tables, in the paths' weights and in images; when and what it gains."""
+
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import scene_parts as parts
+import welch as st
+from mitsuba_bdpt.emitters.emission_tables import EmissionTables, side_of
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from mitsuba_bdpt.planning import emission
+from snapshots import ROUNDING, stopped
+from stress_cases.capture import Capture
+from stress_cases.weights import Tally, weigh
+
+SCENES = Path(__file__).parents[2] / "scenes"
+T = mi.ScalarTransform4f
+CLASSES = emission.CLASSES
+
+
+def random_tables(scene, seed=1, least=0.25):
+    """Tables of a scene's emitters, of neighbours that differ by up to 50."""
+    emitters = Emitters(scene)
+    side = side_of(emitters.table_count)
+    densities = np.random.default_rng(seed).random((emitters.table_count, side, side)) ** 4 + 0.02
+    return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), least, 0.5)
+
+
+def decided(tables, light_paths=1.0, connections="all", kappa=1.0):
+    """The decision for all strategies, with ``tables``."""
+    way = {"pass": 0, "light_paths": light_paths, "connections": connections, "emission": tables.record()}
+    more = {"coefficients": {"t<=1": kappa, "s=1": 1.0}, "cost": 1.0, "variance": 0.0, "mean": 0.0}
+    return json.dumps([way | more])
+
+
+def images(scene, spp, seeds, first=0, **parameters):
+    """(seeds, height, width) of the first colour."""
+    method = mi.load_dict({"type": "bdpt", "max_depth": 4, "rr_depth": 100, **parameters})
+    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
+    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
+
+
+LAMPS = {
+    "rectangle": ["rectangle"],
+    "upright rectangle": ["upright"],
+    "disk": ["disk"],
+    "sphere": ["sphere"],
+    "smooth mesh": ["smooth mesh"],
+    "textured": ["textured"],
+    "spot": ["spot"],
+    "point and rectangle": ["point", "rectangle"],
+    "constant": ["constant"],
+    "sun along an axis": ["down"],
+    "sun and sky": ["directional", "constant"],
+    "envmap": ["rotated envmap"],
+    "projector and sphere": ["projector", "sphere"],
+}
+
+OWN = {
+    "upright": lambda: (
+        parts.EMITTERS["rectangle"]()
+        | {"to_world": T().translate([1.5, 1, 0]).rotate([0, 1, 0], -90).scale(0.4)}
+    ),
+    "down": lambda: {"type": "directional", "direction": [0, -1, 0], "irradiance": 2.0},
+}
+
+
+def scene_of(lamps, sensor="perspective", **more):
+    parts.register_plugins()
+    made = {f"lamp {i}": (OWN.get(name) or parts.EMITTERS[name])() for i, name in enumerate(LAMPS[lamps])}
+    eye = parts.thinlens(aperture=0.6) if sensor == "thinlens" else parts.perspective()
+    return mi.load_dict(parts.open_scene(eye, **made, **more))
+
+
+# -- unbiased -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lamps", LAMPS)
+def test_images_are_those_without_tables(lamps):
+    """Expected: the same tiles, by Welch's test, with all strategies."""
+    scene = scene_of(lamps)
+    a = images(scene, 256, 10, decisions=decided(random_tables(scene)))
+    b = images(scene, 256, 10, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+
+
+@pytest.mark.parametrize("lamps", ["rectangle", "sphere", "point and rectangle", "sun and sky"])
+def test_images_with_a_wide_lens(lamps):
+    """Rationale: t = 0 and (1,1) ask for densities too. Expected: the same tiles, by Welch's test."""
+    scene = scene_of(lamps, "thinlens")
+    a = images(scene, 256, 10, decisions=decided(random_tables(scene)))
+    b = images(scene, 256, 10, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"heuristic": "power"},
+        {"heuristic": "maximum"},
+        {"heuristic": "uniform"},
+        {"points": "independent"},
+        {"hide_emitters": True},
+        {"stored_vertices": 2},
+    ],
+    ids=lambda parameters: next(iter(parameters)) + "=" + str(next(iter(parameters.values()))),
+)
+def test_parameters(parameters):
+    """Expected: the same tiles as without tables, with four camera subpaths per light subpath and one drawn
+    connection.
+    """
+    scene = scene_of("point and rectangle")
+    decisions = decided(random_tables(scene), 0.25, "one", 0.5)
+    a = images(scene, 256, 10, decisions=decisions, **parameters)
+    keep = {"hide_emitters": True} if "hide_emitters" in parameters else {}
+    b = images(scene, 256, 10, first=100, skip="none", **keep)
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+def test_variants(variant):
+    """Expected: the same tiles as without tables."""
+    mi.set_variant(variant)
+    scene = scene_of("sun and sky")
+    a = images(scene, 64, 8, decisions=decided(random_tables(scene)))
+    b = images(scene, 64, 8, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+
+
+def fog():
+    medium = {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.7}
+    box = {"type": "cube", "to_world": T().translate([0, 1, 0]).scale(0.9), "bsdf": {"type": "null"}}
+    return {"fog": box | {"interior": medium}}
+
+
+def test_fog():
+    """Expected: the same tiles as without tables, in a box of fog."""
+    scene = scene_of("point and rectangle", **fog())
+    a = images(scene, 256, 10, decisions=decided(random_tables(scene)))
+    b = images(scene, 256, 10, first=100, skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+
+
+def test_merging():
+    """Rationale: photons set out by the same tables, mixed with their own aim. Expected: the same tiles as
+    merging without tables (a glass ball under a lamp; blur is the same).
+    """
+    glass = {"type": "sphere", "center": [0.2, 0.9, 0.9], "radius": 0.3, "bsdf": {"type": "dielectric"}}
+    scene = scene_of("point and rectangle", glass=glass)
+    a = images(scene, 256, 10, decisions=decided(random_tables(scene)), merging=True)
+    b = images(scene, 256, 10, first=100, skip="none", merging=True)
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+
+
+@pytest.mark.parametrize("heuristic", ["balance", "power"])
+@pytest.mark.parametrize("lamps", ["rectangle", "sphere", "spot", "constant", "sun along an axis"])
+def test_weights_are_those_of_explicit_densities(lamps, heuristic):
+    """Rationale: what partial sums say of a path has to be what all densities say, those of tables in closed
+    form. Expected: weights of real paths within 1e-3, and sums of 1 (but for the 2 % where rounding decides).
+    """
+    scene = scene_of(lamps, "thinlens" if lamps != "spot" else "perspective")
+    tables = random_tables(scene)
+    more = {"max_depth": 4, "heuristic": heuristic, "decisions": decided(tables)}
+    tally = Tally()
+    weigh(tally, Capture(scene, mi.load_dict({"type": "bdpt", **more}), 4000, 3), heuristic)
+    assert tally.bad == 0 and tally.paths > 3000
+    # Within rounding of a cell's edge one side takes the neighbour's density.
+    assert tally.wrong < 2e-3 * tally.paths and tally.off < 2e-3 * tally.paths
+
+
+# -- what a pilot learns --------------------------------------------------------------------------------
+
+
+def heard_of(squares, odds, seed=0, noise=0.0):
+    """What two halves of a pilot hear of these second moments (side, side), in one class of ``odds``."""
+    rng = np.random.default_rng(seed)
+    heard = np.zeros((2, squares.size, CLASSES))
+    kind = int(np.clip(np.log2(odds) / 2 + CLASSES / 2, 0, CLASSES - 1))
+    for half in range(2):
+        heard[half, :, kind] = (squares * np.exp(noise * rng.standard_normal(squares.shape))).ravel()
+    return heard
+
+
+def test_the_best_table_of_paths_that_emission_alone_makes():
+    """Expected: densities by the root of the second moments, as for any importance sampling, and what is left
+    is the square of the mean root over the mean (Cauchy and Schwarz). Tolerance: the least density and a
+    step of the tables; moments vary slowly, so that the blur is small.
+    """
+    x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 16))
+    squares = np.exp(4 * x + 2 * y)
+    learnt = emission.learn(heard_of(squares, 4.0**4), 16, [1])
+    root = np.sqrt(squares)
+    expected = learnt.tables.least + (1 - learnt.tables.least) * root / root.mean()
+    np.testing.assert_allclose(learnt.tables.densities()[0], expected, rtol=0.08)
+    assert learnt.left == pytest.approx(root.mean() ** 2 / squares.mean(), rel=0.1)
+    assert learnt.whole == pytest.approx(learnt.left, rel=0.05)
+
+
+def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
+    """Expected: no tables where emission has a 256th part in the densities, whatever the moments are."""
+    squares = np.ones((16, 16))
+    squares[3:5, 7:9] = 1e4
+    assert emission.learn(heard_of(squares, 4.0**-4), 16, [1]).whole > 0.95
+    few = heard_of(squares, 4.0**4) * 1e-3 + heard_of(np.full((16, 16), 1e4), 4.0**-4)
+    assert emission.learn(few, 16, [1]).whole > 0.95
+
+
+def test_noise_teaches_nothing():
+    """Rationale: a table of noise destroys what points achieve. Expected: none of moments that differ by
+    noise alone, in 20 of 20 pilots; one where the same noise lies over a real difference.
+    """
+    even, odd = np.ones((16, 16)), np.ones((16, 16))
+    odd[4:8, 4:8] = 400
+    for seed in range(20):
+        assert emission.learn(heard_of(even, 16.0, seed, noise=2.0), 16, [1]).tables is None
+        assert emission.learn(heard_of(odd, 16.0, seed, noise=1.0), 16, [1]).tables is not None
+
+
+def test_outliers_alone_teach_nothing():
+    """Expected: no tables where all that is gained is in the cells with most, and the rest loses."""
+    squares = np.exp(np.random.default_rng(2).standard_normal((16, 16)))
+    squares[2, 3] = 1e5
+    assert emission.learn(heard_of(squares, 64.0), 16, [1]).tables is None
+
+
+def test_emitters_without_a_part_are_left_alone():
+    """Expected: of two lamps the one that gains has a table, the other a uniform one."""
+    squares = np.ones((2, 16, 16))
+    squares[0, 4:8, 4:8] = 400
+    squares[1] = 1e-3
+    learnt = emission.learn(heard_of(squares, 64.0), 16, [1, 1])
+    densities = learnt.tables.densities()
+    assert densities[0].std() > 0.5 and (densities[1] == 1).all()
+
+
+@pytest.mark.parametrize("value", [0.0, np.inf, np.nan])
+def test_nothing_heard(value):
+    """Expected: no tables of nothing, and none of what is no number."""
+    heard = np.full((2, 256, CLASSES), value)
+    assert emission.learn(heard, 16, [1]) == emission.Learnt(None)
+
+
+# -- renders --------------------------------------------------------------------------------------------
+
+
+def spotlit(size=32):
+    """A box with a hole in its lid about a lamp: most of what it emits stays inside."""
+    lamp = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 1.2, 0]).rotate([1, 0, 0], -90).scale(0.1),
+        "emitter": {"type": "area", "radiance": 100.0},
+        "bsdf": parts.grey(0.0),
+    }
+    dark = {"type": "diffuse", "reflectance": 0.02}
+    hood = {
+        "type": "cylinder",
+        "p0": [0, 1.1, 0],
+        "p1": [0, 2.0, 0],
+        "radius": 0.2,
+        "bsdf": {"type": "twosided", "bsdf": dark},
+    }
+    ceiling = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(2),
+        "bsdf": parts.grey(0.8),
+    }
+    eye = parts.perspective(origin=[0, 1.0, 4], target=[0, 0.8, 0]) | {"film": parts.film(size)}
+    return mi.load_dict(parts.room(eye, lamp=lamp, hood=hood, ceiling=ceiling))
+
+
+def rendered(scene, seed=0, spp=64, **parameters):
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
+    image = np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64)[..., :3]
+    return image, method
+
+
+def test_it_gains_and_says_so():
+    """Expected: a lamp in a hood is aimed at its opening; `explain`, the decision and the log of skipped
+    classes say so, and the error over that without is what was predicted of light subpaths or better than
+    0.85. Trimmed, of means over five seeds; the reference has 4,096 samples.
+    """
+    scene = spotlit()
+    reference = np.mean([rendered(scene, 50 + i, 512, emission_guiding="never")[0] for i in range(8)], axis=0)
+    never = [rendered(scene, i, emission_guiding="never") for i in range(5)]
+    auto = [rendered(scene, i) for i in range(5)]
+    errors = [np.mean([rel_mse(image, reference, TRIM) for image, _ in of]) for of in (auto, never)]
+    decision = auto[0][1].statistics["decisions"][0]
+    assert decision["emission"]["left"] < 0.9
+    assert never[0][1].statistics["decisions"][0]["emission"] is None
+    assert errors[0] < 0.85 * errors[1], errors
+    text = auto[0][1].explain(scene, spp=64)
+    assert "used: guided emission (light subpaths are aimed; the pilot predicts that" in text
+    assert "skipped (by hand): guided emission: emission_guiding=never" in never[0][1].explain(scene, spp=64)
+
+
+def test_light_that_path_tracing_would_find_alone():
+    """Rationale: where light subpaths do not pay before they are aimed, a second pilot asks whether they do.
+    Expected: in a room with a window they do, and without tables path tracing alone is chosen.
+    """
+    scene = mi.load_file(str(SCENES / "window_room.xml"), resolution=128)
+    ways = {}
+    for guiding in ("never", "auto"):
+        _, method = rendered(scene, spp=64, emission_guiding=guiding)
+        decision = method.statistics["decisions"][0]
+        ways[guiding] = decision["light_paths"], decision["emission"] is not None
+        asked = method.statistics["pilots"]["asked"]
+    assert ways["never"] == (0.0, False)
+    assert ways["auto"][0] > 0 and ways["auto"][1] and asked == 2
+
+
+def test_where_nothing_is_gained_nothing_changes():
+    """Expected: in a furnace the pilot teaches nothing, the image is that with guiding switched off to the
+    last bit of sums, and the reason is told.
+    """
+    light = {"type": "point", "position": [0, 0, 0], "intensity": 1.0}
+    ball = {"type": "sphere", "radius": 2.0, "flip_normals": True, "bsdf": parts.grey(0.7)}
+    eye = parts.perspective(origin=[0, 0, 1], target=[0, 0, 0], fov=90) | {"film": parts.film(32)}
+    scene = mi.load_dict({"type": "scene", "sensor": eye, "ball": ball, "light": light})
+    a, method = rendered(scene)
+    b, _ = rendered(scene, emission_guiding="never")
+    np.testing.assert_allclose(a, b, **ROUNDING)
+    (why,) = (s["why"] for s in method.statistics["skipped"] if s["class"] == "guided emission")
+    assert "less than 90% would pay" in why
+
+
+def test_many_lamps_have_small_tables_or_none():
+    """Expected: 40 lamps have tables of 8 x 8, and 513 none, which is said."""
+
+    def lamps(count):
+        return {
+            f"lamp{i}": {"type": "point", "position": [0.01 * i, 2, 0], "intensity": 0.1}
+            for i in range(count)
+        }
+
+    many = mi.load_dict(parts.open_scene(**lamps(40)))
+    assert Emitters(many).placed().side == 8
+    most = mi.load_dict(parts.open_scene(**lamps(513)))
+    text = mi.load_dict({"type": "bdpt", "max_depth": 4}).explain(most, spp=4)
+    assert "guided emission: 513 tables would be needed, and 512 are the most" in text
+
+
+def test_a_decision_is_done_again():
+    """Expected: with ``decisions`` the same image, and what they record again; without a pilot."""
+    scene = spotlit()
+    image, method = rendered(scene)
+    decisions = method.statistics["decisions"]
+    again, other = rendered(scene, decisions=json.dumps(decisions))
+    np.testing.assert_allclose(again, image, **ROUNDING)
+    assert other.statistics["decisions"] == decisions and other.statistics["pilots"]["asked"] == 0
+
+
+def test_tables_of_another_scene():
+    """Expected: an error that names ``decisions``, before anything is rendered."""
+    scene = scene_of("sun and sky")
+    method = mi.load_dict({"type": "bdpt", "decisions": decided(random_tables(scene_of("sphere")))})
+    with pytest.raises(ValueError, match="decisions: emission has 1 tables"):
+        method.render(scene, spp=1)
+
+
+@pytest.mark.parametrize("record", [{"side": 16}, 3, "text"])
+def test_broken_tables(record):
+    """Expected: an error that quotes ``decisions`` and names what is wrong."""
+    way = json.loads(decided(random_tables(scene_of("sphere"))))
+    way[0]["emission"] = record
+    with pytest.raises(Exception, match="entry 0.*emission"):
+        mi.load_dict({"type": "bdpt", "decisions": json.dumps(way)})
+
+
+def test_a_stopped_render_goes_on():
+    """Expected: one that is stopped after its first pass and goes on from the snapshot's bytes gives the
+    image of one that is not, tables included.
+    """
+    scene = spotlit()
+
+    def method():
+        return mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 16})
+
+    arguments = {"seed": 3, "spp": 64}
+    whole = np.array(method().render(scene, **arguments))
+    snapshot = stopped(method(), scene, 1, **arguments)
+    assert snapshot.progress.decided.decisions[0].emission is not None
+    rest = np.array(method().render(scene, start=snapshot, **arguments))
+    np.testing.assert_allclose(rest, whole, **ROUNDING)
+
+
+def test_later_pilots_refine_the_tables():
+    """Expected: a long render asks again, and the sums of both pilots teach; tables change only if better."""
+    scene = spotlit(16)
+    _, method = rendered(scene, spp=256, spp_per_pass=32)
+    statistics = method.statistics
+    assert statistics["pilots"]["asked"] >= 2
+    assert all(d["emission"] for d in statistics["decisions"])
