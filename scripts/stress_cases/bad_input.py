@@ -50,6 +50,7 @@ SENSIBLE = {
     "connections": ("auto", "all", "one", "none"),
     "points": ("sobol", "sampler", "independent"),
     "photon_guiding": ("auto", "always", "never"),
+    "emission_guiding": ("auto", "never"),
     "aovs": ("", "albedo:albedo", "dd:depth,nn:sh_normal"),
     "decisions": ("", "[]"),
 }

@@ -592,6 +592,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         merging=None,
         guide=None,
         without_isolated=False,
+        tells_emission=False,
         sensor_medium=None,
         scatters=True,
     )
@@ -643,7 +644,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
 
     scene.begin(from_light=True)
     monkeypatch.setattr(dr, "while_loop", python_loop(k if plan.arrival else k - 1))
-    path, _ = kernel._light_subpath(k_, sink.Image(Nothing()), k_.points.stream(), shared, None)
+    path, _, _ = kernel._light_subpath(k_, sink.Image(Nothing()), k_.points.stream(), shared, None)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
     place = SimpleNamespace(index=lambda slot: slot, pixel=lambda slot: mi.Point2i(0))

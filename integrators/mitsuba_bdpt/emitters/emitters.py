@@ -295,7 +295,8 @@ class Emitters:
         )
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
-        direct.index = chosen.index
+        if self.side:  # branches would carry it along
+            direct.index = chosen.index
         if self.shape_errors.small:
             direct.met = rounding.met(chosen.emitter.get_shape())
         return direct

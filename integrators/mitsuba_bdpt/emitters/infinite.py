@@ -65,11 +65,12 @@ class InfiniteEmitters(Group):
     def place(self, index, p, d, active) -> Place:
         return Place(self._bin(index, d, active), self.disks.place(p, d))
 
-    def _point_pdf_a(self, index, p, d, active):
-        """Density with which a subpath along ``d`` passes ``p`` (area across ``d``)."""
+    def _point_pdf_a(self, index, p, d, active, sign=1):
+        """Density with which a subpath along ``d``, times ``sign``, passes ``p`` (area across ``d``)."""
         if self.guide is None:
             return self.disks.pdf_a(p, d)
-        return self.disks.pdf_a(p, d, self.guide.density(index, self.place(index, p, d, active), active))
+        place = self.place(index, p, d * sign, active)
+        return self.disks.pdf_a(p, d, self.guide.density(index, place, active))
 
     def _sample_point(self, index, d, u, active):
         """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
@@ -126,13 +127,13 @@ class InfiniteEmitters(Group):
             anchor=rays.free_anchor(ds.p),
             infinite=mi.Bool(True),
             delta=directional,
-            emission_ratio=self._point_pdf_a(chosen.index, si.p, -ds.d, active),
+            emission_ratio=self._point_pdf_a(chosen.index, si.p, ds.d, active, -1),
         )
 
     def hit_densities(self, chosen: Chosen, hit: Hit, active):
         ds = hit.direction()
         pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
-        return pdf_w, mi.Float(pdf_w), self._point_pdf_a(chosen.index, hit.previous.p, -ds.d, active)
+        return pdf_w, mi.Float(pdf_w), self._point_pdf_a(chosen.index, hit.previous.p, ds.d, active, -1)
 
 
 def _is_directional(emitter) -> bool:
