@@ -855,6 +855,75 @@ MUTANTS = (
         "order = dr.argsort(mi.UInt64(bucket) |",
         ("tests/images/test_merging.py::test_photons_are_in_the_same_order_on_any_number_of_threads",),
     ),
+    Mutant(
+        "guided emission: the density is forgotten in emission",
+        "emitters/area.py",
+        "of_flat = mi.warp.square_to_cosine_hemisphere_pdf(local) * density",
+        "of_flat = mi.warp.square_to_cosine_hemisphere_pdf(local)",
+        ("tests/emitters/test_guided_emission.py::test_light_leaves_as_without_tables[rectangle]",),
+    ),
+    Mutant(
+        "guided emission: s = 1 takes emission for not guided",
+        "emitters/area.py",
+        "direction = self._direction_pdf_w(chosen.index, cos_shading, -ds.d, active)",
+        "direction = dr.maximum(cos_shading, 0) * dr.inv_pi",
+        (
+            "tests/images/test_guided_emission.py::test_weights_are_those_of_explicit_densities[rectangle-balance]",
+        ),
+    ),
+    Mutant(
+        "guided emission: s = 1 asks for the opposite direction",
+        "emitters/infinite.py",
+        "place = self.place(index, p, d * sign, active)",
+        "place = self.place(index, p, d, active)",
+        (
+            "tests/emitters/test_guided_emission.py::test_next_event_estimation_and_hits_state_the_same[constant]",
+        ),
+    ),
+    Mutant(
+        "guided emission: a table is looked up mirrored",
+        "emitters/area.py",
+        "flat = mi.warp.cosine_hemisphere_to_square(known.frame().to_local(d))",
+        "flat = mi.warp.cosine_hemisphere_to_square(known.frame().to_local(d) * mi.Vector3f(-1, 1, 1))",
+        (
+            "tests/images/test_guided_emission.py::test_weights_are_those_of_explicit_densities[rectangle-power]",
+        ),
+    ),
+    Mutant(
+        "guided emission: frames of disks depend on rounding",
+        "emitters/disks.py",
+        "turned = mi.Frame3f(mi.Vector3f(dr.dot(x, d), dr.dot(y, d), dr.dot(z, d)))\n    s, t",
+        "return mi.Frame3f(d)\n    s, t",
+        ("tests/emitters/test_guided_emission.py::test_frames_do_not_depend_on_who_asks[n3]",),
+    ),
+    Mutant(
+        "guided emission: directions that are turned count once",
+        "emitters/area.py",
+        "by_table = dr.select(cos > 0, (density + turned) * dr.inv_four_pi, 0)",
+        "by_table = dr.select(cos > 0, density * dr.inv_two_pi, 0)",
+        ("tests/emitters/test_guided_emission.py::test_light_leaves_as_without_tables[sphere]",),
+    ),
+    Mutant(
+        "guided emission: both halves of a pilot teach and judge",
+        "planning/emission.py",
+        "found = [_left(heard[1 - i], a + (1 - a) * halves[i]) for i in range(HALVES)]",
+        "found = [_left(heard[i], a + (1 - a) * halves[i]) for i in range(HALVES)]",
+        ("tests/images/test_guided_emission.py::test_noise_teaches_nothing",),
+    ),
+    Mutant(
+        "guided emission: what camera subpaths find is aimed at",
+        "planning/emission.py",
+        "density = density * np.sqrt((squares * share / total**2).sum(axis=-1))",
+        "density = density * np.sqrt((squares / total**2).sum(axis=-1))",
+        ("tests/images/test_guided_emission.py::test_the_best_table_of_unequal_shares",),
+    ),
+    Mutant(
+        "guided emission: splats teach as if each light subpath had a camera sample",
+        "planning/pilot.py",
+        "self._hear(c, size * np.sqrt(self._weight), c.position, c.active)",
+        "self._hear(c, size, c.position, c.active)",
+        ("tests/images/test_guided_emission.py::test_what_a_pilot_hears",),
+    ),
 )
 
 

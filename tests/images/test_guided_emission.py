@@ -11,7 +11,8 @@ import welch as st
 from mitsuba_bdpt.emitters.emission_tables import EmissionTables, side_of
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
-from mitsuba_bdpt.planning import emission
+from mitsuba_bdpt.planning import emission, pilot
+from mitsuba_bdpt.run import rendering
 from snapshots import ROUNDING, stopped
 from stress_cases.capture import Capture
 from stress_cases.weights import Tally, weigh
@@ -206,6 +207,58 @@ def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
     assert emission.learn(heard_of(squares, 4.0**-4), 16, [1]).whole > 0.95
     few = heard_of(squares, 4.0**4) * 1e-3 + heard_of(np.full((16, 16), 1e4), 4.0**-4)
     assert emission.learn(few, 16, [1]).whole > 0.95
+
+
+def test_the_best_table_of_unequal_shares():
+    """Rationale: l has to count where it differs from cell to cell. Expected: what is left is within 2 % of
+    the least that a search finds, over densities that have two values (no blur: the two halves are large).
+    """
+    squares = np.ones((16, 16))
+    squares[:, :8] = 3.0
+    often, seldom = heard_of(squares, 4.0**1), heard_of(squares, 4.0**-3)
+    heard = np.where((np.arange(256) % 16 < 8)[None, :, None], seldom, often)
+    share = emission.ODDS / (1 + emission.ODDS)
+    whole = heard.sum(axis=0).reshape(16, 16, CLASSES)
+
+    def moment(high):
+        density = np.where(np.arange(16) < 8, high, 2 - high)[None, :, None]
+        return (whole / (1 - share + density * share)).sum()
+
+    least = min(moment(high) for high in np.linspace(0.05, 1.95, 400))
+    fitted = emission._fitted(heard.sum(axis=0).reshape(1, 16, 16, CLASSES))[0]
+    found = (whole / (1 - share + fitted[..., None] * share)).sum()
+    assert found < 1.02 * least
+    assert moment(1.0) > 1.02 * least
+
+
+def test_what_a_pilot_hears():
+    """Rationale: of the second moments of light tracing and of camera subpaths each counts once per sample.
+    Expected: for the floor under a lamp, which s = 1 and t = 1 find, the sums are the same whatever the
+    number of light subpaths, within 15 % (noise; a factor of two and more if splats counted by themselves).
+    """
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": parts.perspective(origin=[0, 2, 0.01], target=[0, 0, 0], fov=40)
+            | {"film": parts.film(32)},
+            "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": parts.grey(0.6)},
+            "lamp": {
+                "type": "spot",
+                "to_world": T().look_at([0, 1.5, 0], [0, 0, 0], [0, 0, 1]),
+                "cutoff_angle": 20,
+                "beam_width": 19,
+            },
+        }
+    )
+    render = rendering.Render(scene, scene.sensors()[0], mi.load_dict({"type": "bdpt"}).settings, 0, 64)
+    heard = []
+    for times in (1, 4):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pilot, "LIGHT_TIMES", times)
+            found = pilot.measure(render.prepared, render.plan, render.settings, mi.UInt32(5), 1 << 15)
+        by_class = found.emission.sum(axis=(0, 1))
+        heard.append([by_class[CLASSES // 2 :].sum(), by_class.sum()])
+    np.testing.assert_allclose(heard[0], heard[1], rtol=0.15)
 
 
 def test_noise_teaches_nothing():

@@ -10,7 +10,7 @@ Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. T
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import drjit as dr
@@ -79,10 +79,10 @@ class Moments:
     draw: np.ndarray
     isolated: np.ndarray
     gain: np.ndarray
-    emission: np.ndarray
     mean: float
     rays: dict[str, float]
     lanes: int
+    emission: np.ndarray = field(default_factory=lambda: np.zeros((2, 0, 0)))
 
     def variance(self, draw: np.ndarray | float, stratified: bool = False) -> np.ndarray:
         """Relative variance per sample, shape (`GROUPS`, 2, weightings).
