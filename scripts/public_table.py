@@ -10,6 +10,7 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.measure import analysis, report
 from mitsuba_bdpt.measure.agreement import Apart, Means, apart, compare_means
 from mitsuba_bdpt.measure.analysis import ALONE, NONE, OWN, NotJudged, Refused, Results, geometric_mean
+from mitsuba_bdpt.measure.efficiency import refused_share
 from mitsuba_bdpt.measure.tables import ratio, said, table
 
 MARK = "Made by `scripts/public_scenes.py`"
@@ -31,7 +32,8 @@ class Check:
     """What bias checks find in a scene, as texts.
 
     ``path``: what it lacks, empty if nothing; ``wrong``: what this package renders wrongly; ``lacks``: which
-    of its integrators lack light as `path` does; ``unchecked``: why there was no check, empty if there was.
+    of its integrators are darker than the reference, though not than `path`; ``unchecked``: why there was no
+    check, if so.
     """
 
     path: str = ""
@@ -45,9 +47,15 @@ def _where(places: list[Apart]) -> str:
     tiles = sorted((place for place in places if place.tile), key=lambda place: -abs(place.share))
     if not tiles:
         return "the whole image alone"
-    listed = ", ".join(f"{p.tile[0]},{p.tile[1]} ({100 * p.share:+.2g} %)" for p in tiles[:LISTED])
+    listed = ", ".join(f"{p.tile[0]},{p.tile[1]} ({_percent(p.share)})" for p in tiles[:LISTED])
     more = f" and {len(tiles) - LISTED} more" if len(tiles) > LISTED else ""
     return f"tile{'s' if len(tiles) > 1 else ''} {listed}{more}"
+
+
+def _percent(share: float) -> str:
+    """A difference in percent, with two digits or more."""
+    value = 100 * share
+    return f"{value:+.2g} %" if abs(value) < 99.5 else f"{value:+.0f} %"
 
 
 def check(results: Results, scene: str) -> Check:
@@ -69,15 +77,15 @@ def check(results: Results, scene: str) -> Check:
     judge = results.references.get(scene) or means[NONE]
     lost, wrong, lacks = _split(apart(means[path], judge)), [], []
     for method, name in OURS.items():
-        darker, brighter = _split(apart(means[method], means[path]))
-        if darker:
-            wrong.append(f"{name} is darker than `{path}` in {_where(darker)}")
+        below, brighter = _split(apart(means[method], means[path]))
+        if below:
+            wrong.append(f"{name} is darker than `{path}` in {_where(below)}")
         if brighter and method == ALONE:
             wrong.append(f"{name} is brighter than `{path}` in {_where(brighter)}")
         darker, brighter = _split(apart(means[method], judge))
         if brighter:
             wrong.append(f"{name} is brighter than the reference in {_where(brighter)}")
-        if darker:
+        if darker and not below:
             lacks.append(name)
     if lost[1]:
         wrong.append(f"`{path}` is brighter than the reference in {_where(lost[1])}")
@@ -114,14 +122,15 @@ class Findings:
         path = self.results.standard_in(scene)[0]
         return analysis.efficiency(self.results.of(scene, method), self.results.of(scene, path), error)
 
-    def _figures(self, method: str, error: str, complete: bool) -> dict[str, float]:
-        """Medians by scene; if ``complete``, of those in which a check finds that `path` has all light."""
+    @cached_property
+    def _figures(self) -> dict[str, dict[tuple[str, str], float]]:
+        """Medians by integrator and error of the scenes that have all of them: one set of scenes for each."""
         found = {}
         for scene in self.results.scenes:
-            if complete and (self.checks[scene].path or self.checks[scene].unchecked):
-                continue
             try:
-                found[scene] = self._figure(scene, method, error).median
+                found[scene] = {
+                    (way, error): self._figure(scene, way, error).median for way in OURS for error in KINDS
+                }
             except Refused:
                 continue
         return found
@@ -206,25 +215,35 @@ given image). The own error of a given image, which includes what else it shows,
         return "".join(f"* {line}\n" for line in [*lines, *self._worst(), *self._bias(), *self._unjudged()])
 
     def _means(self, complete: bool) -> str:
-        """Geometric means over `path`, of scenes in which that finds all light or of all."""
+        """Geometric means over `path`, of scenes in which a check finds that it has all light, or of all."""
+        scenes = [
+            scene
+            for scene in self._figures
+            if not complete or not (self.checks[scene].path or self.checks[scene].unchecked)
+        ]
+        where = "where `path` finds all light" if complete else "also where `path` may miss light"
+        head = f"Geometric means over `path` at equal time, of {len(scenes)} scenes with all figures, {where}"
+        if not scenes:
+            return f"{head}."
         parts = []
         for way, name in OURS.items():
-            for error, kind in KINDS.items():
-                found = self._figures(way, error, complete)
-                mean = ratio(geometric_mean(list(found.values()))) if found else "no figure"
-                parts.append(f"{name} {mean} {kind} ({len(found)} scenes)")
-        where = "where `path` finds all light" if complete else "of all, also where `path` misses light"
-        return f"Geometric means over `path` at equal time, {where}: {', '.join(parts)}."
+            means = [
+                f"{ratio(geometric_mean([self._figures[scene][way, error] for scene in scenes]))} {kind}"
+                for error, kind in KINDS.items()
+            ]
+            parts.append(f"{name} {', '.join(means)}")
+        return f"{head}: {'; '.join(parts)}."
 
     def _worst(self) -> list[str]:
         """The scenes in which the default does worst."""
+        if not self._figures:
+            return []
         parts = []
         for error, kind in KINDS.items():
-            found = self._figures(DEFAULT, error, complete=False)
-            if found:
-                name = min(found, key=lambda scene: found[scene])
-                parts.append(f"`{name}`, {ratio(found[name])} {kind}")
-        return [f"The default's worst scene: {'; '.join(parts)}."] if parts else []
+            found = {scene: figures[DEFAULT, error] for scene, figures in self._figures.items()}
+            name = min(found, key=lambda scene: found[scene])
+            parts.append(f"`{name}`, {ratio(found[name])} {kind}")
+        return [f"The default's worst scene: {'; '.join(parts)}."]
 
     def _bias(self) -> list[str]:
         """What the checks say of `path` and of this package."""
@@ -236,7 +255,7 @@ given image). The own error of a given image, which includes what else it shows,
         lines.append(f"Biased by us: {len(wrong)} of {len(checked)} scenes{':' if wrong else '.'}")
         lines[1] += "".join(f" `{scene}`: {'; '.join(texts)}." for scene, texts in wrong.items())
         lines += [
-            f"`{scene}`: what `path` misses is also missing in these renders by {', '.join(found.lacks)}."
+            f"`{scene}`: {', '.join(found.lacks)}: darker than the reference, no more than `path`."
             for scene, found in checked.items()
             if found.lacks
         ]
@@ -261,7 +280,7 @@ given image). The own error of a given image, which includes what else it shows,
                     if self.made[scene].given
                     else "run again, which goes on with it, with a larger --reference-seconds"
                 )
-                share = f"{100 * why.share:.2g} %"
+                share = refused_share(why.share, 3)
                 lines.append(
                     f"`{scene}`: the reference carries {share} of an error, 1 % is allowed; {remedy}."
                 )
@@ -274,4 +293,4 @@ def _ours(found: Check) -> str:
     """What is said of this package in a scene."""
     if found.wrong:
         return f"**wrong**: {'; '.join(found.wrong)}"
-    return f"passed; {', '.join(found.lacks)} miss light too" if found.lacks else "passed"
+    return f"passed; {', '.join(found.lacks)} darker than the reference" if found.lacks else "passed"
