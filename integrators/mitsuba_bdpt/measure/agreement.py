@@ -133,6 +133,11 @@ def sidak(p) -> float:
     return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 1 - 1e-16))))
 
 
+def _each(significance: float, count: int) -> float:
+    """The p-value below which one of ``count`` comparisons fails the whole check: `sidak` the other way."""
+    return float(-np.expm1(np.log1p(-significance) / count))
+
+
 @dataclass(frozen=True)
 class BiasCheck:
     """What `bias_check` finds.
@@ -290,7 +295,6 @@ def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> Bias
     worst = int(np.lexsort((-np.abs(found.value), found.p))[0])
     tile, channel = divmod(worst, 3)
     family = sidak(found.p)
-    each = -np.expm1(np.log1p(-significance) / len(found.p))
     return BiasCheck(
         passed=family >= significance,
         p=float(found.p[worst]),
@@ -298,6 +302,37 @@ def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> Bias
         comparisons=len(found.p),
         tile=divmod(tile, tiles) if tile < tiles**2 else None,
         channel=channel,
-        difference=_student(found.value[worst], found.error[worst], found.freedom[worst], 1 - each),
+        difference=_student(
+            found.value[worst],
+            found.error[worst],
+            found.freedom[worst],
+            1 - _each(significance, len(found.p)),
+        ),
         missing=missing_energy(ours.whole, theirs.whole),
     )
+
+
+class Apart(NamedTuple):
+    """A ``tile`` (row, column), None for the whole image, and the ``share`` by which the first is brighter.
+
+    The share is of the second's mean, in the most significant channel; infinite where that is black.
+    """
+
+    tile: tuple[int, int] | None
+    share: float
+
+
+def apart(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> list[Apart]:
+    """Where the renders differ, row by row, the whole image at last: nowhere if `compare_means` passes."""
+    significance = number_of("significance", significance, 0, 1)
+    found, tiles = welch(ours.columns, theirs.columns), ours.tiles
+    p = found.p.reshape(-1, 3)
+    channels = p.argmin(axis=1)
+    places = []
+    for index in np.flatnonzero(p.min(axis=1) < _each(significance, found.p.size)):
+        column = 3 * int(index) + int(channels[index])
+        mean, gap = float(theirs.columns.mean[column]), float(found.value[column])
+        share = gap / mean if mean > 0 else math.copysign(math.inf, gap)
+        tile = (int(index) // tiles, int(index) % tiles) if index < tiles**2 else None
+        places.append(Apart(tile, share))
+    return places

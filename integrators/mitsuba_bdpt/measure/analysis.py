@@ -278,7 +278,8 @@ class Results:
     def bias(self, scene: str, method: str) -> BiasCheck:
         """Bias check against the scene's reference."""
         if scene not in self.references:
-            raise Refused("not rendered")
+            there = self.of(scene, method)
+            raise Refused("no bias check: the reference is a given image" if there else "not rendered")
         return bias(self.of(scene, method), self.references[scene])
 
     def gap(self, scene: str, method: str) -> Summary:

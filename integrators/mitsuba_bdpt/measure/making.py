@@ -223,15 +223,20 @@ def check_size(job: Job) -> None:
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
-    own_width, own_height = job.scene.size()
-    widths = range(TILES, 4 * job.resolution, TILES)
-    fitting = [n for n in widths if (round(n * own_height / own_width) or 1) % TILES == 0]
-    nearest = sorted(fitting, key=lambda n: abs(n - job.resolution))[:1]
-    advice = f"; take resolution={nearest[0]}" if nearest else "; give the film another shape"
+    nearest = nearest_width(job.scene, job.resolution)
+    advice = f"; take resolution={nearest}" if nearest else "; give the film another shape"
     raise CommandError(
         f"scene={job.scene.name!r} has {width} x {height} pixels at resolution={job.resolution}; both must "
         f"be divisible by {TILES}{advice}."
     )
+
+
+def nearest_width(scene: SceneFile, wanted: float) -> int | None:
+    """The width next to the one ``wanted`` of images that a bias check divides into tiles; None if far."""
+    own_width, own_height = scene.size()
+    widths = range(TILES, max(math.ceil(4 * wanted), TILES + 1), TILES)
+    fitting = [n for n in widths if (round(n * own_height / own_width) or 1) % TILES == 0]
+    return min(fitting, key=lambda n: abs(n - wanted), default=None)
 
 
 def _pixels(image):
@@ -289,7 +294,8 @@ def _same(stored: Reference, **wanted) -> bool:
     return all(stored.provenance.get(key) == value for key, value in wanted.items())
 
 
-def _provenance(job: Job, **more) -> dict:
+def provenance_of(job: Job, **more) -> dict:
+    """What is kept of how a reference was made, ``more`` with it."""
     return {
         "scene": job.scene.name,
         "scene_sha256": job.scene_sha256,
@@ -307,7 +313,7 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
     width, height = job.scene.size(job.resolution)
     value = radiance["limit"] - (radiance["lacks"] * 2.0**-job.depth if job.depth > 0 else 0.0)
     image = np.full((height, width, 3), value)
-    provenance = _provenance(job, integrator="known answer")
+    provenance = provenance_of(job, integrator="known answer")
     return Reference(image, 0 * image, Means.known(image), provenance), True
 
 
@@ -338,7 +344,7 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
                 halves.add(_pair(scene, integrator, halves))
             reached = aim.reached(halves.reference({}))
             show(time.perf_counter() - started)
-    provenance = _provenance(
+    provenance = provenance_of(
         job,
         integrator=parameters,
         sampler=sampler,

@@ -50,6 +50,11 @@ class Reference:
         made_by = self.provenance["integrator"]
         return isinstance(made_by, dict) and made_by.get("merging", False)
 
+    @property
+    def given(self) -> bool:
+        """Whether it is an image of the user's (`given`): then its own error is not among what it holds."""
+        return "given" in self.provenance
+
     def share_of(self, image, trim: float) -> float:
         """What its own error adds to ``rel_mse(image, self.image, trim)``."""
         return reference_rel_mse(self.difference, image, self.image, trim)

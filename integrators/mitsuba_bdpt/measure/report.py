@@ -76,11 +76,12 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
                 f"{folder}: the errors in {scene} were taken against another reference; run "
                 f"{project.sweep_command(folder)}, which takes them anew"
             )
-    if without := [scene for scene, kept in made.items() if kept.means is None]:
+    means = {scene: kept.means for scene, kept in made.items() if not kept.given}
+    if without := [scene for scene, kept in means.items() if kept is None]:
         raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
     file = folder / "probes.json"
     measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
-    return Results(rows, {scene: kept.means for scene, kept in made.items()}, measured), made
+    return Results(rows, means, measured), made
 
 
 def _reference_command(project: Project, rows: list[dict], scene: str) -> str:
