@@ -34,6 +34,7 @@ NONE = "bdpt skip=none"
 IMPOSSIBLE = "bdpt skip=impossible"
 INDEPENDENT = "bdpt points=independent"
 ALONE = "bdpt light_paths=0"
+UNAIMED = "bdpt emission_guiding=never"
 LIGHT_TRACER = "ptracer"
 
 # Samples per pixel of the first integrator at which efficiencies are compared, if there are such renders.
@@ -236,7 +237,7 @@ class Results:
         Mitsuba's path tracers, then others that no figure of the project's own looks for.
         """
         tracers = *RIVALS, *MEDIA_RIVALS
-        known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, LIGHT_TRACER}
+        known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, UNAIMED, LIGHT_TRACER}
         others = self.methods[1:]
         return [name for name in tracers if name in others] + [name for name in others if name not in known]
 

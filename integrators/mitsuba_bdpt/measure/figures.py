@@ -19,6 +19,7 @@ from .analysis import (
     MEDIA_RIVALS,
     NONE,
     RIVALS,
+    UNAIMED,
     Biased,
     Refused,
     Results,
@@ -32,6 +33,7 @@ STYLES = {
     NONE: ("#56B4E9", "v", "--"),
     INDEPENDENT: ("#009E73", "^", ":"),
     ALONE: ("#F0E442", "P", "-."),
+    UNAIMED: ("#999999", "X", "--"),
     RIVALS[0]: ("#D55E00", "s", "-"),
     RIVALS[1]: ("#E69F00", "D", "--"),
     # In other scenes than these two.

@@ -30,6 +30,7 @@ from .analysis import (
     MEDIA_RIVALS,
     NONE,
     RIVALS,
+    UNAIMED,
     Biased,
     NotJudged,
     Refused,
@@ -403,6 +404,10 @@ def _against_none(results: Results) -> str:
     )
 
 
+def _unaimed(results: Results, scene: str) -> str:
+    return ranged(results.efficiency(scene, UNAIMED))
+
+
 def _alone(results: Results, scene: str) -> str:
     found = []
     for budget in (results.deciding, 4 * results.deciding):
@@ -461,6 +466,7 @@ GOALS = {
     "worst": _worst,
     "against none": _against_none,
     "alone": _alone,
+    "not aimed": _unaimed,
     "cost": _cost,
     "pilot": _pilot,
     "floor": _floor,
@@ -468,7 +474,7 @@ GOALS = {
     "memory": _memory,
 }
 
-OF_A_SCENE = ("efficiency", "efficiency raw", "near one", "alone", "cost", "pilot")
+OF_A_SCENE = ("efficiency", "efficiency raw", "near one", "alone", "not aimed", "cost", "pilot")
 """Those that take a scene."""
 
 
