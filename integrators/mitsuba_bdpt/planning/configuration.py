@@ -46,7 +46,7 @@ class Configuration:
     The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
     of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: samples
     by which s = 0 is at a vertex; with `merging`, not 0 if vertices are merged though s = 0 finds that light.
-    ``emission``: what guides that of light subpaths.
+    ``emission``: what guides that of light subpaths; ``joined``: with so many of them each camera subpath is.
     """
 
     light_paths: float
@@ -55,6 +55,7 @@ class Configuration:
     kappa_direct: float
     guided: int = field(default=0, kw_only=True)
     emission: EmissionTables | None = field(default=None, kw_only=True)
+    joined: int = field(default=1, kw_only=True)
 
     @classmethod
     def weighted(cls, weighting: Weighting, served: int, connections: str) -> Configuration:
@@ -93,4 +94,5 @@ class Configuration:
             emission=self.emission if full.teachable and light else None,
         )
         served = self.camera_paths_per_light_path if adopted.light else 1
-        return replace(adopted, camera_paths_per_light_path=served)
+        joined = self.joined if adopted.connections == "one" else 1
+        return replace(adopted, camera_paths_per_light_path=served, joined=joined)

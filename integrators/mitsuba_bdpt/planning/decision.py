@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 from ..emitters.emission_tables import EmissionTables
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
-from ..transport.plan import GUIDED
+from ..transport.plan import GUIDED, JOINED
 from .configuration import Configuration
 
 # Contributions below a share of the image's mean play roulette before their ray is traced: below this one,
@@ -21,7 +21,7 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 LARGEST = 1e30
 
 # Entries of a record, see `Decision.record`.
-WAY = ("light_paths", "connections", "guided", "emission", "coefficients")
+WAY = ("light_paths", "connections", "guided", "emission", "joined", "coefficients")
 ENTRIES = ("pass", *WAY, "cost", "variance", "mean")
 
 
@@ -62,6 +62,7 @@ class Decision(Configuration):
             "connections": self.connections,
             "guided": self.guided,
             "emission": None if self.emission is None else self.emission.record(),
+            "joined": self.joined,
             "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
             "cost": self.cost,
             "variance": self.variance,
@@ -131,12 +132,16 @@ def _read_decision(entry: Any) -> Decision:
     guided = entry.get("guided", 0)  # which records of older versions lack
     if isinstance(guided, bool) or guided not in (0, *GUIDED):
         raise ValueError(f"guided={guided!r}")
+    joined = entry.get("joined", 1)
+    if isinstance(joined, bool) or joined not in JOINED or (joined > 1 and connections != "one"):
+        raise ValueError(f"joined={joined!r}, connections={connections!r}")
     emission = entry.get("emission")
     return Decision(
         light_paths=light_paths,
         connections=connections,
         first_pass=first_pass,
         guided=guided,
+        joined=joined,
         emission=None if emission is None else EmissionTables.read(emission),
         **numbers,
     )

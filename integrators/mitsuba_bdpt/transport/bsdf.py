@@ -55,11 +55,15 @@ class Step:
 
 @dataclass(frozen=True)
 class Traits:
-    """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`."""
+    """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`.
+
+    ``glossy``: whether one has a glossy lobe.
+    """
 
     full_pdf: bool
     round_trip: bool
     asked: Asked
+    glossy: bool = False
 
     def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """What the surface ``si`` lets pass straight on."""
@@ -72,7 +76,8 @@ class Traits:
     @staticmethod
     def of(bsdfs: Sequence[mi.BSDF]) -> Traits:
         """Of BSDFs that one virtual call may visit."""
-        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs))
+        glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
+        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy)
 
 
 # From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands

@@ -13,6 +13,7 @@ from . import bsdf, mis, scattering
 from .contribution import Contribution, drop_non_finite, foreseen, roulette, size_of, worth_a_ray
 from .counters import MEDIA, Counters, counted_in_media, one
 from .inputs import Kernel
+from .sketches import Sketch, guess
 from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
 from .walk import Vertex, is_lit, newest_coefficient, where_lit
@@ -94,7 +95,8 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
-    drawn = _draw(kernel, z, path, candidates, u)
+    draw = _draw if path.sketches is None else _draw_by_guess
+    drawn = draw(kernel, z, path, candidates, u)
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
     active = drawn.total > 0
@@ -121,6 +123,10 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
     c = drop_non_finite(seen(kernel, c, sight))
     return c.weighted(), counted + c.counted
+
+
+# The probability with which a candidate is drawn evenly, so that what guesses miss is drawn too.
+EVENLY = 0.005
 
 
 @dataclass
@@ -188,6 +194,48 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     return drawn
 
 
+@dr.syntax
+def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
+    """As `_draw`, among the vertices of several light subpaths, by a `sketches.guess` of what each adds.
+
+    The BSDFs are evaluated for the one drawn. One of all is drawn evenly with the probability `EVENLY`. The
+    ``total`` is the estimate's size: that of the mean over the light subpaths.
+    """
+    some = candidates > 0
+    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    at_z = Sketch.of(kernel, z, newest, some, None)
+    count = mi.Float(candidates)
+    evenly = u < EVENLY
+    u = dr.select(evenly, u / EVENLY, (u - EVENLY) / (1 - EVENLY)) * (1 - 2**-24)
+    even = dr.minimum(mi.UInt32(u * count), dr.maximum(candidates, 1) - 1)
+    slot, total = mi.UInt32(0), mi.Float(0)
+    chosen, of_chosen, of_even = mi.UInt32(0), mi.Float(0), mi.Float(0)
+    while dr.hint(
+        slot < candidates, label="guess inner connections", exclude=[kernel, z, path, candidates, at_z, even]
+    ):
+        y = path.sketches.read(path.si[slot].p, slot)
+        reached = z.edges + path.s[slot] <= kernel.last_inner
+        size = dr.select(reached, guess(kernel, at_z, y), 0)
+        before, total = total, total + size
+        u_total = u * total
+        take = u_total < size
+        rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
+        u = dr.select(total > 0, rest, u)
+        chosen, of_chosen = dr.select(take, slot, chosen), dr.select(take, size, of_chosen)
+        of_even = dr.select(slot == even, size, of_even)
+        slot += 1
+    evenly |= ~(total > 0)
+    drawn = dr.select(some, dr.select(evenly, even, chosen), 0)
+    size = dr.select(evenly, of_even, of_chosen)
+    probability = EVENLY / count + dr.select(total > 0, (1 - EVENLY) * size / total, (1 - EVENLY) / count)
+    y = read_light_vertex(kernel, path, drawn, some)
+    c = drop_non_finite(inner(kernel, replace(z, hit=z.hit & some), y))
+    weighted = foreseen(kernel, c) / (probability * kernel.plan.joined)
+    value = dr.select(some & c.active, weighted, 0)
+    end = rays.end_point(z.anchor, y.anchor)
+    return _Drawn(value, size_of(value), end, u, one(c.active), c.counted.non_finite)
+
+
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:
     """The connection ``c`` of ``z`` and ``y`` as it is drawn: in media with a guess of the transmittance."""
     if kernel.space is None:
@@ -208,9 +256,10 @@ def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to try at ``z``.
 
     Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with
-    media, where null events are no edges, several vertices may have the same number.)
+    media, where null events are no edges, several vertices may have the same number, as where the slots are
+    those of several light subpaths.)
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
-    if kernel.space is not None:
+    if kernel.space is not None or path.sketches is not None:
         return dr.select(possible, path.count, 0)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

@@ -194,7 +194,7 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     """
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
-    return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths_per_light_path, points.seed)
+    return Sharing(batch.pixels, batch.samples, kernel.plan.served, points.seed)
 
 
 def _count_light(batch: Batch, sharing: Sharing) -> float:
@@ -202,7 +202,7 @@ def _count_light(batch: Batch, sharing: Sharing) -> float:
 
     A pilot's estimates are those of one, whose number it divides by itself.
     """
-    return 1.0 if batch.spread else sharing.lanes / batch.size
+    return 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size
 
 
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
@@ -212,9 +212,28 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     shared = shared_by_lane(kernel, stream, place_in_sequence)
     path = stored_vertices.allocate_light_path(kernel, dr.width(index))
     counters, emitted = Counters(), None
-    if kernel.plan.light:
+    if kernel.plan.joined > 1:
+        path, counters = _light_subpaths(kernel, sink, place_in_sequence, index, shared, path)
+    elif kernel.plan.light:
         path, counters, emitted = _light_subpath(kernel, sink, stream, shared, path)
     return Lane(place, shared, path, emitted), counters
+
+
+@dr.syntax
+def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path):
+    """Trace the light subpaths of a lane one after the other, as `_light_subpath` does each."""
+    counters = Counters.zeros("light", "non_finite") + counted_by_light(kernel.plan, kernel.space)
+    number, count = mi.UInt32(0), kernel.plan.joined
+    while dr.hint(
+        number < count,
+        label=f"{count} light subpaths",
+        exclude=[kernel, sink, place, index, shared, count],
+    ):
+        stream = kernel.points.stream("light", place * count + mi.UInt64(number), index)
+        path, counted, _ = _light_subpath(kernel, sink, stream, shared, path)
+        counters = counters + counted
+        number += 1
+    return path, counters
 
 
 def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
@@ -356,7 +375,7 @@ def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
     counters = walked + _camera_counters(kernel)
     served = mi.UInt32(0)
     while dr.hint(
-        served < kernel.camera_paths_per_light_path,
+        served < kernel.served,
         label="camera subpaths of one light subpath",
         exclude=[kernel, sharing, seat, serve],
     ):

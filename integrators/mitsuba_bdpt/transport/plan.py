@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from ..emitters.emission_tables import EmissionTables
 
+# Numbers of light subpaths with which each camera subpath can be joined.
+JOINED = (1, 4)
+
 # Numbers of guided samples at a vertex among which a pilot chooses.
 GUIDED = (1, 4, 8)
 
@@ -21,7 +24,9 @@ class Plan:
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: by how many samples
     s = 0 is guided at a vertex; ``guidable``: whether a pilot may say that it pays; ``emission``: what guides
-    that of light subpaths, ``teachable``: whether a pilot may say that it pays.
+    that of light subpaths, ``teachable``: whether a pilot may say that it pays. ``joined``: light subpaths with
+    whose vertices each camera subpath is joined (M): they serve M S camera subpaths together, see
+    `connections`.
     """
 
     hit: bool
@@ -41,6 +46,12 @@ class Plan:
     guidable: bool = False
     emission: EmissionTables | None = None
     teachable: bool = False
+    joined: int = 1
+
+    @property
+    def served(self) -> int:
+        """Camera subpaths that a lane serves."""
+        return self.camera_paths_per_light_path * self.joined
 
     @property
     def light(self) -> bool:

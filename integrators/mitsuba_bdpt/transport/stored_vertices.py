@@ -11,7 +11,8 @@ import mitsuba as mi
 from ..geometry import rays
 from . import mis
 from .inputs import KEPT, Kernel
-from .walk import Vertex, volume_cosine
+from .sketches import Sketch, Sketches
+from .walk import Vertex, newest_coefficient, volume_cosine
 
 
 @dataclass
@@ -111,6 +112,7 @@ class LightPath:
     count: mi.UInt32
     medium: dr.Local[mi.UInt32] | None = None
     thinning: Any = None  # a `Thinning`, in scenes with media
+    sketches: Any = None  # `Sketches`, where they are drawn by a guess
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
@@ -126,6 +128,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
         medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
+        sketches=Sketches.allocate(kernel, size) if kernel.plan.joined > 1 else None,
     )
 
 
@@ -143,6 +146,9 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     path.s.write(y.edges + 1, slot, keep)
     if path.medium is not None:
         path.medium.write(y.medium, slot, keep)
+    if path.sketches is not None:
+        newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
+        path.sketches.write(Sketch.of(kernel, vertex, newest, keep, vertex.throughput), slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
@@ -154,18 +160,20 @@ def _thinned(path: LightPath, y: StoredVertex, keep):
     return replace(y, throughput_over_cos=y.throughput_over_cos / probability), place, keep & kept
 
 
-def read_light_vertex(kernel: Kernel, path: LightPath, slot: mi.UInt32) -> StoredVertex:
-    """The stored vertex ``slot``, the same in all lanes that use it."""
-    si = path.si[slot]
-    rounding = path.rounding[slot]
-    s = path.s[slot]
+def read_light_vertex(
+    kernel: Kernel, path: LightPath, slot: mi.UInt32, active: mi.Bool | bool = True
+) -> StoredVertex:
+    """The stored vertex ``slot``; zeros where not ``active``, whose slots hold anything."""
+    si = path.si.read(slot, active)
+    rounding = path.rounding.read(slot, active)
+    s = path.s.read(slot, active)
     curvature = rounding.y if kernel.shape_errors.any else mi.Float(0)
     return StoredVertex(
         si=si,
         bsdf=si.bsdf(),
         anchor=rays.Anchor(si.p, si.n, rounding.x, curvature),
-        throughput_over_cos=path.throughput_over_cos[slot],
-        partial=mis.Partial(path.d_vcm[slot], path.d_vc[slot]),
+        throughput_over_cos=path.throughput_over_cos.read(slot, active),
+        partial=mis.Partial(path.d_vcm.read(slot, active), path.d_vc.read(slot, active)),
         edges=s - 1,
-        medium=None if path.medium is None else path.medium[slot],
+        medium=None if path.medium is None else path.medium.read(slot, active),
     )
