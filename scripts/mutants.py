@@ -921,8 +921,8 @@ MUTANTS = (
     Mutant(
         "guided emission: both halves of a pilot teach and judge",
         "planning/emission.py",
-        "found = [_left(heard[1 - i], a + (1 - a) * halves[i], guided) for i in range(HALVES)]",
-        "found = [_left(heard[i], a + (1 - a) * halves[i], guided) for i in range(HALVES)]",
+        "halves = [_fitted(half) for half in heard]",
+        "halves = [_fitted(heard[1 - i]) for i in range(HALVES)]",
         ("tests/images/test_guided_emission.py::test_noise_teaches_nothing",),
     ),
     Mutant(

@@ -9,9 +9,9 @@ light subpath chooses that emission (t <= 1, inner). Tables multiply that densit
 cell, a `Factor` that is 0 and 1 where all is by the table. The second moment (balance heuristic) is then
 v^2 / (1 - q + q (a + b r)): the gain of any table is known from samples without one. With
 
-    D = 1 - q + q a + q b,   l = q b / D   it is   v^2 / D / (1 - l + l r).
+    D = 1 - q + q a + q b,   l = q b / D,   it is   v^2 / D / (1 - l + l r).
 
-the best r, of those of mean 1 in each table, is the fixed point of r^2 <- r^2 sum v^2 / D l / (1 - l + l r)^2.
+The best r of a mean of 1 is the fixed point of r^2 <- r^2 sum of v^2 / D l / (1 - l + l r)^2.
 (E. Veach 1997, section 9.2; of that kind are P. Grittmann et al. 2018, and P. Dutre and Y. Willems 1995, who
 have no l.)
 
