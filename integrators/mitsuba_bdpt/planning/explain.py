@@ -131,6 +131,8 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
             f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of isolated paths, which none of "
             "these figures has"
         )
+    if table[0].without_tables:
+        lines.append("  guided emission is in none of these figures")
     lines.append(
         f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
         f"most {LIGHT_GAIN:g} times as long as the best"

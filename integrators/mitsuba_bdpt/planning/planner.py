@@ -155,7 +155,7 @@ class Planner:
             if not found.mean > 0 or not aimed or not aimed[0].candidate.light_paths:
                 return table, learnt
             self._with_tables, table = found, aimed
-        return [row.with_emission(tables) for row in table], learnt
+        return [row.with_emission(tables, is_lit) for row in table], learnt
 
     def _learnt(self, moments: Moments, samples: int) -> emission.Learnt:
         """What the pilots teach about emission, remembered of the first (20 ms under a sky)."""

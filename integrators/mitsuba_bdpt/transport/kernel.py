@@ -91,6 +91,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..emitters.emission_tables import Cell
 from ..geometry import rays
 from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
@@ -114,7 +115,7 @@ class Lane:
     place: Places
     shared: Shared
     path: stored_vertices.LightPath
-    emission: tuple[mi.UInt32, mi.Bool] | None = None
+    emission: Cell | None = None
 
 
 @dataclass
@@ -246,7 +247,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     """
     plan = kernel.plan
     e = emission(kernel, stream, shared)
-    emitted = kernel.emitters.cell(e.index, e.si.p, e.d, mi.Bool(True)) if kernel.tells_emission else None
+    emitted = None
+    if kernel.tells_emission:
+        emitted = kernel.emitters.cell(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
     counters = Counters()
 
     def splat(c):
