@@ -858,8 +858,9 @@ MUTANTS = (
     Mutant(
         "guided emission: the density is forgotten in emission",
         "emitters/area.py",
-        "of_flat = mi.warp.square_to_cosine_hemisphere_pdf(local) * density",
-        "of_flat = mi.warp.square_to_cosine_hemisphere_pdf(local)",
+        "d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)",
+        "d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)\n"
+        "        pdf_w = dr.maximum(dr.dot(si.sh_frame.n, d), 0) * dr.inv_pi",
         ("tests/emitters/test_guided_emission.py::test_light_leaves_as_without_tables[rectangle]",),
     ),
     Mutant(
@@ -874,8 +875,8 @@ MUTANTS = (
     Mutant(
         "guided emission: s = 1 asks for the opposite direction",
         "emitters/infinite.py",
-        "place = self.place(index, p, d * sign, active)",
-        "place = self.place(index, p, d, active)",
+        "density = self.guide.density(index, self.place(index, p, d * sign, active), active)",
+        "density = self.guide.density(index, self.place(index, p, d, active), active)",
         (
             "tests/emitters/test_guided_emission.py::test_next_event_estimation_and_hits_state_the_same[constant]",
         ),
@@ -897,17 +898,31 @@ MUTANTS = (
         ("tests/emitters/test_guided_emission.py::test_frames_do_not_depend_on_who_asks[n3]",),
     ),
     Mutant(
-        "guided emission: directions that are turned count once",
+        "guided emission: directions of curved lamps are not turned",
         "emitters/area.py",
-        "by_table = dr.select(cos > 0, (density + turned) * dr.inv_four_pi, 0)",
-        "by_table = dr.select(cos > 0, density * dr.inv_two_pi, 0)",
+        "turned = dr.mulsign(turned, dr.dot(si.sh_frame.n, turned))",
+        "pass",
         ("tests/emitters/test_guided_emission.py::test_light_leaves_as_without_tables[sphere]",),
+    ),
+    Mutant(
+        "guided emission: points on the details' disk have the density of another cell",
+        "emitters/disks.py",
+        "density = dr.select(aimed, guided.density(p), density)",
+        "pass",
+        ("tests/emitters/test_guided_emission.py::test_details_beside_tables[middle-130-False]",),
+    ),
+    Mutant(
+        "guided emission: what is learnt of curved lamps leaves out the cosine",
+        "emitters/area.py",
+        "curved = (1 - PLAIN) / (2 * dr.maximum(cos, _LEAST_COS))",
+        "curved = (1 - PLAIN) / (2 * dr.maximum(cos * 0 + 1, _LEAST_COS))",
+        ("tests/emitters/test_guided_emission.py::test_what_tables_change_of_a_density[sphere]",),
     ),
     Mutant(
         "guided emission: both halves of a pilot teach and judge",
         "planning/emission.py",
-        "found = [_left(heard[1 - i], a + (1 - a) * halves[i]) for i in range(HALVES)]",
-        "found = [_left(heard[i], a + (1 - a) * halves[i]) for i in range(HALVES)]",
+        "halves = [_fitted(half) for half in heard]",
+        "halves = [_fitted(heard[1 - i]) for i in range(HALVES)]",
         ("tests/images/test_guided_emission.py::test_noise_teaches_nothing",),
     ),
     Mutant(
@@ -923,6 +938,48 @@ MUTANTS = (
         "self._hear(c, size * np.sqrt(self._weight), c.position, c.active)",
         "self._hear(c, size, c.position, c.active)",
         ("tests/images/test_guided_emission.py::test_what_a_pilot_hears",),
+    ),
+    Mutant(
+        "joined light subpaths: what is drawn evenly is forgotten",
+        "transport/connections.py",
+        "probability = EVENLY / count + dr.select(",
+        "probability = dr.select(",
+        ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed",),
+    ),
+    Mutant(
+        "joined light subpaths: estimates are not over their number",
+        "transport/connections.py",
+        "value = value / kernel.plan.joined",
+        "pass",
+        ("tests/images/test_joined_light_paths.py::test_images_are_those_of_all_connections[diffuse]",),
+    ),
+    Mutant(
+        "joined light subpaths: t <= 1 does not count them all",
+        "transport/kernel.py",
+        "return 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size",
+        "return 1.0 if batch.spread else sharing.lanes / batch.size",
+        ("tests/images/test_joined_light_paths.py::test_images_are_those_of_all_connections[diffuse]",),
+    ),
+    Mutant(
+        "joined light subpaths: all have the same random numbers",
+        "transport/kernel.py",
+        'kernel.points.stream("light", place * count + mi.UInt64(number), index)',
+        'kernel.points.stream("light", place, index)',
+        ("tests/images/test_joined_light_paths.py::test_a_cornell_box_is_joined_and_less_noisy",),
+    ),
+    Mutant(
+        "joined light subpaths: guesses leave out the weight",
+        "transport/sketches.py",
+        "size = size_z * size_y * inverse / (kernel.kappa.inner + others * inverse)",
+        "size = size_z * size_y * inverse",
+        ("tests/images/test_joined_light_paths.py::test_guesses_are_about_right[diffuse-1.1]",),
+    ),
+    Mutant(
+        "joined light subpaths: guesses leave out the lobe",
+        "transport/sketches.py",
+        "size + self.lobes.peak * shape,",
+        "size,",
+        ("tests/images/test_joined_light_paths.py::test_guesses_are_about_right[roughconductor-1.25]",),
     ),
 )
 

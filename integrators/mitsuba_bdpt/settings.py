@@ -156,7 +156,8 @@ class Settings:
         "auto",
         "when emission is guided",
         """Guide the emission of light subpaths to where they matter, by tables that the pilot learns from its
-        own samples; unbiased. ``auto``: where it finds that it pays. ``never``.""",
+        own samples; unbiased. ``auto``: where it finds that it pays, in renders that ask one. ``never``: not
+        unless ``decisions`` hold tables.""",
         choices=EMISSION_GUIDING,
     )
     decisions: tuple[Any, ...] | None = _converted(

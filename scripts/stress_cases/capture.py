@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import numpy as np
-from mitsuba_bdpt.emitters.emission_tables import SKY_BINS, cell_at
+from mitsuba_bdpt.emitters.emission_tables import PLAIN, SKY_BINS, cell_at
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.geometry.flat import is_flat
@@ -100,7 +100,7 @@ class Tables:
     """Densities of emission that tables guide, in closed form; frames and what is flat are the package's."""
 
     def __init__(self, scene, tables):
-        self.tables, self.least, self.side = tables.densities(), tables.least, tables.side
+        self.tables, self.side = tables.densities(), tables.side
         world = Emitters(scene)
         self.emitters, self.counts, self.disks = scene.emitters(), world.tables, world.disks
 
@@ -126,8 +126,8 @@ class Tables:
             n = mi.Vector3f(shape.sample_position(0, mi.Point2f(0.5)).n)
             u = mi.warp.cosine_hemisphere_to_square(mi.Frame3f(n).to_local(v))
             return own * self._density(number, u)
-        both = sum(self._density(number, mi.warp.uniform_sphere_to_square(w)) for w in (v, -v))
-        return self.least * own + (1 - self.least) * (own > 0) * both / (4 * np.pi)
+        u = mi.warp.uniform_hemisphere_to_square(dr.select(v.z < 0, -v, v))
+        return PLAIN * own + (1 - PLAIN) * (own > 0) * self._density(number, u) / (2 * np.pi)
 
     def _density(self, number, u, bins=0):
         first = sum(self.counts[:number])
@@ -148,7 +148,11 @@ class Capture(Observer):
         self.world, self.plan = render.prepared, render.plan
         self.depth = integrator.settings.max_depth
         self.lamps, self.camera = lamps_of(scene), Camera.of(scene.sensors()[0])
-        self.disks = disks_of(render.kernel.emitters.disks)
+        self.disks = disks_of(self.world.emitters.disks)
+        tables = self.plan.emission
+        if tables is not None and self.disks is not None and not self.world.emitters.disks.share(tables.side):
+            # Tables do what the disk of the details does.
+            self.disks.spheres = [(*self.disks.spheres[0][:2], 1.0)]
         self.tables = None if self.plan.emission is None else Tables(scene, self.plan.emission)
         self.walked = {"light": Walked(), "camera": Walked()}
         self.found, self.endpoint = {}, {}

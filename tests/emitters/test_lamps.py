@@ -356,3 +356,30 @@ def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
     image = np.array(integrator.render(mi.load_dict(scene | {"sensor": sensor}), spp=256))
     assert integrator.statistics["non_finite"] == 0
     assert image[..., :3].mean() == pytest.approx(1, rel=0.05)
+
+
+def test_a_textured_lamp_beside_a_group_of_two_kinds_of_shapes():
+    """Rationale: ``Shape.ray_intersect`` of Mitsuba reads out of bounds there. Expected: it is rendered."""
+    texels = np.ones((4, 4, 3), dtype=np.float32)
+    texels[0] = 0
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.2}, "box": {"type": "cube"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {
+                "type": "perspective",
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 16, "height": 16},
+            },
+            "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": radiance}},
+            "group": group,
+            "instance": {
+                "type": "instance",
+                "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).scale(0.1),
+                "group": {"type": "ref", "id": "group"},
+            },
+        }
+    )
+    image = np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=4))
+    assert 0.1 < image.mean() < 1 and np.isfinite(image).all()

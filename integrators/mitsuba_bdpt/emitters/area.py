@@ -18,7 +18,7 @@ from ..geometry.mitsubas_choices import (
 )
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
 from ..host.introspection import children, named, number, own_parameters
-from .emission_tables import EmissionGuide, Place
+from .emission_tables import PLAIN, EmissionGuide, Factor, Place
 from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
@@ -53,13 +53,17 @@ class _Sphere:
         )
 
 
+# Of emissions whose density is asked relative to the cosine.
+_LEAST_COS = 1e-3
+
+
 @dataclass
 class _Table:
     """What the table of an area light's emission means.
 
     Of a flat one (``flat`` 1) directions about its normal in the frame ``s``, ``t``, ``n``, which must not
-    depend on who asks: a frame made of a normal is mirrored by the sign of a zero. Of others directions in
-    the world.
+    depend on who asks: a frame made of a normal is mirrored by the sign of a zero. Of others axes in the
+    world, directions up to their sign.
     """
 
     s: mi.Vector3f | tuple = (1, 0, 0)
@@ -182,30 +186,36 @@ class AreaEmitters(Group):
 
     # -- directions of emission -------------------------------------------------------------
 
-    def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
-        other = super().placed(guide, whole)
+    def placed(self, guide: EmissionGuide | None) -> Group:
+        other = super().placed(guide)
         other._tables = table(rows(self._emitters, _Table(), _Table.of))
         return other
 
     def place(self, index, p, d, active) -> Place:
         known = look_up(self._tables, index, active)
         flat = mi.warp.cosine_hemisphere_to_square(known.frame().to_local(d))
-        return Place(mi.UInt32(0), dr.select(known.flat > 0, flat, mi.warp.uniform_sphere_to_square(d)))
+        curved = mi.warp.uniform_hemisphere_to_square(dr.mulsign(mi.Vector3f(d), d.z))
+        return Place(mi.UInt32(0), dr.select(known.flat > 0, flat, curved))
+
+    def factor(self, index, p, d, cos, side, active) -> Factor:
+        flat = look_up(self._tables, index, active).flat > 0
+        # Over cos / pi.
+        curved = (1 - PLAIN) / (2 * dr.maximum(cos, _LEAST_COS))
+        return Factor(dr.select(flat, 1, curved), dr.select(flat, 0, mi.Float(PLAIN)))
 
     def _direction_pdf_w(self, index, cos, d, active):
         """Density of the direction ``d`` of emission, of the cosine ``cos`` with the shading normal."""
         own, guide = dr.maximum(cos, 0) * dr.inv_pi, self.guide
         if guide is None:
             return own
-        flat, least = look_up(self._tables, index, active).flat > 0, self._least(guide, index, active)
+        flat, plain = look_up(self._tables, index, active).flat > 0, self._plain(guide, index, active)
         density = guide.density(index, self.place(index, None, d, active), active)
-        turned = guide.density(index, self.place(index, None, -d, active), active & ~flat)
-        by_table = dr.select(cos > 0, (density + turned) * dr.inv_four_pi, 0)
-        return dr.select(flat, own * density, least * own + (1 - least) * by_table)
+        curved = plain * own + (1 - plain) * dr.select(cos > 0, density * dr.inv_two_pi, 0)
+        return dr.select(flat, own * density, curved)
 
-    def _least(self, guide: EmissionGuide, index, active):
-        """The share of directions of a curved lamp that are not by its table, 1 of one without."""
-        return dr.select(guide.is_guided(index, active), guide.least, 1)
+    def _plain(self, guide: EmissionGuide, index, active):
+        """`PLAIN` of curved lamps with a table, 1 of those without."""
+        return dr.select(guide.is_guided(index, active), PLAIN, 1)
 
     def _sample_direction(self, index, si, u, active):
         """A direction of emission from ``si``, in the world and in its frame, and its density."""
@@ -214,20 +224,19 @@ class AreaEmitters(Group):
             local = mi.warp.square_to_cosine_hemisphere(u)
             return si.to_world(local), local, mi.warp.square_to_cosine_hemisphere_pdf(local)
         known = look_up(self._tables, index, active)
-        flat, least = known.flat > 0, self._least(guide, index, active)
-        # A curved lamp's table is of directions in the world, turned to the side of the normal.
-        by_table = u.x >= least
-        x = dr.select(by_table, (u.x - least) / (1 - least), u.x / least)
+        flat, plain = known.flat > 0, self._plain(guide, index, active)
+        # A curved lamp's table is of axes in the world, which are turned to the side of the normal.
+        by_table = u.x >= plain
+        x = dr.select(by_table, (u.x - plain) / (1 - plain), u.x / plain)
         own = si.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, u.y)))
         u = mi.Point2f(dr.select(flat, u.x, x), u.y)
-        warped, density = guide.warp(index, mi.UInt32(0), u, active)
-        turned = mi.warp.square_to_uniform_sphere(warped)
+        warped, _ = guide.warp(index, mi.UInt32(0), u, active)
+        turned = mi.warp.square_to_uniform_hemisphere(warped)
         turned = dr.mulsign(turned, dr.dot(si.sh_frame.n, turned))
-        local = mi.warp.square_to_cosine_hemisphere(warped)
-        d = dr.select(flat, known.frame().to_world(local), dr.select(by_table, turned, own))
+        of_flat = known.frame().to_world(mi.warp.square_to_cosine_hemisphere(warped))
+        d = dr.select(flat, of_flat, dr.select(by_table, turned, own))
         pdf_w = self._direction_pdf_w(index, dr.dot(si.sh_frame.n, d), d, active)
-        of_flat = mi.warp.square_to_cosine_hemisphere_pdf(local) * density
-        return d, si.to_local(d), dr.select(flat, of_flat, pdf_w)
+        return d, si.to_local(d), pdf_w
 
     # -- emission ---------------------------------------------------------------------------
 

@@ -8,14 +8,16 @@ these. The density is that of the mixture, wherever a strategy asks for it. Wher
 
 from __future__ import annotations
 
-from copy import copy
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..host.introspection import own_parameters
+from .emission_tables import Factor
 
 # A shape is a detail if the longest side of its box is not more than this part of the scene's.
 DETAIL = 0.25
@@ -63,6 +65,19 @@ class BoundingSphere:
         return dr.rcp(dr.pi * dr.square(self.radius))
 
 
+@dataclass
+class Guided:
+    """What guides where subpaths start on a scene's disk.
+
+    ``warp`` gives numbers for uniform ones, and their density; ``density``: that of a point. ``share`` of the
+    subpaths that are aimed at details.
+    """
+
+    share: mi.Float
+    warp: Callable[[Any], Any]
+    density: Callable[[Any], Any]
+
+
 class Disks:
     """Disks of a scene: outlines of ``scene`` and ``details``, as `BoundingSphere` objects.
 
@@ -79,34 +94,35 @@ class Disks:
         found = details(each, box) if box.valid() else None
         self.details = BoundingSphere.about(found) if found is not None else None
 
-    def guided(self, side: int) -> Disks:
-        """These for emission that tables of ``side`` x ``side`` cells guide."""
-        other = copy(self)
-        if self.details is not None and dr.slice(self.details.radius) * side >= dr.slice(self.scene.radius):
-            other.details = None
-        return other
+    def share(self, side: int) -> float:
+        """The share of subpaths that are aimed at details beside tables of ``side`` x ``side`` cells.
 
-    def start(self, d, u, warp=None):
-        """A point from which a subpath along ``d`` starts, and its density (area across ``d``).
-
-        ``warp`` gives numbers that a guide distributes for uniform ones, and their density, on the scene's
-        disk.
+        None if the details are not smaller than a cell, which the tables can aim at.
         """
-        center, radius, aimed, guided = self.scene.center, self.scene.radius, None, 1
+        if self.details is None:
+            return 0.0
+        return AIMED if dr.slice(self.details.radius) * side < dr.slice(self.scene.radius) else 0.0
+
+    def start(self, d, u, guided: Guided | None = None):
+        """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
+        center, radius, aimed = self.scene.center, self.scene.radius, None
+        share = AIMED if guided is None else guided.share
         if self.details is not None:
-            aimed = u.x < AIMED
-            u = mi.Point2f(dr.select(aimed, u.x / AIMED, (u.x - AIMED) / (1 - AIMED)), u.y)
+            aimed = u.x < share
+            u = mi.Point2f(dr.select(aimed, u.x / share, (u.x - share) / (1 - share)), u.y)
             along = dr.dot(self.details.center - center, d)
             center = dr.select(aimed, self.details.center - along * d, center)
             radius = dr.select(aimed, self.details.radius, radius)
-        frame = mi.Frame3f(d)
-        if warp is not None:
+        frame, density = mi.Frame3f(d), None
+        if guided is not None:
             frame = _frame(d)
-            warped, guided = warp(u)
+            warped, density = guided.warp(u)
             u = warped if aimed is None else dr.select(aimed, u, warped)
         disk = mi.warp.square_to_uniform_disk_concentric(u)
         p = center + radius * (frame.s * disk.x + frame.t * disk.y) - self.scene.radius * d
-        return p, self._pdf_a(p, d, aimed, guided)
+        if guided is not None and aimed is not None:
+            density = dr.select(aimed, guided.density(p), density)
+        return p, self._pdf_a(p, d, aimed, density, share)
 
     def place(self, p, d):
         """The numbers for which a subpath along ``d`` that passes ``p`` starts on the scene's disk."""
@@ -114,26 +130,37 @@ class Disks:
         disk = mi.Point2f(dr.dot(frame.s, offset), dr.dot(frame.t, offset))
         return mi.warp.uniform_disk_to_square_concentric(disk)
 
-    def pdf_a(self, p, d, guided=1):
+    def pdf_a(self, p, d, density=None, share=AIMED):
         """Density with which a subpath along ``d`` passes ``p`` (area across ``d``).
 
-        Without details ``p`` is taken to be a point of the scene, else it may be anywhere. ``guided``: how
-        many times as dense as uniform points are there on the scene's disk.
+        Without details ``p`` is taken to be a point of the scene, else it may be anywhere. ``density``: how
+        many times as dense as uniform points are there on the scene's disk; ``share`` of the details' disk.
         """
-        return self._pdf_a(p, d, None, guided)
+        return self._pdf_a(p, d, None, density, share)
 
-    def _pdf_a(self, p, d, aimed, guided):
+    def _pdf_a(self, p, d, aimed, density, share):
         scene = self.scene.pdf_a()
-        if not isinstance(guided, int):
-            scene = scene * guided
+        if density is not None:
+            scene = scene * density
         if self.details is None:
             return scene
         in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
         if aimed is not None:  # on the rim of its disk a point may be outside by rounding
             in_scene, in_details = in_scene | ~aimed, in_details | aimed
-        return dr.select(in_scene, (1 - AIMED) * scene, 0) + dr.select(
-            in_details, AIMED * self.details.pdf_a(), 0
+        return dr.select(in_scene, (1 - share) * scene, 0) + dr.select(
+            in_details, share * self.details.pdf_a(), 0
         )
+
+    def factor(self, p, d, share: float) -> Factor:
+        """What tables, with a ``share`` beside them, change of the density of subpaths past ``p``."""
+        if self.details is None:
+            return Factor.whole()
+        in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
+        before = self.pdf_a(p, d)
+        scaled = dr.select(in_scene, (1 - share) * self.scene.pdf_a(), 0)
+        kept = dr.select(in_details, share * self.details.pdf_a(), 0)
+        usual = before == 0
+        return Factor(dr.select(usual, 1, scaled / before), dr.select(usual, 0, kept / before))
 
     def covers(self, p, d):
         """Mask: light from infinity along ``d`` passes ``p`` after a point where its subpaths start.

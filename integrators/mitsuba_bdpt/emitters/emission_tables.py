@@ -30,6 +30,9 @@ SKY_BINS = 4
 # Densities are kept to 1 / 16 of a power of two: how lanes are added up does not change them.
 _STEPS, _OFFSET = 16, 128
 
+# Share of the directions of a curved area light that are not by its table but by the cosine.
+PLAIN = 0.25
+
 # The largest number below 1.
 _BELOW_ONE = 1 - 2**-24
 
@@ -38,21 +41,20 @@ _BELOW_ONE = 1 - 2**-24
 class EmissionTables:
     """How many times as dense as by itself emission is in each cell of each table.
 
-    ``levels``: a byte for each cell, table by table, of ``side`` x ``side`` cells, packed as text; ``least``:
-    what no density is below; ``left``: what is predicted to be left of the squared error of light subpaths.
+    ``levels``: a byte for each cell, table by table, of ``side`` x ``side`` cells, packed as text; ``left``:
+    what is predicted to be left of the squared error of light subpaths.
     """
 
     side: int
-    least: float
     left: float
     levels: str
 
     @staticmethod
-    def of(densities: np.ndarray, least: float, left: float) -> EmissionTables:
+    def of(densities: np.ndarray, left: float) -> EmissionTables:
         """Those of ``densities``, shape (tables, side, side), all above 0."""
         levels = np.round(np.log2(densities) * _STEPS) + _OFFSET
         made = base64.b64encode(zlib.compress(np.clip(levels, 0, 255).astype(np.uint8).tobytes()))
-        return EmissionTables(densities.shape[-1], least, float(f"{left:.3g}"), made.decode())
+        return EmissionTables(densities.shape[-1], float(f"{left:.3g}"), made.decode())
 
     def densities(self) -> np.ndarray:
         """Shape (tables, side, side); the mean of each table is 1."""
@@ -67,21 +69,20 @@ class EmissionTables:
     @staticmethod
     def read(record: Any) -> EmissionTables:
         """What was `record`-ed; raises ``ValueError`` or ``TypeError`` for anything else."""
-        if not isinstance(record, dict) or set(record) != {"side", "least", "left", "levels"}:
+        if not isinstance(record, dict) or set(record) != {"side", "left", "levels"}:
             raise TypeError(f"emission={record!r} is no table of emission")
-        side, least, left, levels = (record[name] for name in ("side", "least", "left", "levels"))
-        if side not in SIDES or isinstance(side, bool):
+        side, left, levels = (record[name] for name in ("side", "left", "levels"))
+        if side not in SIDES or not isinstance(side, int):
             raise ValueError(f"emission: side={side!r}")
-        for name, value in (("least", least), ("left", left)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value <= 1:
-                raise ValueError(f"emission: {name}={value!r}")
+        if isinstance(left, bool) or not isinstance(left, (int, float)) or not 0 < left <= 1:
+            raise ValueError(f"emission: left={left!r}")
         try:
             cells = len(_unpacked(levels))
         except (zlib.error, TypeError, ValueError) as error:
             raise ValueError(f"emission: levels: {error}") from error
         if not 0 < cells <= MOST_CELLS or cells % side**2:
             raise ValueError(f"emission: levels holds {cells} cells")
-        return EmissionTables(side, float(least), float(left), levels)
+        return EmissionTables(side, float(left), levels)
 
 
 def _unpacked(levels: str) -> bytes:
@@ -101,6 +102,31 @@ class Place:
     u: mi.Point2f
 
 
+@dataclass
+class Factor:
+    """By what a table changes the density of an emission: to ``kept`` + ``scaled`` r times its own."""
+
+    scaled: mi.Float
+    kept: mi.Float
+
+    @staticmethod
+    def whole() -> Factor:
+        """All of it is by the table."""
+        return Factor(mi.Float(1), mi.Float(0))
+
+
+@dataclass
+class Cell:
+    """Where an emission lies among all tables.
+
+    ``number`` of its cell, whether its emitter has a table (``known``), and the `Factor`.
+    """
+
+    number: mi.UInt32
+    known: mi.Bool
+    factor: Factor
+
+
 def cell_at(u: mi.Point2f, side: int) -> mi.UInt32:
     """The number of the cell at ``u`` in a table of ``side`` x ``side``."""
     at = mi.Point2u(dr.clip(u, 0, _BELOW_ONE) * side)
@@ -111,11 +137,10 @@ class EmissionGuide:
     """`EmissionTables` that a kernel can index.
 
     ``first`` table of each emitter, from 1 on: table 0 is that of emitters that are not guided, uniform.
-    ``least``: see `EmissionTables`.
     """
 
     def __init__(self, tables: EmissionTables, first: mi.UInt32):
-        self.side, self.least, self._first = tables.side, mi.Float(tables.least), first
+        self.side, self._first = tables.side, first
         densities = np.concatenate([np.ones((1, self.side, self.side)), tables.densities()])
         rows = densities.mean(axis=2)
         within = np.cumsum(densities, axis=2) / (rows[:, :, None] * self.side)
@@ -124,7 +149,7 @@ class EmissionGuide:
         self._densities, self._within, self._below = (
             mi.Float(values.astype(np.float32).ravel().tolist()) for values in (densities, within, below)
         )
-        dr.make_opaque(self.least, self._densities, self._within, self._below)
+        dr.make_opaque(self._densities, self._within, self._below)
 
     def is_guided(self, index: mi.UInt32, active) -> mi.Bool:
         """Mask: the emitter of this ``index`` has tables."""

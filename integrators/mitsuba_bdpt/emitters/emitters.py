@@ -18,7 +18,7 @@ from ..errors import UsageError
 from ..geometry import rounding
 from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
-from .emission_tables import EmissionGuide, EmissionTables, cell_at, side_of
+from .emission_tables import Cell, EmissionGuide, EmissionTables, cell_at, side_of
 from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party, needs_evaluation
@@ -144,25 +144,25 @@ class Emitters:
         other.first = mi.UInt32(first)
         dr.make_opaque(other.first)
         guide = None if tables is None else EmissionGuide(tables, other.first)
-        guided = [[guide is not None and first[i] > 0 for i in own] for own in self._of_groups]
         other.groups = tuple(
-            group.placed(guide if any(own) else None, all(own))
-            for group, own in zip(self.groups, guided, strict=True)
+            group.placed(guide if guide is not None and any(first[i] > 0 for i in own) else None)
+            for group, own in zip(self.groups, self._of_groups, strict=True)
         )
-        other.disks = next((group.disks for group in other.groups if group.at_infinity), None)
         return other
 
-    def cell(self, index: mi.UInt32, p, d, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-        """Number of the cell in which emissions of the emitters ``index`` lie that pass ``p`` along ``d``.
+    def cell(self, index: mi.UInt32, p, d, cos, active: mi.Bool) -> Cell:
+        """Where emissions of the emitters ``index`` lie that pass ``p`` along ``d``.
 
-        Among those of all tables, and whether their emitter has any. Asked of copies that `placed` has made.
+        ``cos`` of the geometric normal. Asked of copies that `placed` has made.
         """
         first = dr.gather(mi.UInt32, self.first, index, active)
-        place = self._ask(
-            lambda group, mask: group.place(index, p, d, mask), self._supporting("guidable"), index, active
-        )
+
+        def where(group: Group, mask: mi.Bool):
+            return group.place(index, p, d, mask), group.factor(index, p, d, cos, self.side, mask)
+
+        place, factor = self._ask(where, self._supporting("guidable"), index, active)
         table = dr.select(first > 0, first - 1 + place.bin, 0)
-        return table * self.side**2 + cell_at(place.u, self.side), first > 0
+        return Cell(table * self.side**2 + cell_at(place.u, self.side), first > 0, factor)
 
     # -- selection and dispatch -------------------------------------------------------------
 
@@ -311,12 +311,12 @@ class Emitters:
     def _index_of(self, emitter, active):
         return dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)
 
-    def hit_cell(self, si, previous, active) -> tuple[mi.UInt32, mi.Bool]:
+    def hit_cell(self, si, previous, active) -> Cell:
         """`cell` of the emitter point that was hit, see `hit_densities`."""
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))
         d = dr.select(si.is_valid(), dr.normalize(previous - si.p), mi.Vector3f(si.wi))
-        return self.cell(self._index_of(emitter, active), previous, d, active)
+        return self.cell(self._index_of(emitter, active), previous, d, dr.abs(dr.dot(si.n, d)), active)
 
     def hit_densities(self, si, previous, active):
         """Densities with which light-side strategies make the hit emitter point.

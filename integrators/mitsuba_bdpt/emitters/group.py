@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..geometry import rays, rounding
 from ..host.introspection import named
-from .emission_tables import EmissionGuide, Place
+from .emission_tables import EmissionGuide, Factor, Place
 from .records import Chosen, Direct, Emission, Hit
 
 
@@ -74,11 +74,8 @@ class Group:
         """How many tables guide the emission of this one, see `emission_tables`."""
         return 0
 
-    def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
-        """A copy that knows the `place` of an emission, guided by ``guide`` (None: by none).
-
-        ``whole``: it guides all emitters of the group.
-        """
+    def placed(self, guide: EmissionGuide | None) -> Group:
+        """A copy that knows the `place` of an emission, guided by ``guide`` (None: by none)."""
         other = copy(self)
         other.guide = guide
         return other
@@ -89,6 +86,13 @@ class Group:
         Asked of copies that `placed` has made.
         """
         raise NotImplementedError(f"{type(self).__name__} has no place")
+
+    def factor(self, index: mi.UInt32, p, d, cos, side: int, active) -> Factor:
+        """What tables of ``side`` x ``side`` cells change of the density of such emissions.
+
+        ``cos`` with the geometric normal.
+        """
+        return Factor.whole()
 
     # -- emission ---------------------------------------------------------------------------
 

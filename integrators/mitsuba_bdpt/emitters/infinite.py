@@ -11,8 +11,8 @@ import numpy as np
 from ..geometry import rays
 from ..geometry.to_world import check_rotation
 from ..host.introspection import own_parameters
-from .disks import Disks
-from .emission_tables import SKY_BINS, EmissionGuide, Place, cell_at
+from .disks import AIMED, Disks, Guided
+from .emission_tables import SKY_BINS, Factor, Place, cell_at
 from .group import Context, Group, emitting_point, free_emission, weight_over
 from .records import Chosen, Direct, Emission, Hit
 from .tables import Mask, rows
@@ -51,12 +51,6 @@ class InfiniteEmitters(Group):
 
     # -- points of emission -----------------------------------------------------------------
 
-    def placed(self, guide: EmissionGuide | None, whole: bool) -> Group:
-        other = super().placed(guide, whole)
-        if guide is not None and whole:
-            other.disks = self.disks.guided(guide.side)
-        return other
-
     def _bin(self, index, d, active):
         """In which table of an emitter light along ``d`` is."""
         directional = self._directional.at(index, active)
@@ -65,12 +59,19 @@ class InfiniteEmitters(Group):
     def place(self, index, p, d, active) -> Place:
         return Place(self._bin(index, d, active), self.disks.place(p, d))
 
+    def factor(self, index, p, d, cos, side, active) -> Factor:
+        return self.disks.factor(p, d, self.disks.share(side))
+
+    def _share(self, guide, index, active):
+        """The share of subpaths that are aimed at details, of emitters with and without a table."""
+        return dr.select(guide.is_guided(index, active), self.disks.share(guide.side), AIMED)
+
     def _point_pdf_a(self, index, p, d, active, sign=1):
         """Density with which a subpath along ``d``, times ``sign``, passes ``p`` (area across ``d``)."""
         if self.guide is None:
             return self.disks.pdf_a(p, d)
-        place = self.place(index, p, d * sign, active)
-        return self.disks.pdf_a(p, d, self.guide.density(index, place, active))
+        density = self.guide.density(index, self.place(index, p, d * sign, active), active)
+        return self.disks.pdf_a(p, d, density, self._share(self.guide, index, active))
 
     def _sample_point(self, index, d, u, active):
         """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
@@ -78,7 +79,14 @@ class InfiniteEmitters(Group):
         if guide is None:
             return self.disks.start(d, u)
         which = self._bin(index, d, active)
-        return self.disks.start(d, u, lambda u: guide.warp(index, which, u, active))
+
+        def density(p):
+            return guide.density(index, Place(which, self.disks.place(p, d)), active)
+
+        def warp(u):
+            return guide.warp(index, which, u, active)
+
+        return self.disks.start(d, u, Guided(self._share(guide, index, active), warp, density))
 
     # -- emission ---------------------------------------------------------------------------
 

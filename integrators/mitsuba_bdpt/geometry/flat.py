@@ -7,8 +7,8 @@ import numpy as np
 
 from ..host.introspection import own_parameters
 
-# Of unit normals: 1 - cos up to which they are one.
-_SAME = 1e-6
+# Of unit normals: 1 - cos up to which they are one. (Rounding of vertices is some 1e-14.)
+_SAME = 1e-10
 
 
 def is_flat(shape: mi.Shape) -> bool:

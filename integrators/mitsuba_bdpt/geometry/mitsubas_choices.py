@@ -162,7 +162,9 @@ def _seen(shape, ps):
     any other part of the shape lies between.
     """
     height = dr.opaque(mi.Float, 1e-3 * max(shape.bbox().extents()))
-    return shape.ray_intersect(mi.Ray3f(ps.p + height * ps.n, -mi.Vector3f(ps.n)), mi.RayFlags.All)
+    ray = mi.Ray3f(ps.p + height * ps.n, -mi.Vector3f(ps.n))
+    # Shape.ray_intersect fails where the scene has a shapegroup of two kinds of shapes.
+    return shape.compute_surface_interaction(ray, shape.ray_intersect_preliminary(ray), mi.RayFlags.All)
 
 
 def _differ(sampled, stated):

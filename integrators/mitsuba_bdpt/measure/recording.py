@@ -20,6 +20,7 @@ import numpy as np
 from ..errors import CommandError
 from ..host.jit import gc_paused
 from ..image import sink
+from ..planning import planner
 from ..run import rendering
 from ..sampling.points import Points
 from ..transport import connections, kernel
@@ -146,8 +147,9 @@ def _outlier(launch: Launch, row, slot: int) -> Outlier:
 def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it, largest first.
 
-    They are all samples larger than ``least`` (of the image's shape) in one of the colours. Raises
-    ``CommandError`` for a film of other colours, for `merging`, and where s = 0 is guided.
+    They are all samples larger than ``least`` (of the image's shape) in one of the colours. Lanes keep one
+    light subpath each (`Plan.joined`). Raises ``CommandError`` for a film of other colours, for `merging`,
+    where s = 0 is guided, and for decisions that join more.
     """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -159,6 +161,10 @@ def render(scene, integrator, least, spp: int, seed: int):
     def trace(traced, image, batch, points, of):
         if traced.guide is not None:
             raise CommandError("paths that are guided are not looked at; set photon_guiding=never")
+        if traced.plan.joined > 1:
+            raise CommandError(
+                "decisions: lanes with several light subpaths are not looked at; set joined=1 in them"
+            )
         launch = Launch(copy(traced), batch, points, of, int(film.crop_size()[0]))
         collector = Collector(image._film, least, kernel.shared_by(traced, batch, points).lanes)
         counts = kernel.trace(traced, collector, batch, points, of)
@@ -166,7 +172,8 @@ def render(scene, integrator, least, spp: int, seed: int):
         outliers.extend(collector.found(launch))
         return counts
 
-    with mock.patch.object(rendering, "trace", trace):
+    one = mock.patch.object(planner, "JOINED", (1,))
+    with one, mock.patch.object(rendering, "trace", trace):
         image = np.array(integrator.render(scene, spp=spp, seed=seed))[..., :3]
     outliers.sort(key=lambda found: -(found.value / least[found.y, found.x]).max())
     return image, outliers

@@ -78,24 +78,29 @@ class Prediction:
     """The predicted efficiency of a candidate.
 
     ``cost`` of a sample (path tracing alone: 1); its ``variance`` as relMSE, before what points take off that
-    of all candidates, without isolated light where s = 0 can be guided; ``gain``: see `guided_gain`.
+    of all candidates, without isolated light where s = 0 can be guided; ``gain``: see `guided_gain`;
+    ``without_tables``: not of the tables that guide emission.
     """
 
     candidate: Configuration
     cost: float
     variance: float
     gain: float = 1.0
+    without_tables: bool = False
 
     @property
     def time(self) -> float:
         """To a certain error, in a unit of its own."""
         return self.cost * self.variance
 
-    def with_emission(self, tables: EmissionTables) -> Prediction:
-        """The same with light subpaths that ``tables`` guide, if there are some."""
+    def with_emission(self, tables: EmissionTables, predicted: bool) -> Prediction:
+        """The same with light subpaths that ``tables`` guide, if there are some.
+
+        ``predicted``: whether it was without.
+        """
         if not self.candidate.light_paths:
             return self
-        return replace(self, candidate=replace(self.candidate, emission=tables))
+        return replace(self, candidate=replace(self.candidate, emission=tables), without_tables=predicted)
 
     def decided(self, first_pass: int, mean: float) -> Decision:
         """The decision for the candidate from the pass ``first_pass`` on; ``mean`` of the image."""

@@ -91,8 +91,8 @@ class Configuration:
             kappa_direct=self.kappa_direct,
             guided=max(self.guided, full.guided) if full.guidable and not full.merging else 0,
             merging=full.merging and (self.guided > 0 or not full.guidable),
-            emission=self.emission if full.teachable and light else None,
         )
         served = self.camera_paths_per_light_path if adopted.light else 1
         joined = self.joined if adopted.connections == "one" else 1
-        return replace(adopted, camera_paths_per_light_path=served, joined=joined)
+        emission = self.emission if adopted.light else None
+        return replace(adopted, camera_paths_per_light_path=served, joined=joined, emission=emission)

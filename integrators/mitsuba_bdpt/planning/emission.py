@@ -4,12 +4,16 @@
 """Learns from a pilot where light subpaths should set out to: `emission_tables.EmissionTables`.
 
 A contribution of the pilot with the weighted size v lies on a path whose emission is in some cell of the
-tables, whichever strategy has made it; l is the share in the sum of its densities of those strategies whose
-light subpath chooses that emission (t <= 1, inner). With r times as many emissions in the cell its second
-moment is v^2 / (1 - l + r l), of the balance heuristic, so that the gain of any table is known from samples
-without one. The best one, of those of mean 1 in each table, is the fixed point of r^2 <- r^2 sum of
-v^2 l / (1 - l + r l)^2. (E. Veach 1997, section 9.2; of that kind are S. Grittmann et al. 2018, and P. Dutre
-and Y. Willems 1995, who have no l.)
+tables, whichever strategy has made it; q is the share in the sum of its densities of those strategies whose
+light subpath chooses that emission (t <= 1, inner). Tables multiply that density by a + b r, with r of the
+cell, a `Factor` that is 0 and 1 where all is by the table. The second moment (balance heuristic) is then
+v^2 / (1 - q + q (a + b r)): the gain of any table is known from samples without one. With
+
+    D = 1 - q + q a + q b,   l = q b / D,   it is   v^2 / D / (1 - l + l r).
+
+The best r of a mean of 1 is the fixed point of r^2 <- r^2 sum of v^2 / D l / (1 - l + l r)^2.
+(E. Veach 1997, section 9.2; of that kind are P. Grittmann et al. 2018, and P. Dutre and Y. Willems 1995, who
+have no l.)
 
 A table that noise has made destroys what points achieve, so one that half of a pilot has taught has to gain
 on the other half.
@@ -24,14 +28,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.emission_tables import EmissionTables
+from ..emitters.emission_tables import Cell, EmissionTables
 from ..sensors.records import Region
 from ..transport.contribution import Contribution
 from .configuration import Configuration
-from .moments import HEARD_TILES, group
+from .moments import HEARD_TILES
 
 # Halves of a pilot, and classes of l / (1 - l), each four times the one before.
 HALVES, CLASSES = 2, 8
+
+# Columns of a cell: the classes, and the second moments before, by l and whole.
+BEFORE = 2
+COLUMNS = CLASSES + BEFORE
 
 # What l / (1 - l) is in the classes, about.
 ODDS = 4.0 ** (np.arange(CLASSES) - (CLASSES - 1) / 2)
@@ -39,8 +47,8 @@ ODDS = 4.0 ** (np.arange(CLASSES) - (CLASSES - 1) / 2)
 # Densities are this or more: 1 / 0.25 is the most by which a contribution can rise.
 LEAST = (0.5, 0.25)
 
-# What has to be left of the second moment of light-side strategies at most, the worst cells included or not.
-PAYS = 0.9
+# What has to be left of the second moments, by l, at most (the geometric mean of all and of all but `WORST`).
+PAYS = 0.93
 
 # Cells that are left out of the second judgement: in `glass_caustics` second moments are outliers.
 WORST = 0.02
@@ -54,30 +62,42 @@ _STEPS = 16
 
 
 class Listener:
-    """Sums of what a pilot's contributions tell about their emissions, of ``cells`` cells of all tables."""
+    """Sums of what a pilot's contributions tell about their emissions, of ``cells`` cells of all tables.
+
+    Of each cell v^2 / D by class, then v^2 without tables: times l, and as it is (`BEFORE`).
+    """
 
     def __init__(self, region: Region, cells: int):
         self._region, self.cells = region, cells
-        self._sums = dr.zeros(mi.Float64, HALVES * HEARD_TILES**2 * cells * CLASSES)
+        self._sums = dr.zeros(mi.Float64, HALVES * HEARD_TILES**2 * cells * COLUMNS)
         dr.make_opaque(self._sums)
 
     def hear(
-        self, c: Contribution, position: mi.Point2f, lane: mi.UInt32, square: mi.Float64, active: mi.Bool
+        self, c: Contribution, position: mi.Point2f, half: mi.UInt32, square: mi.Float64, active: mi.Bool
     ):
-        """Add a contribution of this squared size to the ``position`` on the film, where ``active``."""
+        """Add a contribution of this squared size to the ``position`` on the film, where ``active``.
+
+        Where no light subpath could have made its path, it is none of any table's.
+        """
         hit, direct, light, inner = c.shares  # pyright: ignore[reportGeneralTypeIssues]
-        odds = dr.log2((light + inner) / (hit + direct)) / 2 + CLASSES / 2
+        cell: Cell = c.emission  # pyright: ignore[reportAssignmentType]
+        share = (light + inner) / (hit + direct + light + inner)
+        active = active & cell.known & (share > 0)
+        rest = 1 - share + share * cell.factor.kept
+        scaled = share * cell.factor.scaled
+        odds = dr.log2(scaled / rest) / 2 + CLASSES / 2
         kind = mi.UInt32(dr.clip(odds, 0, CLASSES - 1))
         uv = dr.clip(self._region.to_uv(position), 0, 1)
         xy = dr.minimum(mi.Point2u(uv * HEARD_TILES), HEARD_TILES - 1)
-        part = (group(lane) % HALVES) * HEARD_TILES**2 + xy.y * HEARD_TILES + xy.x
-        cell, known = c.emission  # pyright: ignore[reportGeneralTypeIssues]
-        place = (part * self.cells + cell) * CLASSES + kind
-        dr.scatter_reduce(dr.ReduceOp.Add, self._sums, square, place, active & known)
+        part = half * HEARD_TILES**2 + xy.y * HEARD_TILES + xy.x
+        place = (part * self.cells + cell.number) * COLUMNS
+        even, of_table = square / (rest + scaled), square * (scaled / (rest + scaled))
+        for column, value in ((kind, even), (CLASSES, of_table), (CLASSES + 1, square)):
+            dr.scatter_reduce(dr.ReduceOp.Add, self._sums, value, place + column, active)
 
     def evaluated(self) -> np.ndarray:
-        """Shape (`HALVES`, tiles, cells, `CLASSES`)."""
-        return np.array(self._sums).reshape(HALVES, HEARD_TILES**2, self.cells, CLASSES)
+        """Shape (`HALVES`, tiles, cells, `COLUMNS`)."""
+        return np.array(self._sums).reshape(HALVES, HEARD_TILES**2, self.cells, COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -97,13 +117,14 @@ def learn(heard: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
 
     Tables have ``side`` x ``side`` cells; ``counts`` of each emitter's.
     """
-    heard = heard.reshape(HALVES, -1, side, side, CLASSES)
+    heard = heard.reshape(HALVES, -1, side, side, COLUMNS)
     if not heard.any() or not np.isfinite(heard).all():
         return Learnt(None)
     halves = [_fitted(half) for half in heard]
+    guided = _worth_a_table(heard, halves, counts)
     judged: dict[float, Learnt] = {}
     for a in LEAST:
-        found = [_left(heard[1 - i], a + (1 - a) * halves[i]) for i in range(HALVES)]
+        found = [_left(heard[1 - i], a + (1 - a) * halves[i], guided) for i in range(HALVES)]
         left, whole = np.mean(found, axis=0)
         if left.max() < 1:
             judged[a] = Learnt(None, float(np.sqrt(left.prod())), float(np.sqrt(whole.prod())))
@@ -112,19 +133,20 @@ def learn(heard: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
         return best
     least = next(a for a, learnt in judged.items() if learnt is best)
     densities = least + (1 - least) * _fitted(heard.sum(axis=0))
-    _leave_alone(densities, heard.sum(axis=0), counts)
-    return replace(best, tables=EmissionTables.of(densities, least, best.left))
+    densities[~guided] = 1
+    return replace(best, tables=EmissionTables.of(densities, best.left))
 
 
-def _leave_alone(densities: np.ndarray, squares: np.ndarray, counts: Sequence[int]):
-    """Turn tables of emitters that have little part in what is saved into those of none."""
-    share = ODDS / (1 + ODDS)
-    saved = squares * share * (1 - 1 / (1 - share + densities[..., None] * share))
+def _worth_a_table(heard: np.ndarray, halves: list[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+    """Of each table whether its emitter has a part in what the ``halves``' tables save of the other half."""
+    a = LEAST[-1]
+    saved = sum(
+        half[..., CLASSES] - _light_side(half, a + (1 - a) * taught)
+        for half, taught in zip(heard, halves[::-1], strict=True)
+    )
     last = np.cumsum(counts)
-    of_emitters = [saved[end - count : end].sum() for count, end in zip(counts, last, strict=True)]
-    for count, end, own in zip(counts, last, of_emitters, strict=True):
-        if own < PART * sum(of_emitters):
-            densities[end - count : end] = 1
+    own = [max(saved[end - count : end].sum(), 0) for count, end in zip(counts, last, strict=True)]
+    return np.repeat([one > 0 and one >= PART * sum(own) for one in own], counts)
 
 
 def left_out(chosen: Configuration, learnt: Learnt | None) -> list[dict[str, str]]:
@@ -140,13 +162,15 @@ def left_out(chosen: Configuration, learnt: Learnt | None) -> list[dict[str, str
 
 def left_by(tables: EmissionTables, heard: np.ndarray) -> float:
     """What ``tables`` leave of the second moment of light-side strategies in all that was ``heard``."""
-    whole = heard.reshape(HALVES, -1, tables.side, tables.side, CLASSES).sum(axis=0)
-    return float(np.sqrt(_left(whole, tables.densities())[0].prod()))
+    whole = heard.reshape(HALVES, -1, tables.side, tables.side, COLUMNS).sum(axis=0)
+    densities = tables.densities()
+    guided = (densities != 1).any(axis=(1, 2))
+    return float(np.sqrt(_left(whole, densities, guided)[0].prod()))
 
 
-def _fitted(squares: np.ndarray) -> np.ndarray:
-    """The best densities for these sums of v^2, shape (tables, side, side, `CLASSES`)."""
-    squares = _blurred(squares)
+def _fitted(heard: np.ndarray) -> np.ndarray:
+    """The best densities for what was ``heard``, shape (tables, side, side, `COLUMNS`)."""
+    squares = _blurred(heard[..., :CLASSES])
     share = ODDS / (1 + ODDS)
     density = np.ones(squares.shape[:-1])
     for _ in range(_STEPS):
@@ -168,18 +192,25 @@ def _blurred(squares: np.ndarray) -> np.ndarray:
     return squares
 
 
-def _left(squares: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """What is left of second moments, shape (2, 2).
+def _light_side(heard: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Second moments of light-side strategies with these densities."""
+    share = ODDS / (1 + ODDS)
+    return (heard[..., :CLASSES] * share / (1 - share + density[..., None] * share)).sum(axis=-1)
 
-    Of light-side strategies and of all; of all cells and without `WORST`.
+
+def _left(heard: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndarray:
+    """What is left of second moments, shape (2, 2), if these tables are ``guided`` by their densities.
+
+    By l and whole; of all cells and without `WORST` of those that have any.
     """
     share = ODDS / (1 + ODDS)
-    after = squares / (1 - share + density[..., None] * share)
-    light = [(values * share).sum(axis=-1).ravel() for values in (squares, after)]
-    whole = [values.sum(axis=-1).ravel() for values in (squares, after)]
-    kept = np.argsort(light[0])[: int(np.ceil(len(light[0]) * (1 - WORST)))]
-    sums = np.array(
-        [[[values[cells].sum() for cells in (slice(None), kept)] for values in of] for of in (light, whole)]
-    )
-    before, left = sums[:, 0], sums[:, 1]
-    return np.where(before > 0, left / np.where(before > 0, before, 1), 1)
+    whole = (heard[..., :CLASSES] / (1 - share + density[..., None] * share)).sum(axis=-1)
+    before = [heard[..., CLASSES + i] for i in range(BEFORE)]
+    after = [
+        np.where(guided[:, None, None], changed, same)
+        for changed, same in zip((_light_side(heard, density), whole), before, strict=True)
+    ]
+    some = np.flatnonzero(before[0])
+    kept = some[np.argsort(before[0].ravel()[some])[: int(len(some) * (1 - WORST))]]
+    sums = np.array([[[v.sum(), v.ravel()[kept].sum()] for v in of] for of in (before, after)])
+    return np.where(sums[0] > 0, sums[1] / np.where(sums[0] > 0, sums[0], 1), 1)

@@ -65,6 +65,7 @@ def explain(
     ]
     lines = [
         f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.camera_paths_per_light_path)}"
+        + (f", each of which is joined with {p.joined} of them" if p.joined > 1 else "")
         if p.light
         else f"heuristic {settings.heuristic}, no light subpaths"
     ]
@@ -131,6 +132,8 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
             f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of isolated paths, which none of "
             "these figures has"
         )
+    if table[0].without_tables:
+        lines.append("  guided emission is in none of these figures")
     lines.append(
         f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
         f"most {LIGHT_GAIN:g} times as long as the best"

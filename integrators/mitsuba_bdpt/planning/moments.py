@@ -259,7 +259,9 @@ def _of_tiles(heard: np.ndarray | None, samples: Samples, splats: np.ndarray) ->
     brightness = over_tiles(np.bincount(samples.tile, last, FINE**2)) / np.maximum(counts, 1)
     brightness += over_tiles(splats) * HEARD_TILES**2
     norms = brightness**2 + 0.01 * brightness.mean() ** 2
-    return np.einsum("htck,t->hck", heard, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
+    found = np.einsum("htck,t->hck", heard, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
+    # What is no number would be one in no pilot that is joined with this one.
+    return found if np.isfinite(found).all() else np.zeros_like(found)
 
 
 def _other(estimate: np.ndarray) -> np.ndarray:

@@ -192,7 +192,10 @@ class Pilot:
     def _hear(self, c: Contribution, size: mi.Float64, position: mi.Point2f, active: mi.Bool):
         if self._listener is not None:
             lane = dr.arange(mi.UInt32, self._lanes)
-            self._listener.hear(c, position, lane, dr.square(size), active & (size > 0))
+            # Samples of a pixel are in the same half.
+            pair = (lane - self._first_net) // (NETS * NET)
+            half = dr.select(lane < self._first_net, moments.group(lane), pair) % 2
+            self._listener.hear(c, position, half, dr.square(size), active & (size > 0))
 
     def evaluate(self, counts: mi.UInt64):
         """Run what was recorded, and ``counts`` with it."""
@@ -286,6 +289,7 @@ def measure(
         merging=False,
         connections="none" if plan.connections == "none" else "all",
         camera_paths_per_light_path=1,
+        joined=1,
         kappa_light=1.0,
         kappa_direct=1.0,
         roulette=False,

@@ -99,6 +99,8 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     drawn = draw(kernel, z, path, candidates, u)
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
+    if kernel.plan.joined > 1:  # each of so many light subpaths is an estimate of its own
+        value = value / kernel.plan.joined
     active = drawn.total > 0
     active, survival, rouletted = roulette(kernel, value, drawn.u, active)
     counted = rouletted + Counters(
@@ -199,7 +201,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) ->
     """As `_draw`, among the vertices of several light subpaths, by a `sketches.guess` of what each adds.
 
     The BSDFs are evaluated for the one drawn. One of all is drawn evenly with the probability `EVENLY`. The
-    ``total`` is the estimate's size: that of the mean over the light subpaths.
+    ``total`` is the size of the estimate.
     """
     some = candidates > 0
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
@@ -230,8 +232,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) ->
     probability = EVENLY / count + dr.select(total > 0, (1 - EVENLY) * size / total, (1 - EVENLY) / count)
     y = read_light_vertex(kernel, path, drawn, some)
     c = drop_non_finite(inner(kernel, replace(z, hit=z.hit & some), y))
-    weighted = foreseen(kernel, c) / (probability * kernel.plan.joined)
-    value = dr.select(some & c.active, weighted, 0)
+    value = dr.select(some & c.active, foreseen(kernel, c) / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
     return _Drawn(value, size_of(value), end, u, one(c.active), c.counted.non_finite)
 

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..emitters.emission_tables import Cell
 from . import bsdf
 from .counters import Counters, one
 from .inputs import Kernel
@@ -38,7 +39,7 @@ class Contribution:
     position: mi.Point2f | None = None
     counted: Counters = field(default_factory=Counters)
     sides: Any = None
-    emission: tuple[mi.UInt32, mi.Bool] | None = None
+    emission: Cell | None = None
 
     def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""

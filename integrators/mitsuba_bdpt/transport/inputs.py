@@ -140,8 +140,8 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
         splat=entry("light", light, plan.splat),
         endpoints=entry("light", light, plan.endpoints),
         arrival=entry("light", light, plan.arrival),
-        # One of M candidates is no M independent samples. (With M = 4 the error is 0.96 times that of kappa = M
-        # in `cornell_box`, 0.88 in `veach_bidir`.)
+        # One of M candidates is no M independent samples. (With M = 4 the error is 0.96 times that with
+        # kappa = M in `cornell_box`, 0.88 in `veach_bidir`.)
         inner=entry("inner", math.sqrt(plan.joined), plan.connections != "none"),
     )
 

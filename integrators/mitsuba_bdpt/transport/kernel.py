@@ -91,6 +91,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..emitters.emission_tables import Cell
 from ..geometry import rays
 from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
@@ -114,7 +115,7 @@ class Lane:
     place: Places
     shared: Shared
     path: stored_vertices.LightPath
-    emission: tuple[mi.UInt32, mi.Bool] | None = None
+    emission: Cell | None = None
 
 
 @dataclass
@@ -134,7 +135,7 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UI
     `Counters.summed`; nothing is evaluated yet.
     """
     sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(batch, sharing), Observer())
+    kernel = kernel.bound(points, _count_light(kernel, batch, sharing), Observer())
     index = dr.arange(mi.UInt32, sharing.lanes)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
 
@@ -158,7 +159,7 @@ def retrace(
     whoever looks at single samples; no render does.)
     """
     sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(batch, sharing), observer)
+    kernel = kernel.bound(points, _count_light(kernel, batch, sharing), observer)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), sharing.lane(slot))
     return (of_light + _camera_subpath(kernel, sink, lane, slot, mi.Bool(True))).summed()
 
@@ -197,7 +198,7 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     return Sharing(batch.pixels, batch.samples, kernel.plan.served, points.seed)
 
 
-def _count_light(batch: Batch, sharing: Sharing) -> float:
+def _count_light(kernel: Kernel, batch: Batch, sharing: Sharing) -> float:
     """Light subpaths per camera subpath: exact also where S does not divide the batch's pixels.
 
     A pilot's estimates are those of one, whose number it divides by itself.
@@ -265,7 +266,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     """
     plan = kernel.plan
     e = emission(kernel, stream, shared)
-    emitted = kernel.emitters.cell(e.index, e.si.p, e.d, mi.Bool(True)) if kernel.tells_emission else None
+    emitted = None
+    if kernel.tells_emission:
+        emitted = kernel.emitters.cell(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
     counters = Counters()
 
     def splat(c):

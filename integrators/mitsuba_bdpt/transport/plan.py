@@ -24,9 +24,8 @@ class Plan:
     ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
     left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: by how many samples
     s = 0 is guided at a vertex; ``guidable``: whether a pilot may say that it pays; ``emission``: what guides
-    that of light subpaths, ``teachable``: whether a pilot may say that it pays. ``joined``: light subpaths with
-    whose vertices each camera subpath is joined (M): they serve M S camera subpaths together, see
-    `connections`.
+    that of light subpaths, ``teachable``: whether a pilot may say that it pays. ``joined``: number of light
+    subpaths (M) with whose vertices each camera subpath is joined; they serve M S camera subpaths.
     """
 
     hit: bool

@@ -108,7 +108,8 @@ class Sketch:
                 lambda *diffuse: diffuse,
             )
         size, pdf_w, others = found
-        return size * dr.select(self.both | (signed > 0), 1, WRONG_SIDE), pdf_w, others, cos
+        size *= dr.select(self.both | (signed > 0), mi.Float(1), WRONG_SIDE)
+        return size, pdf_w, others, mi.Float(cos)
 
     def _with_lobe(self, d, cos, size, pdf_w, others):
         half = self.wi + d

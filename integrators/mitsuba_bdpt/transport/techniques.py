@@ -130,7 +130,10 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     ray = dr.select(e.infinite, to_infinity, to_point)
     counted = Counters(shadow_s1=one(active))
     sight = Sight(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
-    emission = kernel.emitters.cell(e.index, z.si.p, -e.d, active) if kernel.tells_emission else None
+    emission = None
+    if kernel.tells_emission:
+        cos = dr.abs(dr.dot(e.anchor.n, e.d))
+        emission = kernel.emitters.cell(e.index, z.si.p, -e.d, cos, active)
     ends = mi.UInt32(1), k
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
     return seen(kernel, c, sight)
