@@ -10,7 +10,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
     time, wavelengths <- drawn for all subpaths of the lane                 shared_by_lane
 
-    # The light subpath                                                     _light_subpath
+    # The light subpath, or M of them one after the other                   _light_subpath, _light_subpaths
     y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   emission
     (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
     the first edge <- a ray; it ends here for want of a throughput          light_walk
@@ -30,7 +30,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
         roulette of the subpath; the next edge <- a ray
 
     # Its camera subpaths
-    for S pixels (fewer in the last lanes; one without light subpaths):     _serve_all, _camera_subpath
+    for M S pixels (fewer in the last lanes; one without light subpaths):   _serve_all, _camera_subpath
         z_0, direction, throughput <- the sensor, at a point of the pixel   _camera_sample
         the first edge <- a ray                                             _camera_walk
         d_vcm <- 1 / density of the direction (of z_0, if all are parallel) _first_partial
@@ -48,6 +48,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             s >= 2: total += z joined with kept vertices y (eqs. 40, 41):
                         each of them,                                       connections.connect_all
                         or one, drawn by what it would add unshadowed       connections.connect_one
+                (of several light subpaths by a guess of that)
             d_vcm, d_vc, throughput <- the event at z                       walk._leave
             roulette of the subpath; the next edge <- a ray
         add the total to the film                                           sink.end
