@@ -1042,7 +1042,7 @@ def test_rays_of_light_subpaths_are_counted_for_each():
     [(4, 1 << 12, 16), (64, 1 << 12, 16), (65, 1 << 12, 1024), (1024, 1 << 15, 1024), (4096, 1 << 15, 4096)],
 )
 def test_how_rare_paths_may_be(stands_for, lanes, expected):
-    """Expected: in renders of up to 2^18 samples once in 16 times that the pilot makes them, else once in 1024,
+    """Expected: up to 2^18 samples once in 16 times that the pilot makes them, in longer ones once in 1024,
     or in as many as one of the pilot's samples stands for.
     """
     assert pilot.rarest(stands_for, lanes) == expected
