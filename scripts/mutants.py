@@ -942,9 +942,16 @@ MUTANTS = (
     Mutant(
         "joined light subpaths: what is drawn evenly is forgotten",
         "transport/connections.py",
-        "probability = EVENLY / count + dr.select(",
-        "probability = dr.select(",
-        ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed",),
+        "probability = dr.select(guessed, EVENLY / count + (1 - EVENLY) * size / total, 1 / count)",
+        "probability = dr.select(guessed, (1 - EVENLY) * size / total, 1 / count)",
+        ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed[0.5-0.0]",),
+    ),
+    Mutant(
+        "joined light subpaths: roulette has the number of the even draw",
+        "transport/connections.py",
+        "return _Drawn(value, size_of(value), end, left, one(some)",
+        "return _Drawn(value, size_of(value), end, u_even, one(some)",
+        ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed[1.0-0.1]",),
     ),
     Mutant(
         "joined light subpaths: estimates are not over their number",

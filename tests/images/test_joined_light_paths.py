@@ -11,7 +11,6 @@ import welch as st
 from mitsuba_bdpt.measure import recording
 from mitsuba_bdpt.planning import choice, planner
 from mitsuba_bdpt.planning.configuration import Configuration
-from mitsuba_bdpt.settings import UNLIMITED
 from mitsuba_bdpt.transport import connections, sketches
 from snapshots import ROUNDING, stopped
 
@@ -167,21 +166,24 @@ FEW = {"t<=1": 1e-3, "s=1": 1.0}
 INNER = {"t<=1": 1e-3, "s=1": 1e-2}
 
 
-def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch):
-    """Rationale: a guess may be off by any factor, and 0 where something is added. Expected: the same tiles
-    with guesses that are 0 for half of the light vertices, where inner connections have most of the weight
-    and many are drawn evenly.
+@pytest.mark.parametrize("threshold", [0.0, 0.1])
+@pytest.mark.parametrize("zeros", [0.5, 1.0])
+def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold):
+    """Rationale: a guess may be off by any factor, and 0 where something is added; roulette then needs a
+    number that the draw has not used. Expected: the same tiles with guesses that are 0 for half of the light
+    vertices, or all, where inner connections have most of the weight and many are drawn evenly.
     """
     scene = scene_of("diffuse", "point")
     true = sketches.guess
 
     def wild(kernel, z, y):
         place = y.p.x * 977
-        return dr.select(place - dr.floor(place) < 0.5, 0, true(kernel, z, y))
+        return dr.select(place - dr.floor(place) < zeros, 0, true(kernel, z, y))
 
     monkeypatch.setattr(connections, "guess", wild)
     monkeypatch.setattr(connections, "EVENLY", 0.5)
-    a = images(scene, spp=512, seeds=16, decisions=decided(coefficients=INNER))
+    roulette = {"mean": threshold, "variance": 1.0} if threshold else {}
+    a = images(scene, spp=512, seeds=16, decisions=decided(coefficients=INNER, **roulette))
     monkeypatch.undo()
     b = images(scene, spp=512, seeds=16, first=100, decisions=decided(1, 1.0, coefficients=INNER))
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
@@ -202,7 +204,7 @@ def test_guesses_are_about_right(material, factor, monkeypatch):
     reference = images(scene, spp=4096, seeds=8, first=500, skip="none").mean(axis=0)
     norm = reference**2 + 0.01 * reference.mean() ** 2
     guessed = images(scene, spp=32, seeds=64, decisions=decided(coefficients=FEW))
-    monkeypatch.setattr(connections, "_draw_by_guess", connections._draw)
+    monkeypatch.setattr(connections, "_draw_by_guess", lambda *given: connections._draw(*given[:-1]))
     evaluated = images(scene, spp=32, seeds=64, decisions=decided(coefficients=FEW))
     errors = [np.mean((x - reference) ** 2 / norm) for x in (guessed, evaluated)]
     assert errors[0] < factor * errors[1], errors
@@ -257,31 +259,74 @@ def test_short_renders_are_not_joined():
         ({"light_paths": 1 / 8}, 1),
         ({"connections": "none"}, 1),
         ({"samples": (1 << 16) - 1}, 1),
-        ({"merging": True}, 1),
-        ({"space": "fog"}, 1),
-        ({"small": True}, 1),
-        ({"longest": 300}, 1),
-        ({"longest": 258}, 4),
+        ({"pixels": (1 << 10) - 1}, 1),
+        ({"transmits": True}, 1),
+        ({"points": "sampler"}, 1),
+        ({"why": "in scenes with media"}, 1),
     ],
     ids=str,
 )
 def test_what_is_joined(change, joined):
-    """Expected: four light subpaths where the fewest are chosen with one connection, the render is long, its
-    lanes can keep the vertices, and neither media, merging nor tiny shapes take part.
+    """Expected: four light subpaths where the fewest are chosen with one connection, in a long render of many
+    pixels, and where guesses know the BSDFs and the points are not a scene's sampler's.
     """
-    given = {"light_paths": 1 / 16, "connections": "one", "samples": 1 << 16, "merging": False}
-    given |= {"space": None, "small": False, "longest": 64} | change
+    given = {"light_paths": 1 / 16, "connections": "one", "samples": 1 << 16, "pixels": 1 << 10}
+    given |= {"transmits": False, "points": "sobol", "why": ""} | change
     way = Configuration(given["light_paths"], given["connections"], 1.0, 1.0)
-    emitters = SimpleNamespace(shape_errors=SimpleNamespace(small=given["small"]))
     asked = SimpleNamespace(
-        _prepared=SimpleNamespace(
-            space=given["space"], emitters=emitters, stored_vertices=lambda settings: given["longest"]
-        ),
-        _settings=SimpleNamespace(max_depth=UNLIMITED),
-        full=SimpleNamespace(merging=given["merging"]),
+        _prepared=SimpleNamespace(traits=SimpleNamespace(transmits=given["transmits"])),
+        _settings=SimpleNamespace(points=given["points"]),
+        _pixels=given["pixels"],
+        _why_not_joined=lambda joined: given["why"],
     )
     row = planner.Planner._joined(asked, choice.Prediction(way, 1.0, 1.0), given["samples"])
     assert row.candidate.joined == joined
+
+
+def tiny():
+    return {"tiny": {"type": "sphere", "center": [0, 1.5, 0], "radius": 1e-4}}
+
+
+def fog():
+    medium = {"type": "homogeneous", "sigma_t": 0.5}
+    box = {"type": "cube", "to_world": T().translate([0, 1, 0]).scale(0.9), "bsdf": {"type": "null"}}
+    return {"fog": box | {"interior": medium}}
+
+
+@pytest.mark.parametrize(
+    "more, parameters, why",
+    [
+        (fog, {}, "in scenes with media"),
+        (tiny, {}, "in scenes with shapes so small"),
+        (dict, {"stored_vertices": 300}, "on paths of up to 300 edges, of which a lane"),
+        (
+            lambda: {"glass": {"type": "sphere", "radius": 0.2, "bsdf": {"type": "dielectric"}}},
+            {"merging": True},
+            "with merging",
+        ),
+    ],
+    ids=["media", "tiny shapes", "long paths", "merging"],
+)
+def test_decisions_that_are_impossible(more, parameters, why):
+    """Expected: an error that names ``decisions`` and says why, before anything is rendered."""
+    scene = mi.load_dict(parts.open_scene(parts.perspective(), lamp=parts.EMITTERS["point"](), **more()))
+    method = mi.load_dict({"type": "bdpt", "decisions": decided(), **parameters})
+    with pytest.raises(ValueError, match=f"decisions: joined=4 is not possible {why}"):
+        method.render(scene, spp=1)
+
+
+def test_as_many_vertices_as_lanes_can_keep():
+    """Expected: with paths of 258 edges, of which four light subpaths fill a lane's memory, an image."""
+    scene = scene_of("diffuse", "point")
+    method = mi.load_dict({"type": "bdpt", "decisions": decided(), "stored_vertices": 258})
+    assert np.isfinite(np.array(method.render(scene, spp=16))).all()
+
+
+def test_what_is_counted():
+    """Expected: at most one pair is evaluated for each camera vertex, and not all are zero."""
+    _, method = rendered(cornell(), 64)
+    counted, rays = method.statistics["connections"], method.statistics["rays"]
+    assert 0 < counted["zero"] < counted["evaluated"] <= rays["camera"]
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ kind of path:
 
 from __future__ import annotations
 
+import math
 from argparse import Namespace
 from dataclasses import dataclass
 
@@ -126,9 +127,8 @@ def _found_anew(scene, kernel, kappa, path):
 def coefficients(plan, k: int) -> np.ndarray:
     """kappa of the k + 2 strategies of paths of ``k`` edges, 0 for those that are not in use."""
     light = plan.kappa_light / plan.camera_paths_per_light_path
-    of = oracle.Coefficients(
-        light * plan.endpoints, light * plan.splat, float(plan.connections != "none"), light * plan.arrival
-    )
+    inner = math.sqrt(plan.joined) * (plan.connections != "none")
+    of = oracle.Coefficients(light * plan.endpoints, light * plan.splat, inner, light * plan.arrival)
     kappa = np.array([of.of(s, k) for s in range(k + 2)])
     if plan.direct and k > 1:
         kappa[1] = plan.kappa_direct

@@ -134,6 +134,8 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
         )
     if table[0].without_tables:
         lines.append("  guided emission is in none of these figures")
+    if (joined := table[0].candidate.joined) > 1:
+        lines.append(f"  they are of one light subpath at a time, not of {joined}")
     lines.append(
         f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
         f"most {LIGHT_GAIN:g} times as long as the best"

@@ -15,10 +15,11 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.emission_tables import EmissionTables, side_of
+from ..errors import UsageError
 from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
-from ..settings import LIGHT_PATHS, MAX_STORED, Settings
+from ..settings import LIGHT_PATHS, Settings
 from ..transport.plan import JOINED, Plan
 from . import budget, choice, emission, even_sky, pilot
 from .candidates import candidates
@@ -26,7 +27,7 @@ from .decision import Decision, replayed
 from .explain import words
 from .findings import Findings
 from .moments import Moments
-from .possible import plan, unreachable_paths
+from .possible import plan, unreachable_paths, why_not_joined
 
 # Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
 FIRST_REPEAT = 32
@@ -39,10 +40,13 @@ LATEST_REPEAT = 1 / 4
 AIMED_GAIN = 1.15
 
 # Where the fewest light subpaths are chosen, with one connection, camera subpaths are joined with several of
-# them, drawn by a guess (`connections`), in renders of so many samples. (Efficiency with four over that with
-# one, 16 samples per pixel of 128^2: `ajar_door` 1.32, `uplight_room` 1.36, `cornell_box` 1.46, `window_room`
-# 1.47, `furnace_point` 1.68, `pool_floor` 0.98. Where more light subpaths are chosen it is 0.73 to 1.30.)
-JOINED_SAMPLES = 1 << 16
+# them, drawn by a guess (`connections`), in renders of so many samples and pixels, 64 of which share four
+# light subpaths. (Efficiency with four over that with one, 16 samples per pixel of 128^2: `ajar_door` 1.32,
+# `uplight_room` 1.36, `cornell_box` 1.46, `window_room` 1.47, `furnace_point` 1.68, `pool_floor` 0.98. Where
+# more light subpaths are chosen it is 0.73 to 1.30.) Not where BSDFs scatter to the other side, which guesses
+# do not know well, not with a scene's sampler, whose numbers the light subpaths of a lane would share, and on
+# CPUs alone: on others it was not measured, and lanes need four times the local memory.
+JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
 # Tables that a later pilot has taught replace earlier ones if they leave this part of what those leave.
 BETTER_TABLES = 0.95
@@ -166,19 +170,22 @@ class Planner:
 
     def _joined(self, row: choice.Prediction, samples: int) -> choice.Prediction:
         """``row``, joined with more light subpaths where that pays, see `JOINED_SAMPLES`."""
-        prepared, candidate = self._prepared, row.candidate
-        longest = min(self._settings.max_depth, prepared.stored_vertices(self._settings))
+        candidate = row.candidate
+        fewest = candidate.connections == "one" and candidate.light_paths == min(n for n in LIGHT_PATHS if n)
         if (
-            candidate.connections != "one"
-            or candidate.light_paths != min(n for n in LIGHT_PATHS if n)
+            not fewest
             or samples < JOINED_SAMPLES
-            or self.full.merging
-            or prepared.space is not None
-            or prepared.emitters.shape_errors.small
-            or JOINED[-1] * (longest - 2) > MAX_STORED
+            or self._pixels < JOINED_PIXELS
+            or self._prepared.traits.transmits
+            or self._settings.points == "sampler"
+            or dr.backend_v(mi.Float) != dr.JitBackend.LLVM
+            or self._why_not_joined(JOINED[-1])
         ):
             return row
         return replace(row, candidate=replace(candidate, joined=JOINED[-1]))
+
+    def _why_not_joined(self, joined: int) -> str:
+        return why_not_joined(self._prepared, self._settings, self.full.merging, joined)
 
     def _learnt(self, moments: Moments, samples: int) -> emission.Learnt:
         """What the pilots teach about emission, remembered of the first (20 ms under a sky)."""
@@ -234,6 +241,10 @@ class Planner:
         If that differs from before, with points of their own: lanes serve other samples, and what was half
         done of the old sequence would not be finished.
         """
+        if decision.joined > 1 and (why := self._why_not_joined(decision.joined)):
+            raise UsageError(
+                f"decisions: joined={decision.joined} is not possible {why}; set it to 1, or leave it out"
+            )
         adopted = replace(decision.plan(self.full), skipped=(*self.full.skipped, *left_out))
         begun = self.decided.decisions or decision.first_pass
         if begun and replace(adopted, skipped=()) != replace(self.plan, skipped=()):

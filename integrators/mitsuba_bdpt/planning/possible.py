@@ -12,7 +12,7 @@ from ..emitters.emission_tables import MOST_CELLS, SIDES, side_of
 from ..emitters.emitters import Emitters
 from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
-from ..settings import DEFAULT_STORED, Settings
+from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport.plan import GUIDED, Plan
 from .budget import EVEN
 
@@ -90,6 +90,22 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         guidable=guidable,
         teachable=teachable,
     )
+
+
+def why_not_joined(prepared: PreparedScene, settings: Settings, merging: bool, joined: int) -> str:
+    """Why camera subpaths cannot be joined with so many light subpaths at a time; empty if they can."""
+    longest = min(settings.max_depth, prepared.stored_vertices(settings))
+    if prepared.space is not None:
+        return "in scenes with media"
+    if merging:
+        return "with merging"
+    if prepared.emitters.shape_errors.small:
+        return "in scenes with shapes so small that rays ask which shape they meet"
+    if joined * (longest - 2) > MAX_STORED:
+        return (
+            f"on paths of up to {longest} edges, of which a lane cannot keep the vertices (stored_vertices)"
+        )
+    return ""
 
 
 def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str] | None:

@@ -57,13 +57,15 @@ class Step:
 class Traits:
     """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`.
 
-    ``glossy``: whether one has a glossy lobe.
+    ``glossy``: whether one has a glossy lobe; ``transmits``: whether one has a lobe, not delta, that scatters
+    to the other side.
     """
 
     full_pdf: bool
     round_trip: bool
     asked: Asked
     glossy: bool = False
+    transmits: bool = False
 
     def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """What the surface ``si`` lets pass straight on."""
@@ -76,8 +78,10 @@ class Traits:
     @staticmethod
     def of(bsdfs: Sequence[mi.BSDF]) -> Traits:
         """Of BSDFs that one virtual call may visit."""
+        through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
         glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
-        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy)
+        transmits = any(bsdf.flags() & through for bsdf in bsdfs)
+        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits)
 
 
 # From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays, rounding
-from ..sampling.points import Purpose, Stream
+from ..sampling.points import Purpose, Stream, sequential
 from . import bsdf, mis, scattering
 from .contribution import Contribution, drop_non_finite, foreseen, roulette, size_of, worth_a_ray
 from .counters import MEDIA, Counters, counted_in_media, one
@@ -95,8 +95,10 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
-    draw = _draw if path.sketches is None else _draw_by_guess
-    drawn = draw(kernel, z, path, candidates, u)
+    if path.sketches is None:
+        drawn = _draw(kernel, z, path, candidates, u)
+    else:
+        drawn = _draw_by_guess(kernel, z, path, candidates, u, stream)
     # In this order: the draw may hit a tiny one, for which total / size is infinite.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
     if kernel.plan.joined > 1:  # each of so many light subpaths is an estimate of its own
@@ -105,8 +107,8 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     active, survival, rouletted = roulette(kernel, value, drawn.u, active)
     counted = rouletted + Counters(
         shadow_inner=one(active),
-        evaluated=candidates,
-        zero=candidates - drawn.nonzero,
+        evaluated=drawn.evaluated,
+        zero=drawn.evaluated - drawn.nonzero,
         non_finite=drawn.lost,
     )
     end, own = drawn.end, None
@@ -121,7 +123,7 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
         active &= ~rays.occluded(kernel.scene, ray, active, own)
         return dr.select(active, value / survival, 0), counted
     sight = Sight(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
-    estimate = drawn.joined * (drawn.total / drawn.size / survival)
+    estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
     c = drop_non_finite(seen(kernel, c, sight))
     return c.weighted(), counted + c.counted
@@ -130,25 +132,29 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
 # The probability with which a candidate is drawn evenly, so that what guesses miss is drawn too.
 EVENLY = 0.005
 
+# Which series of hashed numbers a draw by guesses takes; merges have the first.
+_OF_GUESSES = 2
+
 
 @dataclass
 class _Drawn:
     """A draw among inner connections.
 
     The weighted ``value`` of the one drawn, the ``total`` size of all, the ``end`` of the visibility ray to
-    it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, and how many are not zero,
-    and ``lost`` for want of a finite value. In scenes with media, where the weight is known after the ray
-    only, also its unweighted value (``joined``), its ``sides`` (see `Contribution`) and its ``size`` in the
-    draw.
+    it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, how many were
+    ``evaluated`` and are not zero, and ``lost`` for want of a finite value. In scenes with media, where the
+    weight is known after the ray only, also its ``unweighted`` value, its ``sides`` (see `Contribution`) and
+    its ``size`` in the draw.
     """
 
     value: mi.Spectrum
     total: mi.Float
     end: mi.Point3f | mi.UInt32
     u: mi.Float
+    evaluated: mi.UInt32
     nonzero: mi.UInt32
     lost: mi.UInt32
-    joined: mi.Spectrum | None = None
+    unweighted: mi.Spectrum | None = None
     sides: tuple | None = None
     size: mi.Float | None = None
 
@@ -188,28 +194,30 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         nonzero += one(c.active)
         lost += c.counted.non_finite
         slot += 1
-    drawn = _Drawn(value, total, end, u, nonzero, lost)
+    drawn = _Drawn(value, total, end, u, candidates, nonzero, lost)
     if kept is not None:
-        joined, light_side, camera_side, size = kept
+        unweighted, light_side, camera_side, size = kept
         sides = kernel.kappa.inner, light_side, camera_side
-        drawn = replace(drawn, joined=joined, sides=sides, size=size)
+        drawn = replace(drawn, unweighted=unweighted, sides=sides, size=size)
     return drawn
 
 
 @dr.syntax
-def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
+def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, stream: Stream) -> _Drawn:
     """As `_draw`, among the vertices of several light subpaths, by a `sketches.guess` of what each adds.
 
-    The BSDFs are evaluated for the one drawn. One of all is drawn evenly with the probability `EVENLY`. The
-    ``total`` is the size of the estimate.
+    The BSDFs are evaluated for the one drawn. One of all is drawn evenly with the probability `EVENLY`, and
+    where guesses say nothing. The ``total`` is the size of the estimate.
     """
     some = candidates > 0
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
     at_z = Sketch.of(kernel, z, newest, some, None)
     count = mi.Float(candidates)
-    evenly = u < EVENLY
-    u = dr.select(evenly, u / EVENLY, (u - EVENLY) / (1 - EVENLY)) * (1 - 2**-24)
-    even = dr.minimum(mi.UInt32(u * count), dr.maximum(candidates, 1) - 1)
+    word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_GUESSES))
+    u_evenly, word = sequential(word)
+    u_even, word = sequential(word)
+    left, _ = sequential(word)
+    even = dr.minimum(mi.UInt32(u_even * count), dr.maximum(candidates, 1) - 1)
     slot, total = mi.UInt32(0), mi.Float(0)
     chosen, of_chosen, of_even = mi.UInt32(0), mi.Float(0), mi.Float(0)
     while dr.hint(
@@ -226,15 +234,16 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) ->
         chosen, of_chosen = dr.select(take, slot, chosen), dr.select(take, size, of_chosen)
         of_even = dr.select(slot == even, size, of_even)
         slot += 1
-    evenly |= ~(total > 0)
+    guessed = (total > 0) & dr.isfinite(total)
+    evenly = (u_evenly < EVENLY) | ~guessed
     drawn = dr.select(some, dr.select(evenly, even, chosen), 0)
     size = dr.select(evenly, of_even, of_chosen)
-    probability = EVENLY / count + dr.select(total > 0, (1 - EVENLY) * size / total, (1 - EVENLY) / count)
+    probability = dr.select(guessed, EVENLY / count + (1 - EVENLY) * size / total, 1 / count)
     y = read_light_vertex(kernel, path, drawn, some)
     c = drop_non_finite(inner(kernel, replace(z, hit=z.hit & some), y))
     value = dr.select(some & c.active, foreseen(kernel, c) / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
-    return _Drawn(value, size_of(value), end, u, one(c.active), c.counted.non_finite)
+    return _Drawn(value, size_of(value), end, left, one(some), one(c.active), c.counted.non_finite)
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:

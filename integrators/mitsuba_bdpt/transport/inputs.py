@@ -15,7 +15,7 @@ from . import mis
 from .observer import Observer
 from .plan import Plan
 
-# Sizes of the lanes' local memory. They do not matter for speed; few of them make few kernels.
+# Sizes of the lanes' local memory. On CPUs they do not matter for speed; few of them make few kernels.
 STORE_SIZES = (64, 256, MAX_STORED)
 
 # In scenes with media, so many vertices of a light subpath are kept at most; see `stored_vertices.Thinning`.
@@ -76,6 +76,7 @@ class Kernel:
         depth = settings.max_depth
         reach = min(depth, prepared.stored_vertices(settings))
         kept = plan.joined * (min(reach - 2, KEPT) if self.space is not None else reach - 2)
+        # More are refused where they are asked for, see `planning.possible.why_not_joined`.
         self.store_size = next(size for size in STORE_SIZES if size >= kept)
         self.strategy_images = settings.strategy_images
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)

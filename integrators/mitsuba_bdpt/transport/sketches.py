@@ -28,6 +28,9 @@ WRONG_SIDE = 0.0002
 # Least cosine that densities over area are divided by.
 _LEAST_COS = 0.01
 
+# Of numbers whose sign tells something.
+_LEAST_SIZE = 1e-30
+
 # Bounds of the squared width of a lobe, and the least density and cosine that it is fitted to.
 _NARROW, _LEAST_PDF, _LEAST_Z = 1e-5, 1e-3, 1e-3
 
@@ -195,11 +198,11 @@ class Sketches:
 
     def write(self, y: Sketch, slot: mi.UInt32, keep: mi.Bool):
         """Keep one."""
-        size, n = y.lobes.diffuse, y.n
+        size, n = dr.maximum(y.lobes.diffuse, _LEAST_SIZE), y.n  # its sign tells something
         self.normal.write(mi.Vector4f(n.x, n.y, n.z, dr.select(y.both, -size, size)), slot, keep)
         others = y.others
         if self.lobe is not None:
-            others = dr.select(y.glossy, -dr.maximum(others, 1e-30), others)
+            others = dr.select(y.glossy, -dr.maximum(others, _LEAST_SIZE), others)
             lobe = mi.Vector4f(y.lobes.peak, y.lobes.peak_pdf, y.lobes.width2, y.peak_others)
             self.lobe.write(lobe, slot, keep)
             self.wi.write(mi.Vector4f(y.wi.x, y.wi.y, y.wi.z, y.lobes.diffuse_pdf), slot, keep)
