@@ -103,7 +103,7 @@ MUTANTS = (
     Mutant(
         "count of light subpaths",
         "transport/kernel.py",
-        "kernel.bound(points, _count_light(batch, sharing), Observer())",
+        "kernel.bound(points, _count_light(kernel, batch, sharing), Observer())",
         "kernel.bound(points, 1 / kernel.plan.camera_paths_per_light_path, Observer())",
         ("tests/images/test_plausible_bugs.py::test_splats_of_few_pixels_count_once[3-1]",),
     ),
@@ -861,7 +861,7 @@ MUTANTS = (
         "d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)",
         "d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)\n"
         "        pdf_w = dr.maximum(dr.dot(si.sh_frame.n, d), 0) * dr.inv_pi",
-        ("tests/emitters/test_guided_emission.py::test_light_leaves_as_without_tables[rectangle]",),
+        ("tests/emitters/test_emission_tables.py::test_light_leaves_as_without_tables[rectangle]",),
     ),
     Mutant(
         "guided emission: s = 1 takes emission for not guided",
@@ -878,7 +878,7 @@ MUTANTS = (
         "density = self.guide.density(index, self.place(index, p, d * sign, active), active)",
         "density = self.guide.density(index, self.place(index, p, d, active), active)",
         (
-            "tests/emitters/test_guided_emission.py::test_next_event_estimation_and_hits_state_the_same[constant]",
+            "tests/emitters/test_emission_tables.py::test_next_event_estimation_and_hits_state_the_same[constant]",
         ),
     ),
     Mutant(
@@ -895,28 +895,28 @@ MUTANTS = (
         "emitters/disks.py",
         "turned = mi.Frame3f(mi.Vector3f(dr.dot(x, d), dr.dot(y, d), dr.dot(z, d)))\n    s, t",
         "return mi.Frame3f(d)\n    s, t",
-        ("tests/emitters/test_guided_emission.py::test_frames_do_not_depend_on_who_asks[n3]",),
+        ("tests/emitters/test_emission_tables.py::test_frames_do_not_depend_on_who_asks[n3]",),
     ),
     Mutant(
         "guided emission: directions of curved lamps are not turned",
         "emitters/area.py",
         "turned = dr.mulsign(turned, dr.dot(si.sh_frame.n, turned))",
         "pass",
-        ("tests/emitters/test_guided_emission.py::test_light_leaves_as_without_tables[sphere]",),
+        ("tests/emitters/test_emission_tables.py::test_light_leaves_as_without_tables[sphere]",),
     ),
     Mutant(
         "guided emission: points on the details' disk have the density of another cell",
         "emitters/disks.py",
         "density = dr.select(aimed, guided.density(p), density)",
         "pass",
-        ("tests/emitters/test_guided_emission.py::test_details_beside_tables[middle-130-False]",),
+        ("tests/emitters/test_emission_tables.py::test_details_beside_tables[middle-130-False]",),
     ),
     Mutant(
         "guided emission: what is learnt of curved lamps leaves out the cosine",
         "emitters/area.py",
         "curved = (1 - PLAIN) / (2 * dr.maximum(cos, _LEAST_COS))",
         "curved = (1 - PLAIN) / (2 * dr.maximum(cos * 0 + 1, _LEAST_COS))",
-        ("tests/emitters/test_guided_emission.py::test_what_tables_change_of_a_density[sphere]",),
+        ("tests/emitters/test_emission_tables.py::test_what_tables_change_of_a_density[sphere]",),
     ),
     Mutant(
         "guided emission: both halves of a pilot teach and judge",

@@ -18,7 +18,8 @@ def cornell(**changes):
 
 
 def bdpt(**parameters):
-    return mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
+    # Each render asks one pilot: none about tables of emission.
+    return mi.load_dict({"type": "bdpt", "max_depth": 6, "emission_guiding": "never", **parameters})
 
 
 def bumpy(offset=0.0):
