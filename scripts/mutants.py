@@ -951,7 +951,7 @@ MUTANTS = (
         "transport/connections.py",
         "return _Drawn(value, size_of(value), end, left, one(some)",
         "return _Drawn(value, size_of(value), end, u_even, one(some)",
-        ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed[1.0-0.1]",),
+        ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed[1.0-5.0]",),
     ),
     Mutant(
         "joined light subpaths: estimates are not over their number",

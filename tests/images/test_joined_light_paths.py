@@ -163,17 +163,16 @@ def test_films_whose_pixels_do_not_divide(size):
 
 # Light tracing has little weight; inner connections have most of it.
 FEW = {"t<=1": 1e-3, "s=1": 1.0}
-INNER = {"t<=1": 1e-3, "s=1": 1e-2}
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.1])
+@pytest.mark.parametrize("threshold", [0.0, 5.0])
 @pytest.mark.parametrize("zeros", [0.5, 1.0])
 def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold):
     """Rationale: a guess may be off by any factor, and 0 where something is added; roulette then needs a
     number that the draw has not used. Expected: the same tiles with guesses that are 0 for half of the light
     vertices, or all, where inner connections have most of the weight and many are drawn evenly.
     """
-    scene = scene_of("diffuse", "point")
+    scene = cornell(16)
     true = sketches.guess
 
     def wild(kernel, z, y):
@@ -183,9 +182,9 @@ def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold)
     monkeypatch.setattr(connections, "guess", wild)
     monkeypatch.setattr(connections, "EVENLY", 0.5)
     roulette = {"mean": threshold, "variance": 1.0} if threshold else {}
-    a = images(scene, spp=512, seeds=16, decisions=decided(coefficients=INNER, **roulette))
+    a = images(scene, spp=512, seeds=16, decisions=decided(coefficients=FEW, **roulette))
     monkeypatch.undo()
-    b = images(scene, spp=512, seeds=16, first=100, decisions=decided(1, 1.0, coefficients=INNER))
+    b = images(scene, spp=512, seeds=16, first=100, decisions=decided(1, 1.0, coefficients=FEW))
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
 
 
@@ -195,17 +194,16 @@ def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold)
 def test_guesses_are_about_right(material, factor, monkeypatch):
     """Rationale: an estimate is as noisy as its guess is wrong. Expected: in a Cornell box with boxes of a
     material, with the same light subpaths, the error is that of a draw by what connections add, among diffuse
-    surfaces within a tenth, among glossy ones within a quarter. (64 renders: their mean error is known to
-    3 %.)
+    surfaces within a tenth, among glossy ones within a quarter. (32 renders of the same seeds.)
     """
     boxes = mi.cornell_box()
     boxes = {name: boxes[name] | {"bsdf": MATERIALS[material]()} for name in ("small-box", "large-box")}
     scene = cornell(16, **boxes)
-    reference = images(scene, spp=4096, seeds=8, first=500, skip="none").mean(axis=0)
+    reference = images(scene, spp=1024, seeds=8, first=500, skip="none").mean(axis=0)
     norm = reference**2 + 0.01 * reference.mean() ** 2
-    guessed = images(scene, spp=32, seeds=64, decisions=decided(coefficients=FEW))
+    guessed = images(scene, spp=32, seeds=32, decisions=decided(coefficients=FEW))
     monkeypatch.setattr(connections, "_draw_by_guess", lambda *given: connections._draw(*given[:-1]))
-    evaluated = images(scene, spp=32, seeds=64, decisions=decided(coefficients=FEW))
+    evaluated = images(scene, spp=32, seeds=32, decisions=decided(coefficients=FEW))
     errors = [np.mean((x - reference) ** 2 / norm) for x in (guessed, evaluated)]
     assert errors[0] < factor * errors[1], errors
 
