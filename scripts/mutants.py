@@ -928,8 +928,8 @@ MUTANTS = (
     Mutant(
         "guided emission: what camera subpaths find is aimed at",
         "planning/emission.py",
-        "density = density * np.sqrt((squares * share / total**2).sum(axis=-1))",
-        "density = density * np.sqrt((squares / total**2).sum(axis=-1))",
+        "density = density * np.sqrt((squares * _SHARES / _totals(density) ** 2).sum(axis=-1))",
+        "density = density * np.sqrt((squares / _totals(density) ** 2).sum(axis=-1))",
         ("tests/images/test_guided_emission.py::test_the_best_table_of_unequal_shares",),
     ),
     Mutant(

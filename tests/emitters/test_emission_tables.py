@@ -29,6 +29,15 @@ def random_tables(emitters, seed=1):
     return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), 0.5)
 
 
+def without_sky(tables, emitters):
+    """``tables`` with uniform ones for the sky, the emitter that has more than one."""
+    densities = tables.densities()
+    sky = next(i for i, count in enumerate(emitters.tables) if count > 1)
+    first = sum(emitters.tables[:sky])
+    densities[first : first + emitters.tables[sky]] = 1
+    return EmissionTables.of(densities, 0.5)
+
+
 def emissions(emitters, name="", seed=11):
     """`COUNT` emissions, of all emitters."""
     u = [mi.Float(v) for v in np.random.default_rng(seed).random((4, COUNT), dtype=np.float32)]
@@ -141,15 +150,7 @@ def test_details_beside_tables(size, more, only_sun):
     assert emitters.disks.details is not None
     tables = random_tables(emitters)
     if only_sun:
-        densities = tables.densities()
-        sky = (
-            [type(e).__name__ for e in emitters.scene.emitters()].index("ConstantBackgroundEmitter")
-            if False
-            else next(i for i, count in enumerate(emitters.tables) if count > 1)
-        )
-        first = sum(emitters.tables[:sky])
-        densities[first : first + emitters.tables[sky]] = 1
-        tables = EmissionTables.of(densities, 0.5)
+        tables = without_sky(tables, emitters)
     guided = emitters.placed(tables)
     e = emissions(guided)
     stated = column(e.pdf_second)
@@ -292,12 +293,7 @@ def test_only_what_gains_is_looked_up():
     """
     scene = scene_of("constant", more=parts.EMITTERS["rectangle"]())
     emitters = Emitters(scene)
-    tables = random_tables(emitters)
-    densities = tables.densities()
-    sky = next(i for i, e in enumerate(scene.emitters()) if e.get_shape() is None)
-    first = sum(emitters.tables[:sky])
-    densities[first : first + emitters.tables[sky]] = 1
-    guided = emitters.placed(EmissionTables.of(densities, 0.5))
+    guided = emitters.placed(without_sky(random_tables(emitters), emitters))
     groups = {type(group).__name__: group.guide for group in guided.groups}
     assert groups["InfiniteEmitters"] is None and groups["AreaEmitters"] is not None
 

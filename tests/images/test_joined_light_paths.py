@@ -13,6 +13,7 @@ from mitsuba_bdpt.planning import choice, planner
 from mitsuba_bdpt.planning.configuration import Configuration
 from mitsuba_bdpt.transport import connections, sketches
 from snapshots import ROUNDING, stopped
+from test_merging import images as rendered_images
 
 import drjit as dr  # isort: skip
 
@@ -26,11 +27,9 @@ def decided(joined=4, light_paths=1 / 16, **more):
     return json.dumps([way | rest | more])
 
 
-def images(scene, spp=256, seeds=10, first=0, **parameters):
-    """(seeds, height, width) of the first colour."""
-    method = mi.load_dict({"type": "bdpt", "max_depth": 5, "rr_depth": 100, **parameters})
-    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
-    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
+def images(scene, spp=256, seeds=10, **parameters):
+    """(seeds, height, width) of the first colour, of paths of up to five edges."""
+    return rendered_images(scene, spp, seeds, **{"max_depth": 5} | parameters)
 
 
 def bumps():
@@ -90,7 +89,7 @@ def test_images_are_those_of_all_connections(material):
     scene = scene_of(material)
     a = images(scene, decisions=decided())
     b = images(scene, first=100, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+    st.assert_same_tiles(a, b)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +114,7 @@ def test_parameters(parameters):
     a = images(scene, **{"decisions": decided(), **parameters})
     keep = {k: v for k, v in parameters.items() if k in ("max_depth", "hide_emitters")}
     b = images(scene, first=100, skip="none", **keep)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+    st.assert_same_tiles(a, b)
 
 
 @pytest.mark.parametrize("lamp", ["point", "constant", "directional", "projector", "directionalarea"])
@@ -124,7 +123,7 @@ def test_lamps(lamp):
     scene = scene_of("roughconductor", lamp)
     a = images(scene, decisions=decided())
     b = images(scene, first=100, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=8)
+    st.assert_same_tiles(a, b, at_least=8)
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
@@ -134,7 +133,7 @@ def test_variants(variant):
     scene = scene_of("roughplastic")
     a = images(scene, decisions=decided())
     b = images(scene, first=100, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+    st.assert_same_tiles(a, b)
 
 
 def test_a_wide_lens():
@@ -142,7 +141,7 @@ def test_a_wide_lens():
     scene = scene_of("roughplastic", "sphere", parts.thinlens(aperture=0.6))
     a = images(scene, decisions=decided())
     b = images(scene, first=100, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+    st.assert_same_tiles(a, b)
 
 
 @pytest.mark.parametrize("size", [(17, 13), (9, 8)])
@@ -185,7 +184,7 @@ def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold)
     a = images(scene, spp=512, seeds=16, decisions=decided(coefficients=FEW, **roulette))
     monkeypatch.undo()
     b = images(scene, spp=512, seeds=16, first=100, decisions=decided(1, 1.0, coefficients=FEW))
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=10)
+    st.assert_same_tiles(a, b)
 
 
 @pytest.mark.parametrize(

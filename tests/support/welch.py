@@ -120,6 +120,11 @@ def tiles(images, size=4):
     return cut.mean((2, 4)).reshape(n, -1)
 
 
+def assert_same_tiles(a, b, at_least=10):
+    """`assert_agree` of the `tiles` of two sets of images, (seeds, height, width)."""
+    assert_agree(compare_images(tiles(a), tiles(b)), at_least=at_least)
+
+
 def agree(a, b, relative, rounding):
     """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
     their means. Faint columns that are zero in a tenth of the renders are left to the mean: a few

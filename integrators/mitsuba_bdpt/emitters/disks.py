@@ -97,7 +97,7 @@ class Disks:
     def share(self, side: int) -> float:
         """The share of subpaths that are aimed at details beside tables of ``side`` x ``side`` cells.
 
-        None if the details are not smaller than a cell, which the tables can aim at.
+        0 if the details are not smaller than a cell, so that the tables can aim at them.
         """
         if self.details is None:
             return 0.0

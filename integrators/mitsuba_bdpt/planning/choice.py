@@ -93,14 +93,12 @@ class Prediction:
         """To a certain error, in a unit of its own."""
         return self.cost * self.variance
 
-    def with_emission(self, tables: EmissionTables, predicted: bool) -> Prediction:
-        """The same with light subpaths that ``tables`` guide, if there are some.
-
-        ``predicted``: whether it was without.
-        """
+    def with_emission(self, tables: EmissionTables, without_tables: bool) -> Prediction:
+        """The same with light subpaths that ``tables`` guide, if there are some."""
         if not self.candidate.light_paths:
             return self
-        return replace(self, candidate=replace(self.candidate, emission=tables), without_tables=predicted)
+        candidate = replace(self.candidate, emission=tables)
+        return replace(self, candidate=candidate, without_tables=without_tables)
 
     def decided(self, first_pass: int, mean: float) -> Decision:
         """The decision for the candidate from the pass ``first_pass`` on; ``mean`` of the image."""

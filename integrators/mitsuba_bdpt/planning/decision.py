@@ -21,8 +21,10 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 LARGEST = 1e30
 
 # Entries of a record, see `Decision.record`.
-WAY = ("light_paths", "connections", "guided", "emission", "joined", "coefficients")
-ENTRIES = ("pass", *WAY, "cost", "variance", "mean")
+ENTRIES = (
+    *("pass", "light_paths", "connections", "guided", "emission", "joined", "coefficients"),
+    *("cost", "variance", "mean"),
+)
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from ..emitters.emission_tables import Cell, EmissionTables
 from ..sensors.records import Region
 from ..transport.contribution import Contribution
 from .configuration import Configuration
-from .moments import HEARD_TILES
+from .moments import HEARD_TILES, tile_of
 
 # Halves of a pilot, and classes of l / (1 - l), each four times the one before.
 HALVES, CLASSES = 2, 8
@@ -41,8 +41,9 @@ HALVES, CLASSES = 2, 8
 BEFORE = 2
 COLUMNS = CLASSES + BEFORE
 
-# What l / (1 - l) is in the classes, about.
+# What l / (1 - l), and l, are in the classes, about.
 ODDS = 4.0 ** (np.arange(CLASSES) - (CLASSES - 1) / 2)
+_SHARES = ODDS / (1 + ODDS)
 
 # Densities are this or more: 1 / 0.25 is the most by which a contribution can rise.
 LEAST = (0.5, 0.25)
@@ -87,9 +88,7 @@ class Listener:
         scaled = share * cell.factor.scaled
         odds = dr.log2(scaled / rest) / 2 + CLASSES / 2
         kind = mi.UInt32(dr.clip(odds, 0, CLASSES - 1))
-        uv = dr.clip(self._region.to_uv(position), 0, 1)
-        xy = dr.minimum(mi.Point2u(uv * HEARD_TILES), HEARD_TILES - 1)
-        part = half * HEARD_TILES**2 + xy.y * HEARD_TILES + xy.x
+        part = half * HEARD_TILES**2 + tile_of(self._region, position, HEARD_TILES)
         place = (part * self.cells + cell.number) * COLUMNS
         even, of_table = square / (rest + scaled), square * (scaled / (rest + scaled))
         for column, value in ((kind, even), (CLASSES, of_table), (CLASSES + 1, square)):
@@ -171,11 +170,9 @@ def left_by(tables: EmissionTables, heard: np.ndarray) -> float:
 def _fitted(heard: np.ndarray) -> np.ndarray:
     """The best densities for what was ``heard``, shape (tables, side, side, `COLUMNS`)."""
     squares = _blurred(heard[..., :CLASSES])
-    share = ODDS / (1 + ODDS)
     density = np.ones(squares.shape[:-1])
     for _ in range(_STEPS):
-        total = 1 - share + density[..., None] * share
-        density = density * np.sqrt((squares * share / total**2).sum(axis=-1))
+        density = density * np.sqrt((squares * _SHARES / _totals(density) ** 2).sum(axis=-1))
         mean = density.mean(axis=(1, 2), keepdims=True)
         density = np.where(mean > 0, density / np.where(mean > 0, mean, 1), 1)
     return density
@@ -192,10 +189,14 @@ def _blurred(squares: np.ndarray) -> np.ndarray:
     return squares
 
 
+def _totals(density: np.ndarray) -> np.ndarray:
+    """1 - l + l r of each cell and class."""
+    return 1 - _SHARES + density[..., None] * _SHARES
+
+
 def _light_side(heard: np.ndarray, density: np.ndarray) -> np.ndarray:
     """Second moments of light-side strategies with these densities."""
-    share = ODDS / (1 + ODDS)
-    return (heard[..., :CLASSES] * share / (1 - share + density[..., None] * share)).sum(axis=-1)
+    return (heard[..., :CLASSES] * _SHARES / _totals(density)).sum(axis=-1)
 
 
 def _left(heard: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndarray:
@@ -203,8 +204,7 @@ def _left(heard: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndar
 
     By l and whole; of all cells and without `WORST` of those that have any.
     """
-    share = ODDS / (1 + ODDS)
-    whole = (heard[..., :CLASSES] / (1 - share + density[..., None] * share)).sum(axis=-1)
+    whole = (heard[..., :CLASSES] / _totals(density)).sum(axis=-1)
     before = [heard[..., CLASSES + i] for i in range(BEFORE)]
     after = [
         np.where(guided[:, None, None], changed, same)

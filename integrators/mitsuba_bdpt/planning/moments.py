@@ -161,11 +161,11 @@ class Splats:
     lanes: int
 
 
-def tile_of(region: Region, position: mi.Point2f) -> mi.UInt32:
-    """The number of the fine tile at a ``position`` on the film."""
+def tile_of(region: Region, position: mi.Point2f, tiles: int = FINE) -> mi.UInt32:
+    """The number of the tile at a ``position`` on the film, of so many in each direction."""
     uv = dr.clip(region.to_uv(position), 0, 1)
-    xy = dr.minimum(mi.Point2u(uv * FINE), FINE - 1)
-    return mi.UInt32(xy.y * FINE + xy.x)
+    xy = dr.minimum(mi.Point2u(uv * tiles), tiles - 1)
+    return mi.UInt32(xy.y * tiles + xy.x)
 
 
 def group(lane: Lanes) -> Lanes:
@@ -251,8 +251,7 @@ def _of_tiles(heard: np.ndarray | None, samples: Samples, splats: np.ndarray) ->
         return np.zeros((2, 0, 0))
 
     def over_tiles(values: np.ndarray) -> np.ndarray:
-        many = FINE // HEARD_TILES
-        return values.reshape(HEARD_TILES, many, HEARD_TILES, many).sum(axis=(1, 3)).ravel()
+        return _sums_of_blocks(values, HEARD_TILES).ravel()
 
     last = samples.estimate[:, -1]
     counts = over_tiles(np.bincount(samples.tile, minlength=FINE**2).astype(float))
@@ -313,8 +312,13 @@ def _norms(samples: Samples, half: np.ndarray, splats: np.ndarray) -> np.ndarray
 def _over_blocks(values: np.ndarray) -> np.ndarray:
     """Sums over the larger tiles, in place of each fine one."""
     many = FINE // TILES
-    blocks = values.reshape(TILES, many, TILES, many).sum(axis=(1, 3))
-    return np.kron(blocks, np.ones((many, many)))
+    return np.kron(_sums_of_blocks(values, TILES), np.ones((many, many)))
+
+
+def _sums_of_blocks(values: np.ndarray, tiles: int) -> np.ndarray:
+    """Sums over larger tiles, so many in each direction, of ``values`` of the fine ones."""
+    many = FINE // tiles
+    return values.reshape(tiles, many, tiles, many).sum(axis=(1, 3))
 
 
 def _with_neighbours(values: np.ndarray) -> np.ndarray:

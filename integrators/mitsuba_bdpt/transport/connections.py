@@ -211,7 +211,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     """
     some = candidates > 0
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-    at_z = Sketch.of(kernel, z, newest, some, None)
+    at_z = Sketch.of(kernel, z, newest, some, alone=False)
     count = mi.Float(candidates)
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_GUESSES))
     u_evenly, word = sequential(word)

@@ -75,15 +75,15 @@ class Sketch:
     peak_others: mi.Float
 
     @staticmethod
-    def of(kernel, vertex, coefficient, active: mi.Bool, scale: mi.Spectrum | None) -> Sketch:
+    def of(kernel, vertex, coefficient, active: mi.Bool, alone: bool) -> Sketch:
         """That of a ``vertex``; ``coefficient`` of the class to which its newest alternative belongs.
 
-        ``scale``: its throughput; None where all guesses have it in common, and its diffuse brightness too.
+        ``alone``: whether guesses do not all have its brightness in common.
         """
         si, partial = vertex.si, vertex.partial
         wi, n = si.to_world(si.wi), mi.Vector3f(si.n)
         glossy = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Glossy)
-        lobes = _lobes(kernel, vertex, glossy, active, scale)
+        lobes = _lobes(kernel, vertex, glossy, active, alone)
         density = partial.d_vc * vertex.cos
         return Sketch(
             p=mi.Point3f(si.p),
@@ -143,14 +143,16 @@ def _shape(cos2: mi.Float, width2: mi.Float) -> mi.Float:
     return dr.square(width2 / (cos2 * (width2 - 1) + 1))
 
 
-def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, scale: mi.Spectrum | None) -> Lobes:
+def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lobes:
     """From an evaluation towards the normal, and of glossy BSDFs one in the mirror direction."""
     wi = vertex.si.wi
     up = mi.Vector3f(0, 0, dr.sign(wi.z))
-    throughput = vertex.throughput if scale is None else scale
+    throughput = vertex.throughput
     lobes = Lobes.plain()
-    if scale is not None:
-        lobes.diffuse = bsdf.brightest(scale * scattering.evaluate(kernel, vertex, up, active).value) * dr.pi
+    if alone:
+        lobes.diffuse = (
+            bsdf.brightest(throughput * scattering.evaluate(kernel, vertex, up, active).value) * dr.pi
+        )
     if not kernel.traits.glossy:
         return lobes
 

@@ -148,7 +148,7 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
         path.medium.write(y.medium, slot, keep)
     if path.sketches is not None:
         newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
-        path.sketches.write(Sketch.of(kernel, vertex, newest, keep, vertex.throughput), slot, keep)
+        path.sketches.write(Sketch.of(kernel, vertex, newest, keep, alone=True), slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
