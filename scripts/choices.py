@@ -6,8 +6,8 @@
 
 For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
 inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
-``decisions``); those which one render of a seed of its own shows to be among the best, or which are chosen,
-with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, which neighbours on
+``decisions``, with the tables of emission and the guided samples of s = 0 that the default has); those which
+one render of a seed of its own shows to be among the best, or which are chosen, with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, which neighbours on
 the machine disturb less than seconds; the default's without the pilot, which later renders of a scene
 remember (docs/method/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
 The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
@@ -99,13 +99,13 @@ def by_hand(scene, depth: int, way: Configuration, mean: float):
 
 
 def piloted(scene, settings) -> Counter:
-    """How often pilots of `PILOT_SEEDS` seeds choose which candidate; nothing where no pilot is asked."""
+    """How often pilots of `PILOT_SEEDS` seeds choose which candidate; nothing where none is asked."""
     tables = []
     for seed in range(PILOT_SEEDS):
         render = rendering.Render(scene, scene.sensors()[0], settings, 0, SPP)
         render.planner.pilot_seed = seed
         tables.append(render.decide())
-    return Counter(table[0].candidate for table in tables if table)
+    return Counter(named(table[0].candidate) for table in tables if table)
 
 
 def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
@@ -119,7 +119,7 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
     mean = pilot.measure(render.prepared, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
     ways = candidates(render.prepared, render.plan, settings)
     ways += [replace(way, connections="all") for way in ways if way.connections == "one"]
-    ways = {named(way): way for way in ways}
+    ways = {named(way): way for way in map(as_taught(settings, scene), ways)}
     if known:
         old = {name: product(rows) for name, rows in known.items()}
         names = chosen | {min(old, key=lambda name: old[name][i]) for i in (0, 1)}
@@ -133,6 +133,26 @@ def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
     return made
 
 
+def as_taught(settings, scene):
+    """A function that gives a candidate what the default has learnt beside the choice among candidates."""
+    render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
+    table = render.decide()
+    if not table:
+        return lambda way: way
+    best = table[0].candidate
+
+    def taught(way: Configuration) -> Configuration:
+        alike = way.light_paths and (way.light_paths, way.connections) == (best.light_paths, best.connections)
+        return replace(
+            way,
+            emission=best.emission if way.light_paths else None,
+            guided=best.guided,
+            joined=best.joined if alike else 1,
+        )
+
+    return taught
+
+
 def as_fast(known: dict, found: dict) -> dict:
     """``known`` rows with the times that they would have at the machine's present speed.
 
@@ -144,10 +164,11 @@ def as_fast(known: dict, found: dict) -> dict:
 
 
 def named(way: Configuration) -> str:
-    """In words: light subpaths per camera subpath, connections, coefficients of t <= 1 and s = 1."""
+    """In words: light subpaths per camera subpath, connections (with how many), kappa of t <= 1 or s = 1."""
     if not way.light_paths:
         return f"0, {way.kappa_direct:g}"
-    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}"
+    joined = f" of {way.joined}" if way.joined > 1 else ""
+    return f"1/{way.camera_paths_per_light_path} {way.connections}{joined} {way.kappa_light:g}"
 
 
 def measure(name: str, known: dict) -> dict:
@@ -158,7 +179,7 @@ def measure(name: str, known: dict) -> dict:
     scene, depth, expected = loaded(name)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
-    chosen = {named(way): n for way, n in piloted(scene, integrator.settings).most_common()}
+    chosen = dict(piloted(scene, integrator.settings).most_common())
     ways = fixed(scene, depth, expected, set(chosen), known)
     rows, kinds, found = [], [], {way: [] for way in ways}
     for seed in range(SEEDS):

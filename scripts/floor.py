@@ -23,10 +23,11 @@ def main(arguments=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
     parser.add_argument("--rounds", type=number(int, 1), default=5)
+    parser.add_argument("--path", action="store_true", help="of Mitsuba's path, over the same floor")
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     for name in options.scene:
-        ratios = floor.measure(PROJECT.scene(name), options.rounds)
+        ratios = floor.measure(PROJECT.scene(name), options.rounds, of_path=options.path)
         middle = statistics.median(ratios)
         print(f"{name}: {middle:.2f}x the floor ({min(ratios):.2f}-{max(ratios):.2f})", flush=True)
     return 0

@@ -490,3 +490,22 @@ def test_normal_mapped_glass_from_both_sides():
         start = first + 6 * strategy + 3  # unweighted
         sides[side].append(tile_means(image[..., start : start + 3], 4)[:, 0])
     assert_agree(compare_images(sides["camera"], sides["light"], "glass"), at_least=10)
+
+
+def test_path_tracing_alone_asks_nothing_about_the_other_side(monkeypatch):
+    """Rationale: no strategy then starts from a light, so that no weight needs the densities of reverse
+    directions. Expected: nobody asks for them, and the image is the same as if somebody had; with light
+    subpaths somebody does.
+    """
+    scene = mi.load_dict(mi.cornell_box())
+    alone, both = (mi.load_dict({"type": "bdpt", "max_depth": 4, "light_paths": n}) for n in (0, 1))
+    with monkeypatch.context() as patched:
+        patched.setattr(bsdf.Traits, "from_one_side", lambda traits: traits)
+        expected = np.array(alone.render(scene, spp=4))
+
+    asked, with_wi = [], bsdf.with_wi
+    monkeypatch.setattr(bsdf, "with_wi", lambda si, wi: asked.append(wi) or with_wi(si, wi))
+    # Up to the order of sums.
+    assert np.allclose(np.array(alone.render(scene, spp=4)), expected, rtol=1e-5, atol=0) and not asked
+    both.render(scene, spp=4)
+    assert asked

@@ -563,6 +563,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         plan=plan,
         heuristic=mis.Heuristic(name),
         traits=bsdf.Traits(full_pdf=False, round_trip=False, asked=Directly()),
+        reverse=True,
         strategy_images=False,
         store_size=64,
         surfaces=True,

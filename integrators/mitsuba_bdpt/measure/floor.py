@@ -72,6 +72,7 @@ class Pass:
         self._render = rendering.Render(self._scene, self._scene.sensors()[0], integrator.settings, 1, 64)
         self._render.decide()
         self._batch = schedule.batches(self._render.prepared.camera, 0, SPP, integrator.settings)[0]
+        self._path = mi.load_dict({"type": "path", "max_depth": file.max_depth})
 
     def trace(self):
         """Trace the pass as one kernel."""
@@ -80,6 +81,10 @@ class Pass:
         drawn = points.Points(render.settings.points, seed)
         counts = trace(render.kernel, sink.Image(render.accumulator), self._batch, drawn, SPP)
         render.accumulator.evaluate(counts)
+
+    def trace_path(self):
+        """Render as many samples with Mitsuba's `path`."""
+        dr.eval(mi.render(self._scene, integrator=self._path, spp=SPP))
 
     def rays(self) -> list:
         """All calls that trace rays, with their rays."""
@@ -100,17 +105,22 @@ class Pass:
             dr.eval(si.p.x + si.p.y + si.p.z + si.n.x + si.sh_frame.n.x + si.uv.x + si.wi.x + si.t)
 
 
-def measure(file: SceneFile, rounds: int, parameters=None) -> list[float]:
-    """Kernel time over the floor, a value per round."""
+def measure(file: SceneFile, rounds: int, parameters=None, of_path: bool = False) -> list[float]:
+    """Kernel time over the floor, a value per round.
+
+    ``of_path``: that of Mitsuba's `path`, over the same floor. (Where the pass is path tracing alone, its rays
+    are about the same.)
+    """
     # Kernels cannot be recorded as a whole any more where loops were run step by step.
     calls = Pass(file, parameters or {}).rays()
     gc.collect()
     subject = Pass(file, parameters or {})
-    subject.trace()
+    trace = subject.trace_path if of_path else subject.trace
+    trace()
     subject.replay(calls)
     ratios = []
     for _ in range(rounds):
-        whole = kernel_seconds(subject.trace)
+        whole = kernel_seconds(trace)
         floor = kernel_seconds(lambda: subject.replay(calls))
         ratios.append(whole / floor)
     return ratios

@@ -10,7 +10,7 @@ where Mitsuba's importance mode with Veach's correction (thesis, eq. 5.19) is no
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import drjit as dr
@@ -31,7 +31,8 @@ _SAMPLED_PDF_IS_PDF = frozenset(
 class Evaluation:
     """``value`` f |cos| (light subpaths: adjoint factor included), densities in solid angle.
 
-    ``pdf_fwd_w`` of leaving into the new direction, ``pdf_rev_w`` of the reverse.
+    ``pdf_fwd_w`` of leaving into the new direction, ``pdf_rev_w`` of the reverse (0 where `Traits.reverse`
+    does not hold).
     """
 
     value: mi.Spectrum
@@ -41,7 +42,7 @@ class Evaluation:
 
 @dataclass
 class Step:
-    """A sampled direction. Densities in solid angle; ``pdf_*`` are unset where ``delta``."""
+    """A sampled direction. Densities as in `Evaluation`; ``pdf_*`` are unset where ``delta``."""
 
     wo: mi.Vector3f
     weight: mi.Spectrum
@@ -58,7 +59,8 @@ class Traits:
     """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`.
 
     ``glossy``: whether one has a glossy lobe; ``transmits``: whether one has a lobe, not delta, that scatters
-    to the other side.
+    to the other side; ``reverse``: whether some strategy in use starts from the other side, so that weights
+    ask for the densities of the reverse directions.
     """
 
     full_pdf: bool
@@ -66,6 +68,11 @@ class Traits:
     asked: Asked
     glossy: bool = False
     transmits: bool = False
+    reverse: bool = True
+
+    def from_one_side(self) -> Traits:
+        """Of the same BSDFs where no subpath starts from the other side."""
+        return replace(self, round_trip=False, reverse=False)
 
     def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """What the surface ``si`` lets pass straight on."""
@@ -164,18 +171,18 @@ def evaluate(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, traits: Traits
 ) -> Evaluation:
     """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
-    return _evaluation(*_evaluated(bsdf, si, wo, active, traits.asked))
+    return _evaluation(*_evaluated(bsdf, si, wo, active, traits))
 
 
-def _evaluated(bsdf, si, wo, active, asked: Asked):
+def _evaluated(bsdf, si, wo, active, traits: Traits):
     """Value, and densities of ``wo`` and of the reverse, the other direction being ``si.wi``."""
 
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
         value, pdf = self.eval_pdf(ctx, si, wo, active)
-        return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active)
+        return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
 
-    return asked(bsdf, ask, si, wo, active)
+    return traits.asked(bsdf, ask, si, wo, active)
 
 
 def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
@@ -196,12 +203,12 @@ def evaluate_adjoint(bsdf, si, wo, active, traits: Traits, cos_ratio=None) -> Ev
     """
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
-    return _adjoint(cos_ratio, *_evaluated_adjoint(bsdf, si, wo, active, traits.asked))
+    return _adjoint(cos_ratio, *_evaluated_adjoint(bsdf, si, wo, active, traits))
 
 
-def _evaluated_adjoint(bsdf, si, wo, active, asked: Asked):
+def _evaluated_adjoint(bsdf, si, wo, active, traits: Traits):
     """As `_evaluated`, with the directions swapped."""
-    value, pdf_rev_w, pdf_fwd_w = _evaluated(bsdf, with_wi(si, wo), si.wi, active, asked)
+    value, pdf_rev_w, pdf_fwd_w = _evaluated(bsdf, with_wi(si, wo), si.wi, active, traits)
     return value, pdf_fwd_w, pdf_rev_w
 
 
@@ -224,7 +231,7 @@ def sample(
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
-        return drawn, _evaluated(bsdf, si, *joined, traits.asked) if target else None
+        return drawn, _evaluated(bsdf, si, *joined, traits) if target else None
 
     drawn, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
     step = _step(si, drawn, drawn.weight)
@@ -244,7 +251,7 @@ def sample_adjoint(
     def questions(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
         weight = _adjoint_weight(bsdf, si, drawn, sampled, traits)
-        return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits.asked) if target else None
+        return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits) if target else None
 
     drawn, weight, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
     cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
@@ -266,7 +273,7 @@ def _answers(questions, asked: Asked, target, bsdf, *args):
 def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
     """Weight of a sample of a light subpath without the ratio of geometric cosines."""
     bs, delta = drawn.bs, mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
-    f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits.asked))
+    f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits))
     # The radiance that a camera subpath carries, without its factor eta^-2.
     eta2 = dr.square(bs.eta)
     delta_weight = drawn.back / eta2 if traits.round_trip else drawn.weight * eta2
@@ -303,7 +310,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
         if traits.full_pdf:
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
-        pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
+        pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
         back = _back(self, si, bs, u1, u2, active & delta) if traits.round_trip else mi.Spectrum(0)
         return bs, weight, pdf_fwd_w, pdf_rev_w, back
 

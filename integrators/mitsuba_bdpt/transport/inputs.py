@@ -69,7 +69,10 @@ class Kernel:
         self.plan, self.heuristic = plan, heuristic
         self.shape_errors = prepared.emitters.shape_errors
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
-        self.traits, self.space = prepared.traits, prepared.space
+        # Whether some path can be made from the light's side too, so that weights know how likely that is.
+        self.reverse = plan.light or plan.merging or plan.guided > 0
+        self.traits = prepared.traits if self.reverse else prepared.traits.from_one_side()
+        self.space = prepared.space
         self.light_media = prepared.light_media
         self.sensor_medium = None if self.space is None else u32(self.space.media.sensor)
         self.scatters = self.surfaces or (self.space is not None and self.space.media.scatters)

@@ -23,9 +23,11 @@ from .walk import may_merge, newest_coefficient, random_walk
 # Photons that memory is taken for at first, over the number of subpaths: few subpaths have more.
 _CAPACITY = 0.5
 
-# Photons' subpaths of a pass, or of a render's guide: one for so many of its samples, within these limits.
-# More make merges no less noisy in most scenes: the noise is that of the camera's subpaths.
-SAMPLES_PER_PHOTON, FEWEST_PHOTONS, MOST_PHOTONS = 4, 1 << 12, 1 << 18
+# Photons' subpaths of a render's guide, and of a pass with merging: one for so many of its samples, within
+# these limits. Twice as many make merges hardly less noisy (the noise is that of the camera's subpaths), and
+# in `pool_floor` take half as much time again.
+SAMPLES_PER_PHOTON, SAMPLES_PER_MERGED = 4, 8
+FEWEST_PHOTONS, MOST_PHOTONS = 1 << 12, 1 << 18
 
 # So many of a pass at most for each disc of its radius that the film has room for: merges of more are slow.
 _PER_DISC = 64
@@ -34,14 +36,15 @@ _PER_DISC = 64
 _EDGES_BITS, _LANE_BITS = 12, 32
 
 
-def photons_of(samples: int) -> int:
-    """Photons' subpaths of a pass, or a render, of so many ``samples``."""
-    return min(max(samples // SAMPLES_PER_PHOTON, FEWEST_PHOTONS), MOST_PHOTONS)
+def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
+    """Photons' subpaths of so many ``samples``, one for ``each`` so many."""
+    return min(max(samples // each, FEWEST_PHOTONS), MOST_PHOTONS)
 
 
 def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
     """The same of a pass with merging on so many ``pixels``, in discs of this ``radius`` (pixels)."""
-    return min(photons_of(samples), max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64))
+    most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
+    return min(photons_of(samples, SAMPLES_PER_MERGED), most)
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:

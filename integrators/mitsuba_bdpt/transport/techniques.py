@@ -77,7 +77,8 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
         else:
             camera_side = h.combine(camera_side, other)
     weight, shares = h.weigh(kernel.kappa.hit, light_side, camera_side)
-    value = _known(z.throughput * radiance, pdf_connect, pdf_first, pdf_second)
+    others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
+    value = _known(z.throughput * radiance, *others)
     emission = emitters.hit_cell(z.si, z.previous, active) if kernel.tells_emission else None
     return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
 
@@ -107,7 +108,9 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
-    value = _known(z.throughput * f.value * e.weight, e.emission_ratio)
+    value = z.throughput * f.value * e.weight
+    if kernel.reverse:
+        value = _known(value, e.emission_ratio)
     active = active & ~bsdf.is_zero(value)
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
