@@ -7,9 +7,10 @@
 For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
 inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
 ``decisions``, with the tables of emission and the guided samples of s = 0 that the default has); those which
-one render of a seed of its own shows to be among the best, or which are chosen, with 8 seeds, as the default is, 64 samples per pixel. A time is that of the processor, which neighbours on
-the machine disturb less than seconds; the default's without the pilot, which later renders of a scene
-remember (docs/method/skipping.md has what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
+one render of a seed of its own shows to be among the best, or which are chosen, with 8 seeds, as the default
+is, 64 samples per pixel. A time is that of the processor, which neighbours on the machine disturb less than
+seconds; the default's without the pilot, which later renders of a scene remember (docs/method/skipping.md has
+what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
 The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
 fixed choices, with the interval that nine in ten resamplings of the seeds (the same for both sides) lie in,
 and the same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its

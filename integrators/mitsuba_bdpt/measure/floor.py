@@ -108,8 +108,8 @@ class Pass:
 def measure(file: SceneFile, rounds: int, parameters=None, of_path: bool = False) -> list[float]:
     """Kernel time over the floor, a value per round.
 
-    ``of_path``: that of Mitsuba's `path`, over the same floor. (Where the pass is path tracing alone, its rays
-    are about the same.)
+    ``of_path``: that of Mitsuba's `path`, over the same floor. (Where the pass is path tracing alone, `path`
+    traces about the same rays.)
     """
     # Kernels cannot be recorded as a whole any more where loops were run step by step.
     calls = Pass(file, parameters or {}).rays()
