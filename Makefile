@@ -62,6 +62,7 @@ package: $(INSTALLED)
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check build twine
 	$(VENV)/bin/python -m build
 	$(VENV)/bin/python -m twine check --strict dist/*
+	$(VENV)/bin/python scripts/check_package.py dist
 	$(PYTHON) -m venv build/try
 	build/try/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/try && bin/python -m mitsuba_bdpt doctor

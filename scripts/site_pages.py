@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ast
 import html
+import json
 import re
 from pathlib import Path
 
@@ -45,15 +46,16 @@ def top(name: str) -> str:
 
 
 def tutorial() -> str:
-    """Return the cells of docs/user/tutorial.py, prose and code in turn."""
-    cells = re.split(r"^# %%", (ROOT / "docs/user/tutorial.py").read_text(), flags=re.MULTILINE)[1:]
+    """Return the cells of docs/user/tutorial.ipynb: prose, code, and what it prints and shows."""
     parts = []
-    for cell in cells:
-        kind, _, body = cell.partition("\n")
-        if "[markdown]" in kind:
-            parts.append("\n".join(line.removeprefix("#").removeprefix(" ") for line in body.splitlines()))
-        else:
-            parts.append(f"```python\n{body.strip()}\n```")
+    for cell in json.loads((ROOT / "docs/user/tutorial.ipynb").read_text())["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", ()):
+            if text := "".join(output.get("text", ())).rstrip():
+                parts.append(f"```text\n{text}\n```")
+            if image := output.get("data", {}).get("image/png"):
+                parts.append(f"![what the cell shows](data:image/png;base64,{image.strip()})")
     return "\n\n".join(parts) + "\n"
 
 
@@ -122,7 +124,7 @@ def on_files(files, config):
 def on_page_markdown(markdown, page, config, files):
     """Insert docstrings, lead links to the tutorial to its page, and take off those that lead nowhere."""
     markdown = API.sub(described, markdown)
-    markdown = re.sub(r"\]\(((?:[\w./]*/)?)tutorial\.py\)", r"](\1tutorial.md)", markdown)
+    markdown = re.sub(r"\]\(((?:[\w./]*/)?)tutorial\.(?:ipynb|py)\)", r"](\1tutorial.md)", markdown)
     markdown = re.sub(r"\]\((?:\.\./)+(CONTRIBUTING|CHANGELOG)\.md\)", _top_page(page), markdown)
     return OUTSIDE.sub(r"\1", markdown)
 

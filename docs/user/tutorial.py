@@ -1,28 +1,28 @@
 # %% [markdown]
 # # Tutorial
 #
-# Run it as a script, or cell by cell in an editor that knows `# %%`:
+# A notebook (`docs/user/tutorial.ipynb`) and a script of the same cells, in a checkout of the repository, whose scenes it renders:
 #
-#     pip install mitsuba-bdpt
-#     python docs/user/tutorial.py            # some minutes; images in renders/tutorial
-#     python docs/user/tutorial.py --size 32  # a quick look
-#
-# It needs the scenes of the repository.
+#     pip install 'mitsuba-bdpt[measure]' jupyterlab
+#     jupyter lab docs/user/tutorial.ipynb
+#     python docs/user/tutorial.py                   # some minutes; images in renders/tutorial
+#     TUTORIAL_SIZE=32 python docs/user/tutorial.py  # a quick look
 
 # %%
-import argparse
 import json
+import os
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import mitsuba_bdpt  # before mitsuba: it chooses the LLVM library that Dr.Jit loads
 import numpy as np
+from mitsuba_bdpt.progress import Bar
 
 import mitsuba as mi  # isort: skip
 
-parser = argparse.ArgumentParser()
-parser.add_argument("--size", type=int, default=128, help="width of the images")
-SIZE = parser.parse_known_args()[0].size  # a notebook has arguments of its own
-ROOT = Path(__file__).resolve().parents[2]
+SIZE = int(os.environ.get("TUTORIAL_SIZE", "128"))  # width of the images
+here = Path(globals().get("__file__", ".")).resolve()
+ROOT = next(folder for folder in (here, *here.parents) if (folder / "scenes").is_dir())
 OUT = ROOT / "renders" / "tutorial"
 OUT.mkdir(parents=True, exist_ok=True)
 mi.set_variant("llvm_ad_rgb")
@@ -40,6 +40,27 @@ def rel_mse(image, reference):
     return ((x - r) ** 2 / (r**2 + 0.01 * r.mean() ** 2)).mean()
 
 
+def show(name, **images):
+    """Images side by side, in the notebook and in a file."""
+    figure, axes = plt.subplots(1, len(images), figsize=(3.2 * len(images), 3.2), squeeze=False)
+    for axis, (title, image) in zip(axes[0], images.items(), strict=True):
+        colours = np.array(
+            mi.Bitmap(image).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
+        )
+        axis.imshow(colours)
+        axis.set_title(title)
+        axis.set_axis_off()
+    keep(figure, name)
+
+
+def keep(figure, name):
+    """Write a figure to a file, and show it in a notebook."""
+    figure.savefig(OUT / f"{name}.png", bbox_inches="tight", dpi=100)
+    if "get_ipython" in globals():
+        plt.show()
+    plt.close(figure)
+
+
 # %% [markdown]
 # ## A first render
 #
@@ -52,8 +73,8 @@ integrators = {name: mi.load_dict({"type": name, "max_depth": 12}) for name in (
 bdpt = integrators["bdpt"]
 images = {name: mi.render(lamp, integrator=made, spp=64) for name, made in integrators.items()}
 for name, image in images.items():
-    mi.util.write_bitmap(str(OUT / f"lamp_{name}.png"), image)
     print(f"{name}: mean {np.array(image)[..., :3].mean():.3f}")
+show("lamp_behind_glass", **images)
 assert np.array(images["path"])[..., :3].max() == 0
 assert np.array(images["bdpt"])[..., :3].mean() > 0.01
 
@@ -118,6 +139,61 @@ for s in range(5):
 print("paths of three edges, by strategy:", {key: f"{value:.4f}" for key, value in three_edges.items()})
 
 # %% [markdown]
+# ## A caustic of one's own
+#
+# Any scene will do: a dictionary, a file. Here a small lamp over a glass ball on a floor. `path` finds the caustic by
+# camera subpaths that happen to hit the lamp through the ball.
+
+# %%
+at = mi.ScalarTransform4f()
+own = mi.load_dict(
+    {
+        "type": "scene",
+        "sensor": {
+            "type": "perspective",
+            "fov": 35,
+            "to_world": at.look_at(origin=[0, -6, 4], target=[0, 0, 0.5], up=[0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
+        },
+        "floor": {
+            "type": "rectangle",
+            "to_world": at.scale(4),
+            "bsdf": {"type": "diffuse", "reflectance": 0.6},
+        },
+        "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 1, "bsdf": {"type": "dielectric"}},
+        "lamp": {
+            "type": "sphere",
+            "center": [1.5, 1, 5],
+            "radius": 0.1,
+            "emitter": {"type": "area", "radiance": 300.0},
+        },
+    }
+)
+made = {
+    "path": mi.load_dict({"type": "path", "max_depth": 8}),
+    "bdpt": mi.load_dict({"type": "bdpt", "max_depth": 8}),
+}
+images = {name: mi.render(own, integrator=integrator, spp=64) for name, integrator in made.items()}
+show("own_caustic", **images)
+print(made["bdpt"].explain(own, spp=64))
+
+# %% [markdown]
+# ## Long renders
+#
+# A bar under the cell, or on a terminal. The stop button of a notebook, Ctrl-C and `integrator.cancel()` end a render after
+# the pass that is running; what is done is in the film. (`docs/user/long_renders.md` has checkpoints. `mi.render` would wrap the
+# interruption in an error of its own; the integrator's method does not.)
+
+# %%
+bdpt.on_pass = Bar()
+try:
+    image = bdpt.render(box, spp=256)
+except KeyboardInterrupt:
+    image = box.sensors()[0].film().develop()  # all finished passes
+bdpt.on_pass = None
+print(sum(bdpt.statistics["passes"]), "samples per pixel")
+
+# %% [markdown]
 # ## Sweeps
 #
 # `presets/small.toml` names scenes, integrators and samples; a sweep is
@@ -126,7 +202,25 @@ print("paths of three edges, by strategy:", {key: f"{value:.4f}" for key, value 
 #     python scripts/report.py results/small      # tables and plots
 #     python scripts/page.py results/small        # one HTML file to send around
 #
-# In a script of one's own, compare at equal time, not at equal samples, and more than one seed.
+# In a script of one's own, compare at equal time, not at equal samples, and more than one seed. Twice the samples, half the
+# error; bdpt's points make it fall somewhat faster.
+
+# %%
+counts = [4, 16, 64, 256] if SIZE >= 64 else [4, 16]
+plain = mi.load_dict({"type": "path", "max_depth": 6})
+ours = mi.load_dict({"type": "bdpt", "max_depth": 6})
+figure, axis = plt.subplots(figsize=(4.5, 3.2))
+for name, integrator in (("path", plain), ("bdpt", ours)):
+    sweep = []
+    for spp in counts:
+        renders = [mi.render(box, integrator=integrator, spp=spp, seed=seed) for seed in range(3)]
+        sweep.append(np.mean([rel_mse(image, reference) for image in renders]))
+    axis.loglog(counts, sweep, "o-", label=name)
+    print(name, [f"{error:.3g}" for error in sweep])
+axis.set_xlabel("samples per pixel")
+axis.set_ylabel("relMSE")
+axis.legend()
+keep(figure, "sweep")
 
 # %% [markdown]
 # ## Limits

@@ -42,7 +42,7 @@ receive; one after it the lamps without area of whose light more than a hundredt
 because they shine through glass on what is seen through glass. ``statistics["lost_light"]`` has the estimated
 shares by the number of the emitter; what is lost is estimated at the first render, and again after edits.
 
-Layers of the film come in this order: colours and alpha, features, variance, strategies.
+Layers of the film come in this order: colours and alpha, features, denoised colours, variance, strategies.
 
 ``statistics["decisions"]`` is what was decided, by a pilot, by the scene alone or as given, and
 ``statistics["no_pilot"]`` why no pilot was asked, or none decided: an empty text where one did, and where
@@ -244,7 +244,8 @@ class BDPTIntegrator:
         """Names of the film's layers beside colours and alpha."""
         settings = self.settings
         depth, merges = settings.strategy_depth, settings.merge_images
-        return layer_names(depth, settings.variance, feature_names(settings.aovs), merges=merges)
+        names = feature_names(settings.aovs)
+        return layer_names(depth, settings.variance, names, merges=merges, denoise=settings.denoise)
 
     def sample(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""

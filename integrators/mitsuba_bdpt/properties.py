@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import named
-from .image import features, film_limits
+from .image import denoising, features, film_limits
 from .image.channels import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
@@ -153,7 +153,7 @@ def _check_layers(settings: Settings):
     seen = set()
     names = features.feature_names(settings.aovs)
     depth, merges = settings.strategy_depth, settings.merge_images
-    for layer in layer_names(depth, settings.variance, names, merges=merges):
+    for layer in layer_names(depth, settings.variance, names, merges=merges, denoise=settings.denoise):
         if layer in seen:
             raise UsageError(
                 f"aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
@@ -284,8 +284,17 @@ def check_film(sensor, settings: Settings):
             f"strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
+    count = len(features.feature_names(settings.aovs))
+    if settings.denoise:
+        if isinstance(colour, Bands):
+            raise UnsupportedError(
+                f"denoise=True is not possible with film {named(sensor.film())} of class SpecFilm: the "
+                "denoiser knows RGB images only; use hdrfilm"
+            )
+        denoising.check_installed()
+        count += denoising.GUIDE_CHANNELS
     _check_has_pixels(sensor.film())
-    channels = Channels.of(sensor.film(), len(colour.names), len(features.feature_names(settings.aovs)))
+    channels = Channels.of(sensor.film(), len(colour.names), count)
     film_limits.check_film(sensor.film(), channels, settings.variance)
     film_limits.check_strategies(sensor.film(), settings.strategy_depth, settings.merge_images)
     return colour

@@ -191,6 +191,13 @@ class Settings:
         ``timeout`` at least two of the parts have to end (four for the error), so ask for no more samples
         than it allows.""",
     )
+    denoise: bool = _parameter(
+        False,
+        "true or false",
+        """Adds the layers ``denoised.R``, ``.G``, ``.B``: the image without its noise, by Intel's Open Image
+        Denoise (package mitsuba-oidn, extra ``[denoise]``), which is told albedo and normals of what is seen
+        first. The image itself stays as it is. For previews: a denoised image is biased.""",
+    )
     target_error: float = _parameter(
         0.0,
         "the relMSE to stop at, or 0 for none",

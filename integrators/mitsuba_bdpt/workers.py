@@ -2,22 +2,89 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import sys
 import threading
+import time
 from collections import deque
 from contextlib import contextmanager
+from typing import Any
 
 from .errors import CommandError
+
+ANSWERS_WITHIN = 3.0
+"""Seconds that a scheduler may take to answer."""
+
+RETURNS_WITHIN = 300.0
+"""Seconds for which a scheduler that was there may be gone."""
 
 one_at_a_time = threading.Lock()
 """Held by a call that takes all cores of a worker, whose threads would otherwise make several at once."""
 
 
-def results(client, function, arguments):
+class Cluster:
+    """A connection to the scheduler at ``address``, by a ``distributed.Client``."""
+
+    def __init__(self, address: str):
+        self.address, self.client = address, _client(address)
+
+    def reconnect(self) -> None:
+        """Connect to a scheduler that was restarted, which knows nothing of what the former one had.
+
+        Raises ``OSError`` if none comes within `RETURNS_WITHIN`.
+        """
+        print(f"warning: the scheduler {self.address} is gone; waiting for another one", file=sys.stderr)
+        self.close()
+        deadline = time.monotonic() + RETURNS_WITHIN
+        while True:
+            try:
+                self.client = _client(self.address)
+                return
+            except OSError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(1)
+
+    def close(self) -> None:
+        """End the connection, also to a scheduler that is gone."""
+        with contextlib.suppress(Exception):
+            self.client.close(timeout=3)
+
+
+def _client(address: str) -> Any:
+    from distributed import Client
+
+    _check_answers(address)
+    return Client(address, timeout=ANSWERS_WITHIN)
+
+
+def _check_answers(address: str) -> None:
+    """Raise ``OSError`` if nothing at ``address`` speaks.
+
+    A scheduler does so when it is connected to; for one that does not, a ``Client`` waits for ever.
+    """
+    from distributed.comm.addressing import parse_address, parse_host_port
+
+    protocol, place = parse_address(address)
+    if protocol != "tcp":
+        return
+    try:
+        with socket.create_connection(parse_host_port(place), ANSWERS_WITHIN) as connection:
+            if connection.recv(1):
+                return
+            why = "it ends the connection"
+    except OSError as error:
+        why = str(error)
+    raise OSError(f"no dask scheduler answers at {address} within {ANSWERS_WITHIN:g} s: {why}")
+
+
+def results(cluster: Cluster, function, arguments):
     """Index and result of ``function(*arguments[index])``, each index once, as they come from the workers.
 
-    The workers are those of a ``distributed.Client``. A worker has one call at a time; where none are left to
-    begin, idle ones take over calls that others still have, so that one slow machine does not hold up the
-    rest: a call has to give the same wherever it runs. That of a lost worker is made by another one.
+    A worker has one call at a time; where none are left to begin, idle ones take over calls that others still
+    have, so that one slow machine does not hold up the rest: a call has to give the same wherever it runs.
+    That of a lost worker is made by another one; those of a scheduler that is gone are made anew by the next.
     """
     from distributed import as_completed
 
@@ -25,34 +92,64 @@ def results(client, function, arguments):
     pending = as_completed()
 
     def submit(index):
-        future = client.submit(function, *arguments[index], pure=False)
+        future = cluster.client.submit(function, *arguments[index], pure=False)
         running[future] = index
         pending.add(future)
 
     def fill():
-        workers = max(1, worker_count(client))  # none for a moment: another one may come
+        workers = max(1, worker_count(cluster.client))  # none for a moment: another one may come
         while len(running) < workers and to_do:
             submit(to_do.popleft())
         for index in [i for i in running.values() if i not in done]:
             if len(running) < workers and list(running.values()).count(index) == 1:
                 submit(index)
 
+    def recover():
+        nonlocal pending
+        cluster.reconnect()
+        to_do.extendleft(sorted({i for i in running.values() if i not in done}, reverse=True))
+        running.clear()
+        pending = as_completed()
+        fill()
+
     try:
         fill()
         while len(done) < len(arguments):
             future = next(pending)
-            index = running.pop(future)
-            if index not in done:
+            index, found = running[future], None
+            try:
+                if future.cancelled():  # not by this function
+                    raise _gone()[0]
+                if index not in done:
+                    found = _result(future, index)
+            except _gone():
+                recover()
+                continue
+            del running[future]
+            if found is not None:
                 done.add(index)
-                yield index, _result(future, index)
-            fill()
+                yield index, found
+            try:
+                fill()
+            except _gone():
+                recover()
     finally:
-        client.cancel(list(running), force=True)
+        with contextlib.suppress(Exception):  # of a scheduler that is gone
+            cluster.client.cancel(list(running), force=True)
+
+
+def _gone() -> tuple[type[BaseException], ...]:
+    """What is raised where a scheduler is gone."""
+    from distributed.client import CancelledError, ClosedClientError, FutureCancelledError
+
+    return CancelledError, ClosedClientError, FutureCancelledError
 
 
 def _result(future, index: int):
     try:
         return future.result()
+    except _gone():
+        raise
     except Exception as error:
         text = str(error) or type(error).__name__
         raise RuntimeError(f"part {index} failed on the cluster: {text}") from error
@@ -65,18 +162,21 @@ def worker_count(client) -> int:
 
 @contextmanager
 def connected(address: str):
-    """A ``distributed.Client`` of the scheduler at ``address``.
+    """The `Cluster` of the scheduler at ``address``.
 
     Raises ``CommandError`` if distributed is not installed or the scheduler has no worker, ``OSError`` if
-    there is no such scheduler.
+    there is no such scheduler, after `ANSWERS_WITHIN`.
     """
     try:
-        from distributed import Client
+        import distributed  # noqa: F401
     except ImportError as error:
         raise CommandError(
             "scheduler needs dask.distributed; install it with: pip install 'mitsuba-bdpt[cluster]'"
         ) from error
-    with Client(address, timeout="20s") as client:
-        if not worker_count(client):
+    cluster = Cluster(address)
+    try:
+        if not worker_count(cluster.client):
             raise CommandError(f"scheduler={address!r} has no worker; start some with `dask worker`.")
-        yield client
+        yield cluster
+    finally:
+        cluster.close()

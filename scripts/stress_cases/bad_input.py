@@ -42,6 +42,7 @@ SENSIBLE = {
     "stored_vertices": (1, 2, 64),
     "strategy_images": (False, True),
     "variance": (False, True),
+    "denoise": (False, True),
     "target_error": (0.0, 0.1),
     "spp_per_pass": (0, 1, 3),
     "timeout": (-1.0, 0.0, 1e9),

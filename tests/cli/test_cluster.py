@@ -4,10 +4,14 @@ import json
 import math
 import os
 import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from argparse import Namespace
 from pathlib import Path
+from types import SimpleNamespace
 
 import distributed
 import mitsuba as mi
@@ -15,10 +19,10 @@ import numpy as np
 import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import cluster
-from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.loading import load
 from mitsuba_bdpt.planning.planner import Planner
-from mitsuba_bdpt.workers import results
+from mitsuba_bdpt.workers import connected, results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
@@ -79,6 +83,10 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
         sensor=0,
         time=None,
         target_error=None,
+        denoise=False,
+        append=[],
+        size=None,
+        crop=None,
         seed=0,
     )
     scene, integrator = load(options)
@@ -164,6 +172,9 @@ def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
         def result(self):
             return self.value
 
+        def cancelled(self):
+            return False
+
     class Client:
         submitted = []
 
@@ -190,7 +201,7 @@ def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
             return self.futures.pop(1)
 
     monkeypatch.setattr(distributed, "as_completed", Completed)
-    found = list(results(Client(), None, [(seed,) for seed in range(4)]))
+    found = list(results(SimpleNamespace(client=Client()), None, [(seed,) for seed in range(4)]))
     assert sorted(found) == [(i, i) for i in range(4)] and released.is_set()
     assert Client.submitted == [0, 1, 2, 3, 0]
 
@@ -206,8 +217,8 @@ def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
 def test_a_failing_part_is_named(workers):
     """Expected: what a worker raises ends the render with one message, not with silence."""
     failed = pytest.raises(RuntimeError, match="part 0 failed on the cluster: math domain error")
-    with distributed.Client(workers.scheduler_address) as client, failed:
-        list(results(client, math.sqrt, [(-1.0,)]))
+    with connected(workers.scheduler_address) as cluster, failed:
+        list(results(cluster, math.sqrt, [(-1.0,)]))
 
 
 def test_an_edited_scene_is_loaded_anew(workers, tmp_path):
@@ -221,3 +232,76 @@ def test_an_edited_scene_is_loaded_anew(workers, tmp_path):
         assert main([*command, "--scheduler", workers.scheduler_address]) == 0
         means.append(image(tmp_path / "a.exr")[0].mean())
     assert means[1] == pytest.approx(2 * means[0], rel=0.1)
+
+
+def started(*words):
+    """A process of dask's command, its output for whom the test fails."""
+    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", *words]
+    if words[0] == "worker":
+        command = [sys.executable, "-m", "distributed.cli.dask_worker", *words[1:]]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+@pytest.mark.slow
+def test_a_farm_in_a_bad_night(tmp_path):
+    """Rationale: farms lose machines, get new ones, and restart what schedules them.
+
+    Expected: of eight workers one is killed in the middle, two come late, and the scheduler is killed and
+    started again: the image and the counts are those of the same parts on one machine in peace.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    address, seen = f"tcp://127.0.0.1:{port}", []
+    schedule = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show"]
+    work = ["worker", address, "--nworkers", "1", "--nthreads", "1", "--no-dashboard"]
+    processes = [started(*schedule)] + [started(*work) for _ in range(6)]
+    original = cluster.Merged.add
+
+    def add(self, index, snapshot):
+        original(self, index, snapshot)
+        seen.append(index)
+        if len(seen) == 4:
+            processes.extend(started(*work) for _ in range(2))
+            processes[3].kill()
+        if len(seen) == 8:
+            processes[0].kill()
+            processes[0].wait()
+            processes.append(started(*schedule))
+
+    command = ["render", str(SCENE), "-D", "resolution=32", "--spp", "512", "--parts", "24"]
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(cluster.Merged, "add", add)
+            wait_for_workers(address, 6)
+            assert main([*command, "--scheduler", address, "-o", str(tmp_path / "night.exr")]) == 0
+    finally:
+        for process in processes:
+            process.kill()
+    assert len(seen) >= 24
+    found, night = image(tmp_path / "night.exr")
+    options = build_parser().parse_args([*command])
+    scene, integrator = load(options)
+    merged, reports = cluster.Merged(), []
+    decided = json.dumps(night["decisions"])
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": integrator.max_depth, "decisions": decided})
+    integrator.on_pass = reports.append
+    for index, (seed, spp) in enumerate(cluster.parts_of(512, 24, 0)):
+        integrator.render(scene, 0, seed, spp, develop=False)
+        merged.add(index, reports[-1].snapshot().image_only())
+    integrator.on_pass = None
+    expected = np.array(integrator.assemble(merged.snapshot, scene))[..., :3]
+    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
+    assert night["rays"] == integrator.statistics["rays"]
+
+
+def wait_for_workers(address, count):
+    """Until the scheduler has so many; a scheduler that does not come within two minutes is an error."""
+    deadline = time.monotonic() + 120
+    while True:
+        try:
+            with distributed.Client(address, timeout="2s") as client:
+                client.wait_for_workers(count, timeout=100)
+                return
+        except OSError:
+            if time.monotonic() > deadline:
+                raise

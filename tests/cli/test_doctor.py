@@ -58,7 +58,11 @@ def test_other_commands_report_the_failure_without_a_traceback():
 def test_crash_of_the_child_is_put_into_words():
     findings = doctor.render_in_child(
         "llvm_ad_rgb",
-        child(-signal.SIGABRT, '{"variants": ["llvm_ad_rgb"]}\n', "LLVM ERROR: Cannot select\n"),
+        child(
+            -signal.SIGABRT,
+            '{"variants": ["llvm_ad_rgb"], "backends": ["LLVM"]}\n',
+            "LLVM ERROR: Cannot select\n",
+        ),
     )
     assert [finding.state for finding in findings] == ["ok", "FAIL"]
     assert "killed by SIGABRT (LLVM ERROR: Cannot select)" in findings[1].text
@@ -82,6 +86,18 @@ def test_hanging_child_is_a_failure():
 
     (finding,) = doctor.render_in_child("llvm_ad_rgb", hang)
     assert finding.state == "FAIL" and "not finished" in finding.text
+
+
+def test_which_variants_can_render_here():
+    """Expected: each variant once, with the reason where it cannot."""
+    installed = ["scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral_polarized", "cuda_ad_rgb", "metal_ad_rgb"]
+    finding = doctor.variants(installed, ["LLVM"])
+    assert finding.state == "ok" and finding.text.startswith("here: llvm_ad_rgb; not: scalar_rgb (")
+    assert "cuda_ad_rgb (no CUDA device or driver was found)" in finding.text
+    assert doctor.variants(installed, ["LLVM", "CUDA"]).text.startswith(
+        "here: llvm_ad_rgb, cuda_ad_rgb; not: "
+    )
+    assert doctor.variants(["llvm_ad_rgb"], []).state == "note"
 
 
 def test_missing_package_is_named_with_its_remedy(monkeypatch):

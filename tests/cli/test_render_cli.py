@@ -664,22 +664,6 @@ def test_bad_values_are_usage_errors(arguments, capsys):
     assert caught.value.code == 2 and "which must" in capsys.readouterr().err
 
 
-def test_progress_shows_rate_and_time_left():
-    bar = render.progress_bar()
-    draw = render.show_pass(bar, None)
-    draw(SimpleNamespace(spp_done=1, spp_total=4, seconds=2.0, rays=5_000_000))
-    assert bar.tasks[0].description == "1/4 spp, 2.5 M rays/s, 6 s left"
-    assert bar.tasks[0].completed == 0.25
-
-
-def test_progress_under_a_time_limit():
-    bar = render.progress_bar()
-    report = SimpleNamespace(spp_done=8, spp_total=render.UNLIMITED_SPP, seconds=2.0, rays=2000)
-    render.show_pass(bar, 8.0)(report)
-    assert bar.tasks[0].description == "8 spp, 1 k rays/s, 6 s left"
-    assert bar.tasks[0].completed == 0.25
-
-
 @pytest.mark.parametrize(
     "words", [["--help"], *([name, "--help"] for name in ("render", "explain", "doctor"))], ids=" ".join
 )

@@ -8,17 +8,21 @@ What needs Mitsuba is imported inside `main`, because `doctor` has to run where 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import re
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
 import mitsuba_bdpt
 
 from ..errors import did_you_mean
+from ..progress import KINDS
 from . import measuring
-from .values import definition, number, property_
+from .tev import PORT
+from .values import crop, definition, frames, number, property_, size, tev_address
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -26,6 +30,10 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line `arguments` (default: the process's own) and return its exit status."""
     options = build_parser().parse_args(arguments)
+    if options.command == "completion":
+        from . import completion
+
+        return completion.run(options.shell, build_parser())
     if options.command == "doctor":
         from . import doctor
 
@@ -70,12 +78,16 @@ class Parser(argparse.ArgumentParser):
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
     parser = Parser(prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3.")
-    parser.add_argument("--version", action="version", version=mitsuba_bdpt.__version__)
+    parser.add_argument("--version", action="version", version=_versions())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     help_text = "say what is installed and render a tiny image to prove that it works"
     doctor = commands.add_parser("doctor", help=help_text, description=help_text)
     doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
+
+    help_text = "print a script that completes commands and options: source it in the shell's start-up file"
+    completion = commands.add_parser("completion", help=help_text, description=help_text)
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
 
     help_text = "render a Mitsuba scene file to an EXR and a PNG image"
     add_render_arguments(commands.add_parser("render", help=help_text, description=help_text))
@@ -85,9 +97,18 @@ def build_parser() -> argparse.ArgumentParser:
     )
     explain = commands.add_parser("explain", help=help_text, description=help_text)
     add_scene_arguments(explain)
-    explain.set_defaults(integrator="bdpt", time=None, target_error=None)
+    explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
     measuring.add_commands(commands)
     return parser
+
+
+def _versions() -> str:
+    """Versions of this package, Mitsuba and Dr.Jit, as far as they are installed."""
+    found = []
+    for name in ("mitsuba", "drjit"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found.append(f"{name} {metadata.version(name)}")
+    return f"mitsuba-bdpt {mitsuba_bdpt.__version__} ({', '.join(found) or 'no mitsuba'})"
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,6 +131,16 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "index of the sensor; default: %(default)s"
     add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
+    text = "folder in which files that the scene names are looked for, after the scene's own; may be repeated"
+    add("-a", "--append", type=Path, action="append", default=[], metavar="FOLDER", help=text)
+    text = "size of the image in pixels, in place of that of all of the scene's films"
+    add("--size", type=size, metavar="WxH", help=text)
+    text = "render this part of the image alone, in pixels from the upper left corner"
+    add("--crop", type=crop, metavar="X,Y,W,H", help=text)
+    text = "number of threads; default: one for each core"
+    add("--threads", type=number(int, 1), metavar="N", help=text)
+    text = "say more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
+    add("-v", "--verbose", action="count", default=0, help=text)
 
 
 def add_render_arguments(parser: argparse.ArgumentParser) -> None:
@@ -131,11 +162,27 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     )
     text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
-    add("--resume", action="store_true", help="go on from the checkpoint of an earlier, unfinished render")
+    text = "keep the last checkpoint of a finished render, so that --resume --spp MORE can go on from it"
+    add("--keep-checkpoint", action="store_true", help=text)
+    text = "go on from the checkpoint of an earlier render; with a larger --spp also from a finished one"
+    add("--resume", action="store_true", help=text)
+    text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"
+    add("--frames", type=frames, metavar="RANGE", help=text)
+    text = (
+        "bar, lines (for logs, the first after ten seconds), deadline (per cents on standard output, as "
+        "Deadline and Alfred have them) or none; default: a bar on a terminal, lines elsewhere"
+    )
+    add("--progress", choices=KINDS, default="auto", help=text)
+    text = "rewrite the PNG with the image so far, so often"
+    add("--preview", type=number(float, 0), metavar="SECONDS", help=text)
+    text = f"show the image in the viewer tev while it is rendered; default port: {PORT}"
+    add("--tev", type=tev_address, metavar="HOST:PORT", help=text)
     text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
     add("--scheduler", metavar="ADDRESS", help=text)
     text = "number of parts of a render on a cluster; default: 4 for each worker"
     add("--parts", type=number(int, 1), metavar="N", help=text)
+    text = "add a denoised image as a layer, which the PNG then shows (extra [denoise]); the raw one stays"
+    add("--denoise", action="store_true", help=text)
     text = "replace the scene's integrator, keeping depth, hide_emitters, timeout, layers of aov"
     add("--integrator", metavar="TYPE", help=text)
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")

@@ -23,9 +23,10 @@ def path_of(output: Path) -> Path:
 
 
 def digest(options: Namespace) -> str:
-    """Of a scene file, the files that it names, the definitions on the command line and the sensor."""
-    found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor]).encode())
-    for path in (options.scene, *named_files(options.scene, options.defines)):
+    """Of a scene file, the files that it names, definitions on the command line, sensor and film."""
+    film = [options.size, options.crop] if options.size or options.crop else []
+    found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor, *film]).encode())
+    for path in (options.scene, *named_files(options.scene, options.defines, options.append)):
         found.update(hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()
 
@@ -40,7 +41,8 @@ def check(options: Namespace, output: Path) -> None:
         check_writable(path)
     if options.checkpoint is not None and path.exists() and not options.resume:
         raise CommandError(
-            f"checkpoint={str(path)!r} of an unfinished render exists; go on by --resume, or delete it."
+            f"checkpoint={str(path)!r} of an earlier render exists; go on by --resume (with a larger --spp "
+            "if it is finished), or delete it."
         )
 
 
@@ -91,9 +93,6 @@ class Checkpoints:
             print(f"warning: no checkpoint {str(self.path)!r}: {error}", file=sys.stderr)
         self._last = time.monotonic()
 
-    def end(self, finished: bool) -> None:
-        """The last checkpoint of a render that can go on; none of one that is ``finished``."""
-        if finished:
-            self.path.unlink(missing_ok=True)
-        else:
-            self.write()
+    def remove(self) -> None:
+        """The render is finished and its image written: there is nothing to go on from."""
+        self.path.unlink(missing_ok=True)

@@ -12,7 +12,7 @@ import time
 import uuid
 from argparse import Namespace
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -84,19 +84,20 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     they are of the parts before the first one that had not come. Raises what `connected` does.
     """
     started, merged, interrupted = time.perf_counter(), Merged(), False
-    with connected(options.scheduler) as client:
+    with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
         asked = integrator.statistics  # before the parts, whose own take their place
-        count = options.parts or PARTS_PER_WORKER * worker_count(client)
+        count = options.parts or PARTS_PER_WORKER * worker_count(workers.client)
         parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
         try:
-            for index, data in results(client, render_part, parts):
+            for index, data in results(workers, render_part, parts):
                 merged.add(index, Snapshot.from_bytes(data))
                 done = merged.snapshot
                 if done is not None:
                     rays = sum(done.progress.work.counts[name] for name in RAYS)
                     seconds = time.perf_counter() - started
-                    on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s))
+                    image = partial(integrator.assemble, done, scene, options.sensor)
+                    on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s, image))
         except KeyboardInterrupt:
             interrupted = True
     if merged.snapshot is None:
@@ -128,8 +129,9 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     if settings.decisions is None:  # an empty list where there is nothing to choose
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
-    names = ("variant", "defines", "integrator", "sensor", "time", "target_error")
+    names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")
     kept = {name: getattr(options, name) for name in names}
+    kept["append"] = [str(folder.resolve()) for folder in options.append]
     kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
 
@@ -153,5 +155,5 @@ def render_part(job: str, seed: int, spp: int) -> bytes:
 def _loaded(job: str):
     """Options, scene and integrator of a `_job`; a worker loads them once."""
     options = Namespace(**json.loads(job))
-    options.scene = Path(options.scene)
+    options.scene, options.append = Path(options.scene), [Path(folder) for folder in options.append]
     return options, *load(options)

@@ -30,7 +30,8 @@ PROBE = """
 import json, sys
 import mitsuba_bdpt
 import drjit as dr, mitsuba as mi
-print(json.dumps({"variants": mi.variants()}), flush=True)
+backends = [name for name in ("LLVM", "CUDA") if dr.has_backend(getattr(dr.JitBackend, name))]
+print(json.dumps({"variants": mi.variants(), "backends": backends}), flush=True)
 mi.set_variant(sys.argv[1])
 scene = mi.cornell_box()
 scene["integrator"] = {"type": "bdpt", "max_depth": 4}
@@ -126,10 +127,35 @@ def render_in_child(
     for line in child.stdout.splitlines():
         if line.startswith("{"):
             said.update(json.loads(line))
-    findings = []
-    if "variants" in said:
-        findings.append(Finding("ok", "variants", ", ".join(said["variants"])))
+    findings = [variants(said["variants"], said.get("backends", []))] if "variants" in said else []
     return [*findings, judge(child, said, variant)]
+
+
+def variants(installed: list[str], backends: list[str]) -> Finding:
+    """Which of the ``installed`` variants bdpt can render with on this machine, and why not with the others.
+
+    ``backends``: ``LLVM`` or ``CUDA``, where Dr.Jit finds its library, or a device with a driver.
+    """
+    reasons: dict[str, list[str]] = {}
+    for name in installed:
+        reasons.setdefault(why_not(name, backends), []).append(name)
+    here = reasons.pop("", [])
+    others = [f"{', '.join(names)} ({why})" for why, names in reasons.items()]
+    text = f"here: {', '.join(here) or 'none'}" + (f"; not: {'; '.join(others)}" if others else "")
+    return Finding("ok" if here else "note", "variants", text)
+
+
+def why_not(variant: str, backends: list[str]) -> str:
+    """Why bdpt cannot render with a ``variant``; empty if it can."""
+    if variant.startswith("scalar"):
+        return "bdpt has no scalar variant"
+    if "polarized" in variant:
+        return "bdpt has no polarization"
+    if variant.startswith("metal"):
+        return "bdpt does not support Metal"
+    if variant.startswith("cuda"):
+        return "" if "CUDA" in backends else "no CUDA device or driver was found"
+    return "" if "LLVM" in backends else "no LLVM library was found"
 
 
 def judge(child: subprocess.CompletedProcess, said: dict, variant: str) -> Finding:

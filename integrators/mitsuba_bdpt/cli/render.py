@@ -14,17 +14,18 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
 from ..errors import CommandError, message
 from ..files.images import check_channels, check_png, prepare_output, write_images
 from ..files.loading import check_file, choose_sensor, load
 from ..host.versions import versions
-from . import checkpoints, cluster
+from ..progress import OPEN_ENDED, display, readable
+from ..run.rendering import PassReport
+from . import checkpoints, cluster, extension, live
 from .mistakes import INTERRUPTED
+from .signals import Ending, terminable
 
-UNLIMITED_SPP = 1 << 16
+UNLIMITED_SPP = OPEN_ENDED
 """Samples per pixel where only the time limits them."""
 
 PASS_SPP = 16
@@ -42,46 +43,106 @@ class Outcome:
     spp: int
     interrupted: bool = False
     statistics: dict = field(default_factory=dict)
+    written: Callable[[], object] = lambda: None
+    """To be called when the image is written."""
 
 
 def run(options: Namespace) -> int:
     """Render as the command line `options` say and return the exit status."""
-    try:
-        check_file(options.scene)  # before a folder is made for its image
-        output = options.output or Path("renders") / f"{options.scene.stem}.exr"
-        prepare_output(output)
-        check_options(options, output)
-        scene, integrator = load(options)
-        check_integrator(options, integrator)
-        sensor = choose_sensor(scene, options.sensor)
-        check_png(sensor.film())
-        check_channels(sensor.film(), integrator.aov_names())
-        open_ended = options.time is not None or options.target_error is not None
-        spp = options.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
-        if not spp:
+    with terminable() as ending:
+        try:
+            check_file(options.scene)  # before a folder is made for its image
+            jobs = jobs_of(options)
+            for job in jobs:
+                prepare_output(job.output)
+                check_options(job)
+            scene, integrator = loaded(options)
+            check_integrator(options, integrator)
+            for job in jobs:
+                film = choose_sensor(scene, job.sensor).film()
+                check_png(film)
+                check_channels(film, integrator.aov_names())
+            for job in jobs:
+                if not render_job(scene, integrator, job, ending):
+                    return ending.status
+        except KeyboardInterrupt:
+            print("interrupted; no image written", file=sys.stderr)
+            return ending.status
+        except (OSError, RuntimeError, TypeError, ValueError) as error:
+            print(f"error: {message(error)}", file=sys.stderr)
+            return 1
+    return 0
+
+
+def jobs_of(options: Namespace) -> list[Namespace]:
+    """The options of each image, with its ``sensor`` and ``output``: of one, or of each of the ``frames``."""
+    output = options.output or Path("renders") / f"{options.scene.stem}.exr"
+    if options.frames is None:
+        return [Namespace(**vars(options) | {"output": output})]
+    given = ("sensor", options.sensor != 0), ("checkpoint", options.checkpoint is not None)
+    for name, is_given in given:
+        if is_given:
             raise CommandError(
-                "The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N."
+                f"frames together with {name} is not possible: each frame is a sensor and has an image of "
+                "its own; leave out one or the other."
             )
-        outcome = render(scene, integrator, options, spp, output)
+    return [
+        Namespace(**vars(options) | {"sensor": n, "output": output.with_stem(f"{output.stem}.{n:04d}")})
+        for n in dict.fromkeys(options.frames)
+    ]
+
+
+def loaded(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+    """`load`, with what holds for the whole process: how much is logged, and the number of threads."""
+    if options.verbose:
+        levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
+        mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
+    found = load(options)
+    if (
+        options.threads is not None
+    ):  # after the scene: with one thread Mitsuba reads no EXR, see `two_threads`
+        dr.set_thread_count(options.threads)
+    return found
+
+
+def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, ending: Ending) -> bool:
+    """Render one image and write it; returns whether it came to its end.
+
+    Once rendered, it is written whatever signals come, and only then a checkpoint is removed.
+    """
+    sensor = choose_sensor(scene, job.sensor)
+    open_ended = job.time is not None or job.target_error is not None
+    spp = job.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
+    if not spp:
+        raise CommandError("The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N.")
+    outcome = render(scene, integrator, job, spp)
+    ending.patient = True
+    try:
         if outcome.interrupted and not outcome.spp:
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
-            return INTERRUPTED
-        attributes = {"bdptSettings": settings(options, spp), "bdptStatistics": report(outcome)}
-        write_images(sensor.film(), output, attributes, options.exposure)
-    except KeyboardInterrupt:
-        print("interrupted; no image written", file=sys.stderr)
-        return INTERRUPTED
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
-        print(f"error: {message(error)}", file=sys.stderr)
-        return 1
-    print(summary(output, outcome, sensor.film().crop_size(), asked_error(integrator)))
-    return INTERRUPTED if outcome.interrupted else 0
+            return False
+        attributes = {"bdptSettings": settings(job, spp), "bdptStatistics": report(outcome)}
+        write_images(sensor.film(), job.output, attributes, job.exposure)
+        outcome.written()
+        say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
+    finally:
+        ending.patient = False
+    return not outcome.interrupted and not ending.asked
+
+
+def say(line: str) -> None:
+    """Print a ``line``; that nobody listens any more must not cost an image, or the next ones."""
+    try:
+        print(line, flush=True)
+    except OSError as error:
+        sys.stdout = None
+        print(f"warning: standard output: {error}", file=sys.stderr)
 
 
 def explain(options: Namespace) -> int:
     """Print what a render as the command line `options` say would do, and return the exit status."""
     try:
-        scene, integrator = load(options)
+        scene, integrator = loaded(options)
         sensor = choose_sensor(scene, options.sensor)
         spp = options.spp or sensor.sampler().sample_count()
         print(integrator.explain(scene, sensor, spp))
@@ -94,19 +155,24 @@ def explain(options: Namespace) -> int:
     return 0
 
 
-def check_options(options: Namespace, output: Path) -> None:
+def check_options(options: Namespace) -> None:
     """Raise ``CommandError`` for options that contradict one another."""
-    if options.resume and options.checkpoint is None:
-        raise CommandError("resume needs --checkpoint MINUTES: how often to write the next ones.")
+    for name in ("resume", "keep_checkpoint"):
+        if getattr(options, name) and options.checkpoint is None:
+            raise CommandError(f"{name} needs --checkpoint MINUTES: how often to write them.")
     if options.parts is not None and options.scheduler is None:
         raise CommandError("parts needs --scheduler: without one, a render is made in one piece.")
-    for name in ("checkpoint", "target_error", "time"):
+    for name in ("checkpoint", "target_error", "time", "threads"):
         if options.scheduler is not None and getattr(options, name) is not None:
             raise CommandError(
                 f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
                 "leave out one or the other."
             )
     properties = dict(options.properties)
+    if options.denoise and properties.get("denoise") is False:
+        raise CommandError(
+            "-P denoise=false together with --denoise is not possible; leave out one or the other."
+        )
     for option, names in SETS.items():
         for name in names & set(properties):
             value = getattr(options, option)
@@ -115,12 +181,12 @@ def check_options(options: Namespace, output: Path) -> None:
                     f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is "
                     f"not possible: the option sets {name} itself; leave out one or the other."
                 )
-    checkpoints.check(options, output)
+    checkpoints.check(options, options.output)
 
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
     """Raise ``CommandError`` for options that only ``bdpt`` can follow, and for what these cannot."""
-    for name in ("checkpoint", "scheduler"):
+    for name in ("checkpoint", "scheduler", "preview", "tev"):
         if getattr(options, name) is not None and not hasattr(integrator, "assemble"):
             raise CommandError(
                 f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "
@@ -135,48 +201,82 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
         cluster.check_settings(integrator.settings)
 
 
-def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, output: Path) -> Outcome:
-    """Render into the sensor's film, drawing progress on a terminal."""
-    if options.scheduler is not None:
+def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
+    """Render into the sensor's film, and show what is done meanwhile."""
+    film = choose_sensor(scene, options.sensor).film()
+    with live.watchers(options, film, options.output) as watchers:
+        if options.scheduler is None:
+            if options.time is not None and not hasattr(integrator, "on_pass"):
+                return render_repeatedly(scene, integrator, options, spp)
+            return render_here(scene, integrator, options, spp, watchers)
         started = time.perf_counter()
-        with progress_bar() as bar:
-            statistics, interrupted = cluster.render(scene, integrator, options, spp, show_pass(bar, None))
-        return Outcome(time.perf_counter() - started, sum(statistics["passes"]), interrupted, statistics)
-    if options.time is not None and not hasattr(integrator, "on_pass"):
-        return render_repeatedly(scene, integrator, options, spp)
-    return render_here(scene, integrator, options, spp, output)
-
-
-def render_here(scene, integrator, options: Namespace, spp: int, output: Path) -> Outcome:
-    """Render in one go, with checkpoints if they are wanted."""
-    started, interrupted, asked, arguments = time.perf_counter(), False, spp, {}
-    watchers, kept, limit = [], None, options.time
-    if options.checkpoint is not None:
-        kept = checkpoints.Checkpoints(options, output)
-        watchers.append(kept.after_pass)
-    if options.resume:
-        arguments["start"] = checkpoints.start(options, output)
-        limit = limit and limit + arguments["start"].progress.work.seconds
-    with progress_bar() as bar:
-        if hasattr(integrator, "on_pass"):
-            watchers.append(show_pass(bar, limit))
-            integrator.on_pass = lambda report: [watch(report) for watch in watchers]
+        shown = display(options.progress)
         try:
-            integrator.render(
-                scene, options.sensor, options.seed, spp, develop=False, evaluate=True, **arguments
-            )
-            dr.sync_thread()
-        except KeyboardInterrupt:
-            interrupted = True
+            watch = all_of([shown, *watchers])
+            statistics, interrupted = cluster.render(scene, integrator, options, spp, watch)
+        finally:
+            shown.close()
+        return Outcome(time.perf_counter() - started, sum(statistics["passes"]), interrupted, statistics)
+
+
+def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
+    """A function that calls all ``watchers`` with a report."""
+
+    def watch(report: PassReport) -> None:
+        for watcher in watchers:
+            watcher(report)
+
+    return watch
+
+
+def render_here(scene, integrator, options: Namespace, spp: int, watchers: list) -> Outcome:
+    """Render in one go, with checkpoints if they are wanted."""
+    started, interrupted, seed, start, rest = time.perf_counter(), False, options.seed, None, None
+    if hasattr(integrator, "statistics"):
+        integrator.statistics = {}  # of the render before
+    kept, limit, asked = None, options.time, spp
+    if options.resume:
+        start = checkpoints.start(options, options.output)
+        limit = limit and limit + start.progress.work.seconds
+        if extension.is_needed(start, spp):
+            rest, start = extension.Extension(start, scene, integrator, options), None
+            seed, spp = rest.seed, spp - rest.whole.spp
+    if options.checkpoint is not None:
+        kept = checkpoints.Checkpoints(options, options.output)
+        watchers = [kept.after_pass, *watchers]
+    shown = display(options.progress, limit)
+    try:
+        if hasattr(integrator, "on_pass"):
+            watch = all_of([*watchers, shown])
+            integrator.on_pass = watch if rest is None else rest.watching(watch)
+        arguments = {} if start is None else {"start": start}
+        integrator.render(scene, options.sensor, seed, spp, develop=False, evaluate=True, **arguments)
+        dr.sync_thread()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        shown.close()
+        if hasattr(integrator, "on_pass"):
+            integrator.on_pass = None
+    if rest is not None:
+        rest.assemble()
     statistics = getattr(integrator, "statistics", None) or {}
+    done = asked
     if "passes" in statistics:
-        spp = int(sum(statistics["passes"]))
+        done = int(sum(statistics["passes"]))
     elif interrupted:
         # Mitsuba's own integrators leave nothing behind.
-        spp = 0
+        done = 0
+    outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics)
     if kept is not None:
-        kept.end(finished=not interrupted and (spp == asked or reached(asked_error(integrator), statistics)))
-    return Outcome(time.perf_counter() - started, spp, interrupted, statistics)
+        whole = done == asked or reached(asked_error(integrator), statistics)
+        finished = not interrupted and whole
+        # Of a finished render at the end only: its image may fail to be written.
+        if finished and not options.keep_checkpoint:
+            outcome.written = kept.remove
+        else:
+            kept.write()
+    return outcome
 
 
 def asked_error(integrator) -> float:
@@ -212,39 +312,10 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
     return Outcome(time.perf_counter() - started, done, interrupted)
 
 
-def progress_bar() -> Progress:
-    """A bar on standard error, silent where that is not a terminal."""
-    console = Console(stderr=True)
-    columns = (SpinnerColumn(), BarColumn(), TextColumn("{task.description}"))
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-
-
-def show_pass(bar: Progress, limit: float | None) -> Callable[[object], None]:
-    """Start a task on `bar`; the result is to be called with a report after every pass."""
-    task = bar.add_task("rendering", total=None)
-
-    def draw(report) -> None:
-        done = report.spp_done / report.spp_total
-        left = report.seconds * (1 / max(done, 1e-9) - 1)
-        if limit:
-            left = max(0.0, min(left, limit - report.seconds))
-            done = max(done, min(1.0, report.seconds / limit))
-        rate = readable(report.rays / max(report.seconds, 1e-9))
-        open_ended = report.spp_total == UNLIMITED_SPP
-        text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp, {rate} rays/s"
-        if limit or not open_ended:
-            text += f", {left:.0f} s left"
-        if getattr(report, "error", None) is not None:
-            text += f", relMSE {report.error:.2g}"
-        bar.update(task, total=1.0, completed=done, description=text)
-
-    return draw
-
-
 def settings(options: Namespace, spp: int) -> str:
     """The command line as JSON, for the header of the image."""
     values = {key: str(v) if isinstance(v, Path) else v for key, v in vars(options).items()}
-    values |= {"spp": spp, "defines": dict(options.defines)}
+    values |= {"spp": spp, "defines": dict(options.defines), "append": list(map(str, options.append))}
     values["properties"] = dict(options.properties)
     return json.dumps(values)
 
@@ -290,11 +361,3 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: f
     if outcome.interrupted:
         parts.append("interrupted")
     return "; ".join(parts)
-
-
-def readable(number: float) -> str:
-    """A number to three digits with a unit prefix."""
-    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
-        if number >= limit:
-            return f"{number / limit:.3g}{unit}"
-    return f"{number:.3g}"

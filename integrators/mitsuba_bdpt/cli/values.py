@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from typing import TypeVar
 
+from . import tev
+
 PropertyValue = bool | int | float | str
+
+MOST_FRAMES = 1 << 20
+"""Sensors in a range, at most."""
 
 Number = TypeVar("Number", int, float)
 
@@ -30,6 +36,50 @@ def number(kind: type[Number], minimum: float, maximum: float = math.inf) -> Cal
         return value
 
     return parse
+
+
+def size(text: str) -> tuple[int, int]:
+    """Split ``WIDTHxHEIGHT``, whole numbers of at least 1."""
+    width, x, height = text.lower().partition("x")
+    if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form WIDTHxHEIGHT, in pixels")
+    return int(width), int(height)
+
+
+def crop(text: str) -> tuple[int, int, int, int]:
+    """Split ``X,Y,WIDTH,HEIGHT``, whole numbers, the last two of at least 1."""
+    parts = text.split(",")
+    if len(parts) != 4 or not all(p.strip().isdecimal() for p in parts) or not all(map(int, parts[2:])):
+        raise argparse.ArgumentTypeError(
+            f"got {text!r}, which must have the form X,Y,WIDTH,HEIGHT, in pixels"
+        )
+    x, y, width, height = map(int, parts)
+    return x, y, width, height
+
+
+def frames(text: str) -> list[int]:
+    """Numbers of sensors: ``3``, ``0-9``, ``0-99:10`` (each tenth), several of these with commas between."""
+    found = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
+        first, last, step = (match and match[i] for i in (1, 2, 3)) if match else (None, None, None)
+        if first is None or step == "0" or (last is not None and int(last) < int(first)):
+            raise argparse.ArgumentTypeError(
+                f"got {text!r}, which must be numbers of sensors such as 3, 0-9, 0-99:10 or 0,5,7"
+            )
+        numbers = range(int(first), int(last or first) + 1, int(step or 1))
+        if len(numbers) > MOST_FRAMES:
+            raise argparse.ArgumentTypeError(f"got {text!r}, which must be {MOST_FRAMES} numbers at most")
+        found += numbers
+    return found
+
+
+def tev_address(text: str) -> tuple[str, int]:
+    """Host and port of the viewer tev, see `tev.address`."""
+    try:
+        return tev.address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def definition(text: str) -> tuple[str, str]:

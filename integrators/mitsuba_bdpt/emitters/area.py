@@ -17,6 +17,7 @@ from ..geometry.mitsubas_choices import (
     is_textured,
 )
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
+from ..host import renamed
 from ..host.introspection import children, named, number, own_parameters
 from .emission_tables import PLAIN, EmissionGuide, Factor, Place
 from .group import Context, Group, weight_over
@@ -396,7 +397,7 @@ def _check_coordinates(emitter):
     """Raise ``UsageError`` for a texture on a mesh that has no texture coordinates."""
     shape = emitter.get_shape()
     # Of the parameters: a shape that Python first met as an emitter's has no methods of meshes.
-    if shape.shape_type() == mi.ShapeType.Mesh.value and not len(own_parameters(shape)["vertex_texcoords"]):
+    if shape.shape_type() == mi.ShapeType.Mesh.value and not renamed.has_coordinates(own_parameters(shape)):
         raise UsageError(
             f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
             f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..host import renamed
 from ..host.introspection import own_parameters
 from .emission_tables import Factor
 
@@ -195,8 +196,8 @@ def boxes(scene) -> list:
     for shape in scene.shapes():
         box = mi.ScalarBoundingBox3f(shape.bbox())
         params = own_parameters(shape) if shape.is_mesh() else {}
-        if "vertex_positions" in params:
-            vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
+        if renamed.holds_a_mesh(params):
+            vertices = np.array(renamed.positions(params)).reshape(-1, 3)
             vertices = vertices[np.isfinite(vertices).all(axis=1)]
             box = mi.ScalarBoundingBox3f()
             for corner in (vertices.min(axis=0), vertices.max(axis=0)) if len(vertices) else ():

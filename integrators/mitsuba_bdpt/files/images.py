@@ -5,13 +5,16 @@ from __future__ import annotations
 import errno
 import re
 from collections.abc import Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 
 from ..errors import CommandError
+from ..image.layers import DENOISED
 from .whole import MAGIC, check_format, check_writable, replacing
 
 PNG_SIDE = 1_000_000
@@ -75,9 +78,24 @@ def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exp
     for key, value in attributes.items():
         image.metadata()[key] = value
     write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
+    write_png(film, output.with_suffix(".png"), exposure)
+
+
+def write_png(film: mi.Film, path: Path, exposure: float) -> None:
+    """Write the film's picture for a screen."""
+    write_whole(developed(screen_image(film), exposure), path, mi.Bitmap.FileFormat.PNG)
+
+
+def screen_image(film: mi.Film) -> mi.Bitmap:
+    """What of the film is shown on screens, linear: its colours, denoised if they are, or `grey`."""
+    bitmap = film.bitmap()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        bitmap = grey(pixels[..., : film.base_channels_count()])
-    write_whole(developed(bitmap, exposure), output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
+        return grey(np.array(bitmap)[..., : film.base_channels_count()])
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        parts = dict(bitmap.split())
+        is_denoised = all(name in {c.name for c in bitmap.struct_()} for name in DENOISED)
+        return parts["denoised"] if is_denoised else parts["<root>"]
+    return bitmap
 
 
 def grey(bands: np.ndarray) -> mi.Bitmap:
@@ -91,8 +109,6 @@ def grey(bands: np.ndarray) -> mi.Bitmap:
 
 def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
     """The picture for a screen: exposure, clipping to [0, 1] and the sRGB curve."""
-    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-        bitmap = next(part for name, part in bitmap.split() if name == "<root>")
     rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     bright = mi.Bitmap(mi.TensorXf(rgb) * 2.0**exposure, mi.Bitmap.PixelFormat.RGB)
     return bright.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
@@ -105,9 +121,23 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
     PNG is missing, and nobody hears of it.
     """
     stream = mi.MemoryStream()
-    bitmap.write(stream, file_format)
+    with two_threads():
+        bitmap.write(stream, file_format)
     with replacing(path) as temporary:
         temporary.write_bytes(stream.raw_buffer())
+
+
+@contextmanager
+def two_threads():
+    """Within, Dr.Jit has two threads at least: with one, Mitsuba waits for ever at an EXR."""
+    before = dr.thread_count()
+    if before < 2:
+        dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if before < 2:
+            dr.set_thread_count(before)
 
 
 def check_output(path: Path, suffix: str) -> None:

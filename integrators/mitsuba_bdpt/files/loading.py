@@ -30,6 +30,9 @@ NOT_CARRIED = {
 }
 """Integrators around another whose layers `bdpt` cannot have."""
 
+CROP = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+"""Parameters of a film's crop window."""
+
 AROUND = ("aov", *NOT_CARRIED)
 """Mitsuba's integrators around another one."""
 
@@ -100,6 +103,11 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
             f"variant={options.variant!r} is not one of Mitsuba's: {known}; {question}".rstrip("; ")
         )
     check_file(options.scene)
+    for folder in options.append:
+        if not folder.is_dir():
+            raise CommandError(
+                f"append={str(folder)!r} is no folder; give one that holds files of the scene."
+            )
     try:
         mi.set_variant(options.variant)
     except ImportError as error:
@@ -108,6 +116,8 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
             "use an LLVM variant, for example llvm_ad_rgb."
         ) from error
     mi.file_resolver().prepend(str(options.scene.resolve().parent))
+    for folder in options.append:
+        mi.file_resolver().append(str(folder.resolve()))
     try:
         return _load(options)
     except RuntimeError as error:
@@ -129,16 +139,19 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     state = mi.parser.parse_file(config, str(options.scene), **defines)
     _check_root(state, options.scene)
     _check_film_sizes(state)
+    for film in _films(state):
+        set_film_size(film.props, options.size, options.crop)
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     kind = mi.ObjectType.Integrator
     node = next((node for node in state.nodes if node.type == kind), None)
+    used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
+    for name in ("target_error", "denoise"):
+        if getattr(options, name) and used != "bdpt":
+            raise CommandError(f"{name} is for the integrator bdpt, not for {used}; use --integrator bdpt.")
     if options.target_error is not None:
-        used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
-        if used != "bdpt":
-            raise CommandError(
-                f"target_error is for the integrator bdpt, not for {used}; use --integrator bdpt."
-            )
         overrides |= {"target_error": options.target_error, "variance": True}
+    if options.denoise:
+        overrides["denoise"] = True
     around = options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator)
     if around and (options.integrator != "aov" or not overrides.get("aovs")):
         raise CommandError(
@@ -184,12 +197,43 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
         )
 
 
+def _films(state: mi.parser.ParserState) -> list:
+    """The nodes of all films."""
+    return [node for node in state.nodes if node.type == mi.ObjectType.Film]
+
+
 def _check_film_sizes(state: mi.parser.ParserState) -> None:
     """Raise ``CommandError`` for films without pixels, of which Mitsuba says that they see too much."""
-    for node in state.nodes:
-        for name in ("width", "height") if node.type == mi.ObjectType.Film else ():
+    for node in _films(state):
+        for name in ("width", "height"):
             if isinstance(size := node.props.get(name, 1), int) and size < 1:
                 raise CommandError(f"{name}={size} of the film must be 1 or more pixels.")
+
+
+def set_film_size(film: mi.Properties, size: Sequence[int] | None, crop: Sequence[int] | None) -> None:
+    """Give a ``film`` another ``size`` (width, height), and a ``crop`` window (x, y, width, height).
+
+    Raises ``CommandError`` if the window is not within the image, or was made for another size.
+    """
+    of_scene = [name for name in CROP if name in film]
+    if size is not None:
+        if of_scene and crop is None:
+            raise CommandError(
+                f"size={size[0]}x{size[1]} is for a film with a crop window ({of_scene[0]}="
+                f"{film[of_scene[0]]}), which is one of the scene's own size; give --crop X,Y,W,H too."
+            )
+        film["width"], film["height"] = size
+    if crop is None:
+        return
+    # Mitsuba's own size where a film names none.
+    width, height = int(film.get("width", 768)), int(film.get("height", 576))
+    if crop[0] + crop[2] > width or crop[1] + crop[3] > height:
+        raise CommandError(
+            f"crop={','.join(map(str, crop))} is not within the image of {width}x{height} pixels; give "
+            "X,Y,W,H."
+        )
+    for name, value in zip(CROP, crop, strict=True):
+        film[name] = value
 
 
 def check_file(scene: Path) -> None:

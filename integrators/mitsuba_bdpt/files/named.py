@@ -8,14 +8,17 @@ from pathlib import Path
 from .loading import elements
 
 
-def named_files(scene: Path, definitions: Iterable[tuple[str, str]] = ()) -> list[Path]:
+def named_files(
+    scene: Path, definitions: Iterable[tuple[str, str]] = (), folders: Iterable[Path] = ()
+) -> list[Path]:
     """Files that a scene file names, and those that named scene files name, each once.
 
     Meshes, textures, spectra and scene files, as far as they exist; raises ``CommandError`` if one of the
-    scene files is not XML. ``definitions`` of parameters, for names that hold some.
+    scene files is not XML. ``definitions`` of parameters, for names that hold some; ``folders`` in which
+    Mitsuba looks too.
     """
     found = {}
-    _note_files(scene, dict(definitions), [Path()], found)
+    _note_files(scene, dict(definitions), [Path(), *folders], found)
     return list(found)
 
 

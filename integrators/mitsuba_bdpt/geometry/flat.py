@@ -5,6 +5,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from ..host import renamed
 from ..host.introspection import own_parameters
 
 # Of unit normals: 1 - cos up to which they are one. (Rounding of vertices is some 1e-14.)
@@ -19,9 +20,9 @@ def is_flat(shape: mi.Shape) -> bool:
         return False
     # Of parameters: a shape that Python first met as an emitter's has no methods of meshes.
     params = own_parameters(shape)
-    faces, vertices, normals = (
-        np.array(params[name], dtype=kind).reshape(-1, 3)
-        for name, kind in (("faces", np.int64), ("vertex_positions", float), ("vertex_normals", float))
+    faces = np.array(renamed.faces(params), dtype=np.int64).reshape(-1, 3)
+    vertices, normals = (
+        np.array(of(params), dtype=float).reshape(-1, 3) for of in (renamed.positions, renamed.normals)
     )
     if not len(faces) or faces.max() >= len(vertices):
         return False

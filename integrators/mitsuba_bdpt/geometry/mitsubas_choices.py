@@ -38,6 +38,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UnsupportedError
+from ..host import renamed
 from ..host.introspection import children, named, number
 from .quadrics import Sphere, sphere_normal
 
@@ -164,7 +165,7 @@ def _seen(shape, ps):
     height = dr.opaque(mi.Float, 1e-3 * max(shape.bbox().extents()))
     ray = mi.Ray3f(ps.p + height * ps.n, -mi.Vector3f(ps.n))
     # Shape.ray_intersect fails where the scene has a shapegroup of two kinds of shapes.
-    return shape.compute_surface_interaction(ray, shape.ray_intersect_preliminary(ray), mi.RayFlags.All)
+    return shape.compute_surface_interaction(ray, shape.ray_intersect_preliminary(ray), renamed.hit_flags())
 
 
 def _differ(sampled, stated):

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
 from .quadrics import ROUND, outward_sign
 
@@ -171,9 +172,9 @@ def reaches(shape: mi.Shape) -> np.ndarray:
     if kind in _WHOLE:
         return np.array([_finite(np.abs([shape.bbox().min, shape.bbox().max]).max())])
     params = own_parameters(shape) if shape.is_mesh() else {}
-    if "vertex_positions" not in params or not len(params["faces"]):
+    if not renamed.holds_a_mesh(params) or not len(renamed.faces(params)):
         return np.zeros(1)
-    found = _reaches_of_triangles(params["vertex_positions"], params["faces"])
+    found = _reaches_of_triangles(renamed.positions(params), renamed.faces(params))
     # Hits on ellipsoids tell the number of the ellipsoid, not that of the triangle.
     return found.max(keepdims=True) if kind == mi.ShapeType.EllipsoidsMesh.value else found
 

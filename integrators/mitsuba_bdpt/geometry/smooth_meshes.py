@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
+from ..host import renamed
 from ..host.introspection import named, own_parameters
 from .mitsubas_choices import CHECKED, OFF, spread_points
 
@@ -64,7 +65,8 @@ class SmoothMeshes:
             raise UsageError(
                 f"{off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
                 "or measures, are not on the faces that its areas tell: after an edit of faces Mitsuba keeps "
-                "its table of areas; update vertex_positions with them, or load the scene anew"
+                f"its table of areas; update {' or '.join(renamed.POSITIONS)} with them, or load the scene "
+                "anew"
             )
 
     def normal(self, n, index, u, active):
@@ -108,7 +110,7 @@ class _Faces:
             return None
         length = np.linalg.norm(cross, axis=1)
         params = own_parameters(shape)
-        faces, positions = mi.UInt32(params["faces"]), mi.Float(params["vertex_positions"])
+        faces, positions = renamed.faces(params), renamed.positions(params)
         index = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, len(cross)))
         a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in index)
         # As Mesh::build_pmf of Mitsuba, rounding included.
@@ -127,11 +129,11 @@ def _curved_faces(shape):
         return None
     params = own_parameters(shape)
     # Neither a rectangle (flat, without vertices) nor a mesh without normals at its vertices.
-    if "vertex_positions" not in params or not len(params["vertex_normals"]):
+    if not renamed.holds_a_mesh(params) or not len(renamed.normals(params)):
         return None
-    faces = np.array(params["faces"]).reshape(-1, 3)
-    p = np.array(params["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-    n = np.array(params["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+    faces = np.array(renamed.faces(params)).reshape(-1, 3)
+    p = np.array(renamed.positions(params), dtype=np.float64).reshape(-1, 3)
+    n = np.array(renamed.normals(params), dtype=np.float64).reshape(-1, 3)
     if faces.max(initial=0) >= len(p):
         raise UsageError(
             f"the emitting mesh {named(shape)} has a face with vertex {faces.max()} of {len(p)}; "

@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
+from . import denoising
 from .block import Block
 from .channels import Channels
 from .layers import image_count, layer_names, strategies, strategy_count, strategy_index
@@ -46,8 +47,9 @@ class Accumulator:
         self.rfilter = film.rfilter()
         self.variance, self.replicates = variance, Replicates()
         names = features.names if features else []
-        colour.prepare(layer_names(depth, variance, names, colour.names, merges))
-        self._channels = Channels.of(film, len(colour.names), len(names))
+        guides = features is not None and features.guides
+        colour.prepare(layer_names(depth, variance, names, colour.names, merges, guides))
+        self._channels = Channels.of(film, len(colour.names), features.count if features else 0)
         self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf)
         # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
@@ -191,7 +193,7 @@ class Accumulator:
         return high - np.interp(-self.border - centre, edges, cumulative)
 
     def finish(self):
-        """Store the result of the passes so far in the film."""
+        """Store the result of the passes so far in the film, in the place of what was stored before."""
         sums, passes = self._done
         if not passes:
             return
@@ -200,6 +202,8 @@ class Accumulator:
         to_film = pixels.weight / self._splat_weight(spp)[..., None]
         colours = np.concatenate([pixels.colours + pixels.light * to_film, pixels.alpha], axis=-1)
         layers = [pixels.features]
+        if self.features is not None and self.features.guides:
+            layers = self._denoised(pixels, colours)
         if self.variance:
             layers.append(self.replicates.variance(spp, pixels.colours.shape) * pixels.weight)
         if self.depth:
@@ -207,7 +211,17 @@ class Accumulator:
         parts = self.colour.stored(colours, pixels.weight, layers)
         values = np.concatenate(parts, axis=-1).astype(np.float32)
         block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
+        self.film.clear()  # of what was stored before
         self.film.put_block(block)
+
+    def _denoised(self, pixels: _Pixels, colours) -> list:
+        """The features that are layers of the film, and the image of these ``colours`` without noise."""
+        shown, guides = np.split(pixels.features, [len(self.features.names)], axis=-1)
+        # A pixel without samples (of a filter that is negative somewhere) has nothing to be divided.
+        weight = np.where(pixels.weight == 0, 1, pixels.weight)
+        image, guides = colours[..., : self._channels.colours] / weight, guides / weight
+        found = denoising.denoised(image, guides[..., denoising.ALBEDO], guides[..., denoising.NORMAL])
+        return [shown, found * pixels.weight]
 
     def _strategy_layers(self, sums, to_film) -> list:
         """The strategy images in the order of their layers; ``to_film``: what splats are multiplied by."""

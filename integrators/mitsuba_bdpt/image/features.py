@@ -20,6 +20,7 @@ import mitsuba as mi
 from ..errors import UsageError, did_you_mean
 from ..sampling.points import Purpose
 from ..sensors.records import Region
+from .denoising import GUIDES
 
 # What ``aov`` of Mitsuba 3.9.1 knows.
 KINDS = (
@@ -76,12 +77,17 @@ def _plugin(aovs: str):
 
 
 class FeatureLayers:
-    """The layers ``names`` of one render of ``spp`` samples per pixel; ``aovs`` must not be empty."""
+    """The layers ``names`` of a render of ``spp`` samples per pixel, and a denoiser's ``guides`` after them.
 
-    def __init__(self, scene, sensor, aovs: str, spp: int):
-        self._scene, self._sensor, self._plugin = scene, sensor, _plugin(aovs)
-        self.names = self._plugin.aov_names()
-        self._may_be_undefined = _may_be_undefined(aovs)
+    There must be some: ``aovs`` or `denoising.GUIDES`. ``count`` of all; guides are no layers of the film.
+    """
+
+    def __init__(self, scene, sensor, aovs: str, spp: int, guides: bool = False):
+        asked = f"{aovs},{GUIDES}" if guides else aovs
+        self._scene, self._sensor, self._plugin = scene, sensor, _plugin(asked)
+        self.names, self.guides = feature_names(aovs), guides
+        self.count = len(self._plugin.aov_names())
+        self._may_be_undefined = _may_be_undefined(asked)
         self._region = Region(sensor.film())
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+# Names of the layers of a denoised image.
+DENOISED = ("denoised.R", "denoised.G", "denoised.B")
+
 
 def strategies(depth: int):
     """All ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, in order: k + 2 of each length."""
@@ -25,14 +28,15 @@ def strategy_index(s, t):
 
 
 def layer_names(
-    depth: int, variance: bool, features=(), colours=("R", "G", "B"), merges: bool = False
+    depth: int, variance: bool, features=(), colours=("R", "G", "B"), merges: bool = False, denoise=False
 ) -> list[str]:
     """Names of the film's layers, in the order in which `Accumulator` keeps them.
 
-    ``features``, the variance of the pixels in the film's ``colours``, and technique images of paths of up to
-    ``depth`` edges, with one of all ``merges`` if there are some.
+    ``features``, those of ``denoise``, the variance of the pixels in the film's ``colours``, and technique
+    images of paths of up to ``depth`` edges, with one of all ``merges`` if there are some.
     """
-    names = [*features, *(f"variance.{colour}" for colour in colours if variance)]
+    names = [*features, *(DENOISED if denoise else ())]
+    names += [f"variance.{colour}" for colour in colours if variance]
     of_strategies = [f"s{s}t{t}" for _, s, t in strategies(depth)] + ["merged"] * merges
     return names + [
         f"{kind}.{strategy}.{channel}"

@@ -14,6 +14,7 @@ import gc
 import drjit as dr
 import mitsuba as mi
 
+from ..host import renamed
 from ..host.jit import evaluated_mode
 from ..image import sink
 from ..run import rendering, schedule
@@ -100,7 +101,7 @@ class Pass:
                 dr.eval(self._scene.ray_test(ray, active=active))
                 continue
             pi = self._scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            si = pi.compute_surface_interaction(ray, renamed.hit_flags(), active)
             # A sum of what a path needs, so that nothing is left out and little is written.
             dr.eval(si.p.x + si.p.y + si.p.z + si.n.x + si.sh_frame.n.x + si.uv.x + si.wi.x + si.t)
 

@@ -91,7 +91,7 @@ class Sweep:
     def run(self, progress: Progress, elsewhere=None):
         """Render all that is not there yet, showing ``progress``.
 
-        On a cluster if ``elsewhere``, a client and the preset's text, is given.
+        On a cluster if ``elsewhere``, a `workers.Cluster` and the preset's text, is given.
         """
         scenes, todo = self.scenes, self._todo
         probed = 0 if elsewhere else len(self.preset.probes)
@@ -136,7 +136,7 @@ class Sweep:
             self._judges[cells.where()] = judge_of(*cells.where())
         store(self.output, cell, *result, self._judges[cells.where()])
 
-    def _remote(self, client, preset: str, scenes: list[Cells], todo: list[list[Cell]]):
+    def _remote(self, cluster, preset: str, scenes: list[Cells], todo: list[list[Cell]]):
         """Render the cells of ``todo``, and those that follow from them, on a cluster."""
         root = str(self.project.root.resolve())
         while any(
@@ -151,7 +151,7 @@ class Sweep:
                 (root, preset, cells.subject.name, [asdict(cell) for cell in group])
                 for cells, group in groups
             ]
-            for index, results in workers.results(client, measured, calls):
+            for index, results in workers.results(cluster, measured, calls):
                 cells, group = groups[index]
                 for cell, result in zip(group, results, strict=True):
                     if isinstance(result, str):
@@ -263,8 +263,8 @@ def run(options: Namespace) -> int:
     sweep.prepare(options.reference_seconds)
     with showing.bar() as progress:
         if options.scheduler:
-            with workers.connected(options.scheduler) as client:
-                sweep.run(progress, (client, file.read_text()))
+            with workers.connected(options.scheduler) as cluster:
+                sweep.run(progress, (cluster, file.read_text()))
         else:
             sweep.run(progress)
     table = sweep.rows()

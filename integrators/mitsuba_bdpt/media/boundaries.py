@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
+from ..host import renamed
 from .media import Space
 
 
@@ -20,7 +21,7 @@ def behind(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, m
     going, arrived = mi.Bool(True), mi.Bool(False)
     while dr.hint(going, label="media up to the end of a ray", exclude=[space, ray, medium]):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
-        si = space.scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
+        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
         hit = going & si.is_valid()
         arrived |= going & ~hit
         passed = hit & ~dr.all(space.null_transmission(si, hit) == 0)

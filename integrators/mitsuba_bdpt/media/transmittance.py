@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..geometry import rays
 from ..geometry.rounding import met
+from ..host import renamed
 from . import tracking
 from .media import Media, Space, depth_of, of_depth
 
@@ -94,7 +95,7 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
     segments, collisions = mi.UInt32(0), mi.UInt32(0) if media.grids else None
     while dr.hint(going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
-        si = scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
+        si = scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
         hit = going & si.is_valid() & ~_is_end(si, own, ray.maxt - left + si.t)
         length = dr.select(hit, si.t, left)
         passed, of_segment, word, met_here = _along(media, medium, segment, length, word, going)

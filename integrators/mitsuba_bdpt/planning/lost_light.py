@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import rays
+from ..host import renamed
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..scene.prepared import PreparedScene
@@ -307,7 +308,7 @@ def _follow(
 
     def body(walk: _Walk, generator: PCG32, ends: _Ends) -> tuple[_Walk, PCG32, _Ends]:
         ray, weight = walk.ray, walk.weight
-        si = prepared.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=walk.active)
+        si = prepared.scene.ray_intersect(ray, renamed.hit_flags(), coherent=False, active=walk.active)
         active = walk.active & si.is_valid()
         distance = walk.distance + dr.select(active, si.t, 0)
         surface = si.bsdf()

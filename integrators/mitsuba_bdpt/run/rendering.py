@@ -47,8 +47,9 @@ from .work import Meter
 class PassReport:
     """Progress after a pass: samples per pixel, seconds and rays so far.
 
-    ``error``: the relMSE estimated when ``target_error`` was last looked at, else ``None``; ``snapshot()``,
-    of the newest report: what a later render can start from."""
+    ``error``: the relMSE estimated when ``target_error`` was last looked at, else ``None``. Of the newest
+    report: ``snapshot()``, what a later render can start from, and ``image()``, the image so far as `render`
+    returns it, which is stored in the film, too."""
 
     spp_done: int
     spp_total: int
@@ -56,6 +57,7 @@ class PassReport:
     rays: int
     error: float | None
     snapshot: Callable[[], Snapshot]
+    image: Callable[[], mi.TensorXf]
 
 
 class Render:
@@ -82,7 +84,9 @@ class Render:
         self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         aims = self.plan.merging or self.plan.guidable
         self.aim = Aim.of(scene, self.prepared.emitters) if aims else None
-        features = FeatureLayers(scene, sensor, settings.aovs, spp) if feature_names(settings.aovs) else None
+        features = None
+        if settings.denoise or feature_names(settings.aovs):
+            features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
         border = self.prepared.camera.region.border
         strategies = settings.strategy_depth, settings.merge_images
         self.accumulator = Accumulator(
@@ -278,10 +282,9 @@ class Render:
     def report(self) -> PassReport:
         """Progress so far, for ``on_pass``."""
         self._state = self._freeze()
-        snapshot, seconds = partial(self._snapshot, len(self.passes)), self.meter.work.seconds
-        return PassReport(
-            sum(self.passes), self.spp, seconds, sum(rays(self).values()), self._error, snapshot
-        )
+        done, counts = len(self.passes), sum(rays(self).values())
+        made = partial(self._snapshot, done), partial(self._image, done)
+        return PassReport(sum(self.passes), self.spp, self.meter.work.seconds, counts, self._error, *made)
 
     def _freeze(self) -> tuple[tuple[int, ...], Progress, dict]:
         """Passes, progress and arrays of a snapshot of now, also when the next pass has begun.
@@ -306,6 +309,17 @@ class Render:
         passes, progress, arrays = state
         arrays = {name: np.array(a, dtype=np.float64) for name, a in arrays.items()}
         return Snapshot(self._identity(), passes, progress, arrays)
+
+    def _image(self, reported: int):
+        """The image of the report after so many passes; raises `UsageError` as `_snapshot` does."""
+        if len(self.passes) != reported:
+            raise UsageError(
+                f"image() of the report after {reported} passes came too late; only the newest report has one"
+            )
+        self.accumulator.finish()
+        image = self.sensor.film().develop()
+        dr.eval(image)
+        return image
 
     def _identity(self) -> dict:
         """See `snapshot.identity`."""

@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from ..emitters.records import Direct
 from ..geometry import rays
+from ..host import renamed
 from ..media import flight
 from ..sampling.points import Purpose
 from ..sensors.records import CameraJoin
@@ -252,7 +253,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
     landing = tr = volume = None
     if kernel.space is None:
-        si = walk.pi.compute_surface_interaction(ray, mi.RayFlags.All, walk.active)
+        si = walk.pi.compute_surface_interaction(ray, renamed.hit_flags(), walk.active)
         hit = walk.active & si.is_valid()
         throughput = walk.throughput
     else:
@@ -320,7 +321,7 @@ def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream) -> flight.Land
 
 def _landed(landing: flight.Landing, ray, active) -> mi.SurfaceInteraction3f:
     """The surface at the end of an edge, or a point in the medium as one without normal and shape."""
-    si = landing.pi.compute_surface_interaction(ray, mi.RayFlags.All, active & ~landing.collided)
+    si = landing.pi.compute_surface_interaction(ray, renamed.hit_flags(), active & ~landing.collided)
     point = dr.zeros(mi.SurfaceInteraction3f)
     point.p, point.t, point.time, point.wavelengths = ray(landing.t), landing.t, ray.time, ray.wavelengths
     point.sh_frame, point.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)

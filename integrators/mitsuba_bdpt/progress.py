@@ -1,0 +1,192 @@
+"""What a render shows of its progress: a bar, lines for a log, or what farms read.
+
+A display is a function that a render calls with a `run.rendering.PassReport` after each pass::
+
+    integrator.on_pass = mitsuba_bdpt.progress.Bar()  # on a terminal or in a notebook
+    mi.render(scene, integrator=integrator, spp=4096)
+
+Each knows by ``limit`` (seconds; None without one) when a render will be stopped for time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from typing import Protocol, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+# Seconds between two lines of a log, at least, and as a share of those that the render has taken.
+EVERY, SHARE = 10.0, 0.02
+
+# A total of so many samples per pixel stands for as many as time allows.
+OPEN_ENDED = 1 << 16
+
+
+class Report(Protocol):
+    """What displays ask of a `PassReport`."""
+
+    @property
+    def spp_done(self) -> int: ...
+    @property
+    def spp_total(self) -> int: ...
+    @property
+    def seconds(self) -> float: ...
+    @property
+    def rays(self) -> int: ...
+
+
+def share_done(report: Report, limit: float | None = None) -> float:
+    """Share of the render that is done, of its samples or of the time that limits it, from 0 to 1."""
+    done = report.spp_done / report.spp_total
+    if limit:
+        done = max(done, report.seconds / limit)
+    return min(done, 1.0)
+
+
+def seconds_left(report: Report, limit: float | None = None) -> float:
+    """Seconds that the rest of the render is expected to take."""
+    left = report.seconds * (report.spp_total / max(report.spp_done, 1e-9) - 1)
+    return max(0.0, min(left, limit - report.seconds)) if limit else left
+
+
+def in_words(report: Report, limit: float | None = None) -> str:
+    """Samples per pixel, rays per second, what is left, and the estimated error if there is one."""
+    open_ended = report.spp_total == OPEN_ENDED
+    rate = readable(report.rays / max(report.seconds, 1e-9))
+    text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp, {rate} rays/s"
+    if limit or not open_ended:
+        text += f", {seconds_left(report, limit):.0f} s left"
+    error = getattr(report, "error", None)
+    return text if error is None else f"{text}, relMSE {error:.2g}"
+
+
+def readable(number: float) -> str:
+    """A number to three digits with a unit prefix."""
+    for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if number >= limit:
+            return f"{number / limit:.3g}{unit}"
+    return f"{number:.3g}"
+
+
+def _say(line: str, stream: TextIO | None) -> None:
+    """Print a ``line``, as long as somebody listens: the render must not end with them."""
+    if stream is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(line, file=stream, flush=True)
+
+
+class Bar:
+    """A bar, on standard error of a terminal or under the cell of a notebook; silent elsewhere.
+
+    ``console``: where else. `close` ends it; the last pass of a render does so too.
+    """
+
+    def __init__(self, limit: float | None = None, console: Console | None = None):
+        console = console or Console(stderr=True)
+        shown = console.is_terminal or console.is_jupyter
+        columns = BarColumn(), TextColumn("{task.description}")
+        # Nothing is drawn between passes: a thread would go on for ever after a render that was interrupted.
+        self._bar = Progress(
+            *columns, console=console, transient=not console.is_jupyter, auto_refresh=False, disable=not shown
+        )
+        self._limit = limit
+        self._task = self._bar.add_task("rendering", total=1.0)
+        self._begun = False
+
+    @property
+    def description(self) -> str:
+        """What stands beside the bar."""
+        return self._bar.tasks[0].description
+
+    @property
+    def completed(self) -> float:
+        """Share of the bar that is filled."""
+        return self._bar.tasks[0].completed
+
+    def __call__(self, report: Report) -> None:
+        if not self._begun:
+            self._bar.start()
+            self._begun = True
+        done = share_done(report, self._limit)
+        self._bar.update(self._task, completed=done, description=in_words(report, self._limit))
+        self._bar.refresh()
+        if report.spp_done >= report.spp_total:
+            self.close()
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._begun:
+            self._bar.stop()
+        self._begun = False
+
+
+class Lines:
+    """A line for a log now and then: time, samples, share, what is left.
+
+    The first after `EVERY` seconds, so that short renders are silent; later ones after `SHARE` of the time
+    that the render has taken.
+    """
+
+    def __init__(self, limit: float | None = None, stream: TextIO | None = None, every: float = EVERY):
+        self._limit, self._stream, self._every = limit, stream or sys.stderr, every
+        self._last = time.monotonic()
+
+    def __call__(self, report: Report) -> None:
+        now = time.monotonic()
+        if now - self._last < max(self._every, SHARE * report.seconds):
+            return
+        self._last = now
+        minutes, seconds = divmod(int(report.seconds), 60)
+        clock = f"{minutes // 60:02d}:{minutes % 60:02d}:{seconds:02d}"
+        done = share_done(report, self._limit)
+        _say(f"{clock} {done:4.0%} {in_words(report, self._limit)}", self._stream)
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+
+class Percentages:
+    """Whole per cents on standard output, for the schedulers of farms, each once.
+
+    In the words that Deadline's plugins look for (``Progress: 42%``) and those of Alfred, which OpenCue's and
+    others' logs know (``ALF_PROGRESS 42%``).
+    """
+
+    def __init__(self, limit: float | None = None, stream: TextIO | None = None):
+        self._limit, self._stream, self._last = limit, stream, -1
+
+    def __call__(self, report: Report) -> None:
+        percent = int(100 * share_done(report, self._limit))
+        if percent > self._last:
+            self._last = percent
+            _say(f"ALF_PROGRESS {percent}% Progress: {percent}%", self._stream or sys.stdout)
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+
+class Silent:
+    """Shows nothing."""
+
+    def __call__(self, report: Report) -> None:
+        """Nothing is shown."""
+
+    def close(self) -> None:
+        """Nothing is left to do."""
+
+
+Display = Bar | Lines | Percentages | Silent
+
+KINDS = ("auto", "bar", "lines", "deadline", "none")
+"""Names of displays on the command line."""
+
+
+def display(kind: str, limit: float | None = None) -> Display:
+    """The display of this name; ``auto``: a bar on a terminal, lines elsewhere."""
+    if kind == "auto":
+        kind = "bar" if Console(stderr=True).is_terminal else "lines"
+    made = {"bar": Bar, "lines": Lines, "deadline": Percentages}.get(kind)
+    return Silent() if made is None else made(limit)

@@ -1,0 +1,348 @@
+"""``render`` on a farm: signals, sizes, frames, more samples, what schedulers read."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+from mitsuba_bdpt.cli import render, values
+from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.cli.signals import TERMINATED
+from mitsuba_bdpt.run.snapshot import read
+
+SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
+SMALL = ["render", str(SCENE), "--size", "16x16", "-P", "spp_per_pass=4"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def image(path):
+    """The colours of an EXR file, and the statistics of its header."""
+    file = OpenEXR.File(str(path), separate_channels=True)
+    channels = file.channels()
+    return np.stack([channels[n].pixels for n in "RGB"], axis=-1), json.loads(file.header()["bdptStatistics"])
+
+
+def test_sigterm_ends_as_ctrl_c_does():
+    """Rationale: farms end renders by SIGTERM, and by SIGKILL some seconds later. Expected: what is done is
+    written, an image and a checkpoint, and the exit status is 128 + 15; a second signal changes nothing.
+    """
+    command = [sys.executable, "-m", "mitsuba_bdpt", *SMALL, "--spp", "4000000", "--checkpoint", "600"]
+    process = subprocess.Popen(
+        [*command, "-o", "ended.exr", "--preview", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while not Path("ended.png").exists() and time.monotonic() < deadline:  # the first pass is over
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == TERMINATED == 143, err
+    pixels, statistics = image("ended.exr")
+    assert statistics["interrupted"] and 0 < statistics["spp"] < 4000000 and np.all(np.isfinite(pixels))
+    assert out.rstrip().endswith("interrupted")
+    # The signal may come between the end of a pass and its report.
+    assert 0 < read(Path("ended.checkpoint.npz")).spp <= statistics["spp"]
+
+
+def test_a_finished_render_goes_on_with_more_samples(capsys):
+    """Expected: 8 and then 24 samples more are a render of 32, whose image is the mean of both parts, with
+    seeds of their own; both counts are its; then 32 more. What it has already is an error, and other
+    parameters are, before anything is rendered.
+    """
+    arguments = [*SMALL, "-o", "more.exr", "--checkpoint", "60", "--keep-checkpoint"]
+    assert main([*arguments, "--spp", "8"]) == 0
+    first, before = image("more.exr")
+    for others, words in (
+        (["--spp", "4"], "has 8 samples per pixel already"),
+        (["--spp", "32", "-P", "max_depth=3"], "its max_depth is"),
+        (["--spp", "32", "--size", "8x8"], "is of another scene"),
+    ):
+        assert main([*arguments, "--resume", *others]) == 1
+        assert words in capsys.readouterr().err
+    assert main([*arguments, "--resume", "--spp", "32"]) == 0
+    whole, after = image("more.exr")
+    kept = read(Path("more.checkpoint.npz"))
+    assert after["spp"] == 32 and kept.spp == 32 and len(set(kept.identity["seed"])) == 2
+    assert after["rays"]["camera"] > 3 * before["rays"]["camera"]
+    rest = (32 * whole - 8 * first) / 24
+    assert abs(rest.mean() / first.mean() - 1) < 0.1 and not np.allclose(rest, first, rtol=0.05)
+    assert main([*arguments, "--resume", "--spp", "64"]) == 0
+    assert (
+        image("more.exr")[1]["spp"] == 64
+        and len(set(read(Path("more.checkpoint.npz")).identity["seed"])) == 3
+    )
+    assert main([*arguments[:-1], "--resume", "--spp", "96"]) == 0
+    assert not Path("more.checkpoint.npz").exists()
+
+
+def test_what_is_kept_needs_checkpoints(capsys):
+    assert main([*SMALL, "--keep-checkpoint"]) == 1
+    assert "keep_checkpoint needs --checkpoint MINUTES" in capsys.readouterr().err
+
+
+def test_size_and_crop():
+    """Expected: the image's size and its proportions are those asked for; a crop window is that part of the
+    whole image, sample by sample.
+    """
+    arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "16"]
+    assert main([*arguments, "-o", "whole.exr"]) == 0
+    whole = image("whole.exr")[0]
+    assert whole.shape == (16, 24, 3)
+    assert (
+        main(["render", str(SCENE), "--size", "24x16", "--crop", "4,2,10,8", "--spp", "16", "-o", "part.exr"])
+        == 0
+    )
+    part = image("part.exr")[0]
+    assert part.shape == (8, 10, 3)
+    # Other points, the same picture.
+    assert abs(part.mean() / whole[2:10, 4:14].mean() - 1) < 0.1
+
+
+def test_sizes_that_are_refused(capsys):
+    Path("cropped.xml").write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><sensor type="perspective"><film type="hdrfilm">'
+        '<integer name="width" value="64"/><integer name="height" value="32"/>'
+        '<integer name="crop_width" value="8"/><integer name="crop_height" value="8"/>'
+        '<rfilter type="box"/></film></sensor></scene>'
+    )
+    for arguments, words in (
+        (
+            [str(SCENE), "--size", "16x16", "--crop", "8,8,9,8"],
+            "crop=8,8,9,8 is not within the image of 16x16",
+        ),
+        (["cropped.xml", "--size", "16x16"], "has a film with a crop window"[6:]),
+    ):
+        assert main(["render", *arguments]) == 1
+        assert words in capsys.readouterr().err
+    assert (
+        main(["render", "cropped.xml", "--size", "16x16", "--crop", "0,0,4,4", "--spp", "1", "-o", "a.exr"])
+        == 0
+    )
+    assert image("a.exr")[0].shape == (4, 4, 3)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--size", "16"], ["--size", "0x4"], ["--crop", "1,2,3"], ["--crop", "0,0,0,4"], ["--frames", "3-1"]]
+    + [["--frames", "x"], ["--frames", "0-4:0"], ["--threads", "0"]],
+    ids=" ".join,
+)
+def test_values_that_are_refused(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        build_parser().parse_args(["render", "scene.xml", *arguments])
+    assert ended.value.code == 2 and "must" in capsys.readouterr().err
+
+
+def test_ranges_of_frames():
+    assert values.frames("3") == [3] and values.frames("0-3") == [0, 1, 2, 3]
+    assert values.frames("0-10:5,7") == [0, 5, 10, 7]
+
+
+def sensors(count):
+    """A scene file with sensors that look at lamps of radiance 1, 2, ..."""
+    text = '<scene version="3.0.0">'
+    for i in range(count):
+        text += (
+            f'<sensor type="perspective"><transform name="to_world"><translate x="{100 * i}"/></transform>'
+            '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/>'
+            '<rfilter type="box"/></film></sensor><shape type="sphere">'
+            f'<point name="center" x="{100 * i}" y="0" z="0"/>'
+            '<float name="radius" value="3"/><boolean name="flip_normals" value="true"/>'
+            f'<emitter type="area"><rgb name="radiance" value="{i + 1}"/></emitter></shape>'
+        )
+    Path("frames.xml").write_text(text + "</scene>")
+
+
+def test_frames_are_sensors(capsys):
+    """Expected: an image of each, with its number in the name; a sensor that is not there, and options of one
+    image, are errors before any is rendered.
+    """
+    sensors(3)
+    assert main(["render", "frames.xml", "--frames", "0-2:2", "--spp", "2", "-o", "out/shot.exr"]) == 0
+    assert sorted(p.name for p in Path("out").glob("*.exr")) == ["shot.0000.exr", "shot.0002.exr"]
+    for number in (0, 2):
+        # Of few samples: a pixel may have a splat of its own.
+        assert abs(np.median(image(f"out/shot.{number:04d}.exr")[0]) / (number + 1) - 1) < 0.02
+    assert capsys.readouterr().out.count("\n") == 2
+    for arguments, words in (
+        (["--frames", "0-3"], "sensor=3 is not in the scene"),
+        (["--frames", "0", "-s", "1"], "frames together with sensor"),
+        (["--frames", "0", "--resume", "--checkpoint", "1"], "frames together with checkpoint"),
+    ):
+        assert main(["render", "frames.xml", "-o", "other.exr", *arguments]) == 1
+        assert words in capsys.readouterr().err
+    assert not list(Path().glob("other*"))
+
+
+def test_files_elsewhere(capsys):
+    """Expected: a texture in a folder that is appended is found, and is part of what a checkpoint belongs to;
+    a folder that is not there is an error.
+    """
+    Path("textures").mkdir()
+    Path("scene").mkdir()
+    mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write("textures/appended_sky.exr")
+    Path("scene/scene.xml").write_text(
+        '<scene version="3.0.0"><emitter type="envmap">'
+        '<string name="filename" value="appended_sky.exr"/></emitter>'
+        '<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>'
+        '<integer name="height" value="4"/></film></sensor></scene>'
+    )
+    arguments = ["render", "scene/scene.xml", "--spp", "1", "-o", "a.exr"]
+    assert main([*arguments, "-a", "nowhere"]) == 1
+    assert "append='nowhere' is no folder" in capsys.readouterr().err
+    assert main([*arguments, "-a", "textures"]) == 0
+    from mitsuba_bdpt.cli import checkpoints
+
+    options = build_parser().parse_args([*arguments, "-a", "textures"])
+    before = checkpoints.digest(options)
+    mi.Bitmap(np.full((2, 2, 3), 0.25, np.float32)).write("textures/appended_sky.exr")
+    assert checkpoints.digest(options) != before
+
+
+def test_threads_and_log(capfd):
+    """Expected: Dr.Jit has so many threads, and -v shows what the integrator logs."""
+    before, level = dr.thread_count(), mi.log_level()
+    try:
+        assert main([*SMALL, "--spp", "1", "--threads", "1", "-v"]) == 0
+        assert dr.thread_count() == 1 and mi.log_level() == mi.LogLevel.Info
+    finally:
+        dr.set_thread_count(before)
+        mi.set_log_level(level)
+    assert "bdpt: " in capfd.readouterr().out
+
+
+def test_version_names_mitsubas(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert re.fullmatch(r"mitsuba-bdpt \S+ \(mitsuba 3\.\S+, drjit \S+\)\n", capsys.readouterr().out)
+
+
+def test_progress_for_farms(capsys):
+    """Expected: per cents on standard output before the closing line, none twice, the last is 100."""
+    assert main([*SMALL, "--spp", "16", "--progress", "deadline", "-o", "a.exr"]) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    found = [int(re.fullmatch(r"ALF_PROGRESS (\d+)% Progress: \1%", line)[1]) for line in lines]
+    assert found == sorted(set(found)) and found[-1] == 100 and last.startswith("a.exr: ")
+
+
+def test_a_scheduler_that_does_not_answer_is_said_soon(capsys):
+    """Expected: of an address where nothing answers, though it can be reached, within some seconds."""
+    with socket.create_server(("127.0.0.1", 0), backlog=1) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        started = time.monotonic()
+        assert main([*SMALL, "--spp", "16", "--scheduler", address]) == 1
+        # Of loading the scene a second, of the scheduler three.
+        assert time.monotonic() - started < 10
+    assert "error: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_completion(shell, capsys):
+    """Expected: a script that knows commands and options."""
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "explain" in script and ("keep-checkpoint" in script or shell == "tcsh")
+
+
+def test_completion_without_shtab(capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["completion", "bash"]) == 2
+    assert "pip install shtab" in capsys.readouterr().err
+
+
+def test_a_preview_is_rewritten(monkeypatch):
+    """Expected: the PNG is there, with the image so far, before the EXR is; the last one is the EXR's."""
+    from mitsuba_bdpt.cli import live
+
+    seen, write = [], live.write_png
+
+    def noted(film, path, exposure):
+        write(film, path, exposure)
+        seen.append((Path(path).read_bytes(), Path("shown.exr").exists()))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(live, "write_png", noted)
+        assert main([*SMALL, "--spp", "12", "--preview", "0", "-o", "shown.exr"]) == 0
+    assert (
+        len(seen) > 2 and len({data for data, _ in seen}) == len(seen) and not any(done for _, done in seen)
+    )
+    assert os.path.exists("shown.exr")
+    last = np.array(mi.Bitmap("shown.png")).astype(int)
+    Path("last.png").write_bytes(seen[-1][0])
+    # Mitsuba dithers.
+    assert np.abs(np.array(mi.Bitmap("last.png")).astype(int) - last).max() <= 2
+
+
+def test_a_signal_while_the_image_is_written_changes_nothing(monkeypatch):
+    """Rationale: farms send a signal, and another one some seconds later, whatever is being done.
+
+    Expected: an image that is being written gets whole, and a finished render's checkpoint goes after that;
+    the exit status is that of the signal.
+    """
+    write = render.write_images
+
+    def interrupted(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert Path("a.checkpoint.npz").exists()
+        write(*arguments)
+
+    monkeypatch.setattr(render, "write_images", interrupted)
+    assert main([*SMALL, "--spp", "8", "-o", "a.exr", "--checkpoint", "0"]) == 130
+    assert image("a.exr")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
+
+
+def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, capsys):
+    """Rationale: disks are full in the end, not at the start. Expected: an error, and a checkpoint to go on
+    from, of which --resume writes the image at once.
+    """
+
+    def full(*arguments):
+        raise OSError(28, "No space left on device", "a.exr")
+
+    arguments = [*SMALL, "--spp", "8", "-o", "a.exr", "--checkpoint", "0"]
+    with monkeypatch.context() as patch:
+        patch.setattr(render, "write_images", full)
+        assert main(arguments) == 1
+    assert "No space left" in capsys.readouterr().err and Path("a.checkpoint.npz").exists()
+    assert main([*arguments, "--resume"]) == 0
+    assert image("a.exr")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
+
+
+def test_nobody_listens_any_more():
+    """Expected: a render whose standard output is closed writes its image and ends well."""
+    command = [
+        sys.executable,
+        "-m",
+        "mitsuba_bdpt",
+        *SMALL,
+        "--spp",
+        "8",
+        "--progress",
+        "deadline",
+        "-o",
+        "a.exr",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.close()
+    assert process.wait(timeout=120) == 0, process.stderr.read()
+    process.stderr.close()
+    assert image("a.exr")[1]["spp"] == 8

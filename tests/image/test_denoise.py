@@ -1,0 +1,122 @@
+"""Denoised images: ``denoise`` of the integrator, ``--denoise`` of the command."""
+
+import sys
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import OpenEXR
+import pytest
+import repository
+from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.errors import UnsupportedError, UsageError
+from mitsuba_bdpt.image import denoising
+from mitsuba_bdpt.measure.metrics import rel_mse
+
+SCENES = ("cornell_box", "glass_caustics", "veach_bidir", "ajar_door", "uplight_room", "open_sky")
+SIZE, SPP = 128, 16
+
+
+def layers(scene, sensor=0):
+    """Names of the film's channels after those of the colours."""
+    return [channel.name for channel in scene.sensors()[sensor].film().bitmap().struct_()]
+
+
+def guides(scene, spp=64):
+    """Albedo and normals of a scene as `denoising.GUIDES` has them, by Mitsuba's own plugin."""
+    made = mi.load_dict({"type": "aov", "aovs": denoising.GUIDES})
+    image = np.array(mi.render(scene, integrator=made, spp=spp, seed=7))
+    return image[..., -6:-3], image[..., -3:]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_it_does_to_the_error(name):
+    """Rationale: previews are to look finished, whoever has rendered them.
+
+    Expected: in six scenes of 16 samples per pixel the relMSE of the denoised image is at most three quarters
+    of the raw one's, of `path` as of bdpt; the colours are those of a render without the parameter. (Where
+    `path` misses light there is nothing to compare with. In `veach_mis` the denoiser makes halos about a lamp
+    whose radiance is a thousand times the image's mean: docs/reports/denoise.md.)
+    """
+    scene, depth = repository.load_scene(name, resolution=SIZE), repository.benchmark_depth(name)
+    expected = repository.load_reference(name, SIZE, depth).image
+    common = {"type": "bdpt", "max_depth": depth}
+    raw = np.array(mi.load_dict(common).render(scene, seed=1, spp=SPP))[..., :3]
+    both = np.array(mi.load_dict(common | {"denoise": True}).render(scene, seed=1, spp=SPP))
+    assert layers(scene)[-3:] == ["denoised.R", "denoised.G", "denoised.B"]
+    found = both[..., -3:]
+    assert np.all(np.isfinite(found)) and np.allclose(both[..., :3], raw, rtol=1e-4, atol=1e-5)
+    before, after = rel_mse(raw, expected), rel_mse(found, expected)
+    assert after < 0.75 * before, (before, after)
+    if name in ("cornell_box", "open_sky"):
+        path = np.array(mi.load_dict({"type": "path", "max_depth": depth}).render(scene, seed=1, spp=SPP))
+        found = denoising.denoised(path[..., :3], *guides(scene))
+        assert rel_mse(found, expected) < 0.75 * rel_mse(path[..., :3], expected)
+
+
+def test_other_layers_are_untouched():
+    """Expected: features, variance and strategies are where they were, with the same numbers; the layers come
+    after the features.
+    """
+    scene = repository.load_scene("cornell_box", resolution=16)
+    more = {"aovs": "albedo:albedo,dd:depth", "variance": True, "strategy_images": True, "max_depth": 3}
+    images = {}
+    for denoise in (False, True):
+        made = mi.load_dict({"type": "bdpt", "denoise": denoise, **more})
+        images[denoise] = np.array(made.render(scene, spp=16)), layers(scene)
+    (without, names), (image, more_names) = images[False], images[True]
+    first = names.index("variance.R")
+    assert more_names == [*names[:first], "denoised.R", "denoised.G", "denoised.B", *names[first:]]
+    kept = np.delete(image, slice(first, first + 3), axis=-1)
+    assert np.allclose(kept, without, rtol=1e-4, atol=1e-5)
+
+
+def test_a_film_that_keeps_alpha_or_luminance():
+    """Expected: three denoised channels, whatever the film makes of the colours; alpha is no colour."""
+    for pixel_format, channels in (("rgba", 4), ("luminance", 1)):
+        described = mi.cornell_box()
+        described["sensor"]["film"] |= {"width": 16, "height": 16, "pixel_format": pixel_format}
+        scene = mi.load_dict(described)
+        image = np.array(mi.load_dict({"type": "bdpt", "denoise": True}).render(scene, spp=4))
+        assert image.shape[-1] == channels + 3 and np.all(np.isfinite(image))
+        assert abs(image[..., -3:].mean() / image[..., :channels].mean() - 1) < (1 if channels == 4 else 0.5)
+
+
+def test_what_is_refused(monkeypatch):
+    """Expected: films of bands, and a package that is missing, are said before anything is rendered."""
+    described = mi.cornell_box()
+    described["sensor"]["film"] = {
+        "type": "specfilm",
+        "width": 8,
+        "height": 8,
+        "band": {"type": "regular", "wavelength_min": 400, "wavelength_max": 700, "values": "1, 1"},
+    }
+    made = mi.load_dict({"type": "bdpt", "denoise": True})
+    if mi.is_spectral:
+        with pytest.raises(UnsupportedError, match="denoise=True is not possible with film"):
+            made.render(mi.load_dict(described), spp=1)
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    with pytest.raises(UsageError, match=r"pip install 'mitsuba-bdpt\[denoise\]'"):
+        made.render(mi.load_dict(mi.cornell_box()), spp=1)
+
+
+def test_the_command(tmp_path, capsys):
+    """Expected: the EXR has the raw image and the denoised one, the PNG shows the latter; contradictions and
+    other integrators are refused.
+    """
+    scene = str(Path(repository.SCENES) / "cornell_box.xml")
+    arguments = ["render", scene, "--size", "32x32", "--spp", "4", "-o", str(tmp_path / "a.exr")]
+    assert main([*arguments, "--denoise"]) == 0
+    channels = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
+    raw, found = (np.stack([channels[p + c].pixels for c in "RGB"], axis=-1) for p in ("", "denoised."))
+    assert not np.allclose(raw, found, rtol=0.05)
+    shown = np.array(
+        mi.Bitmap(str(tmp_path / "a.png")).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    )
+    assert np.abs(shown - np.clip(found, 0, 1)).max() < 0.02 < np.abs(shown - np.clip(raw, 0, 1)).max()
+    for others, words in (
+        (["--integrator", "path"], "denoise is for the integrator bdpt, not for path"),
+        (["-P", "denoise=false"], "-P denoise=false together with --denoise"),
+    ):
+        assert main([*arguments, "--denoise", *others]) == 1
+        assert words in capsys.readouterr().err

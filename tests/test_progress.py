@@ -1,0 +1,109 @@
+"""What a render shows of its progress."""
+
+import io
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import progress
+from mitsuba_bdpt.errors import UsageError
+from rich.console import Console
+
+
+def report(done, total=100, seconds=2.0, rays=5_000_000, **more):
+    return SimpleNamespace(spp_done=done, spp_total=total, seconds=seconds, rays=rays, **more)
+
+
+def test_a_bar_shows_rate_and_time_left():
+    """Expected: words and length of the bar, for a render of so many samples and for one that time ends."""
+    bar = progress.Bar(console=Console(file=io.StringIO(), force_terminal=True))
+    bar(report(1, total=4))
+    assert bar.description == "1/4 spp, 2.5 M rays/s, 6 s left" and bar.completed == 0.25
+    bar.close()
+    bar = progress.Bar(8.0, Console(file=io.StringIO()))
+    bar(report(8, total=progress.OPEN_ENDED, rays=2000))
+    assert bar.description == "8 spp, 1 k rays/s, 6 s left" and bar.completed == 0.25
+
+
+def test_a_bar_is_drawn_on_terminals_alone():
+    """Expected: control sequences on a terminal, nothing in a file; the last pass takes the bar away."""
+    for is_terminal in (True, False):
+        stream = io.StringIO()
+        bar = progress.Bar(console=Console(file=stream, force_terminal=is_terminal, width=100))
+        for done in (50, 100):
+            bar(report(done))
+        assert ("50/100 spp" in stream.getvalue()) == is_terminal
+        bar.close()  # once more does nothing
+
+
+def test_lines_come_now_and_then(monkeypatch):
+    """Rationale: logs of farms are kept. Expected: nothing in the first ten seconds; then a line every ten,
+    and in long renders every fiftieth of their time.
+    """
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    lines = progress.Lines(stream=stream)
+
+    def at(seconds, done, **more):
+        now[0] = seconds
+        lines(report(done, seconds=seconds, rays=seconds * 10**6, **more))
+        return stream.getvalue().splitlines()
+
+    assert not at(9.0, 5)
+    assert at(11.0, 5) == ["00:00:11   5% 5/100 spp, 1 M rays/s, 209 s left"]
+    assert len(at(20.0, 9)) == 1 and len(at(22.0, 10, error=0.25)) == 2
+    assert at(22.0, 10)[-1].endswith(", relMSE 0.25")
+    assert len(at(3000.0, 60)) == 3 and len(at(3050.0, 61)) == 3 and len(at(3070.0, 61)) == 4
+
+
+def test_percentages_are_those_that_farms_read():
+    """Expected: each whole per cent once, in lines that the expressions of Deadline's plugins
+    (``.*Progress: (\\d+)%.*``) and of Alfred's readers (``ALF_PROGRESS\\s+([0-9]+)%``) find.
+    """
+    stream = io.StringIO()
+    show = progress.Percentages(10.0, stream)
+    for done, seconds in ((0.2, 0.01), (1, 0.1), (1.4, 0.1), (50, 1.0), (60, 9.0), (100, 9.5)):
+        show(report(done, seconds=seconds))
+    expected = [f"ALF_PROGRESS {n}% Progress: {n}%" for n in (0, 1, 50, 90, 100)]
+    assert stream.getvalue().splitlines() == expected
+
+
+def test_which_display(monkeypatch):
+    """Expected: of pytest, whose standard error is no terminal, lines, unless asked for something else."""
+    kinds = {"auto": "Lines", "bar": "Bar", "lines": "Lines", "deadline": "Percentages", "none": "Silent"}
+    for name in progress.KINDS:
+        shown = progress.display(name)
+        assert type(shown).__name__ == kinds[name]
+        shown(report(1))
+        shown.close()
+
+
+def test_a_report_has_the_image_so_far():
+    """Rationale: who watches a render wants to see it. Expected: the image of the first pass is what its
+    snapshot is assembled to; of the last pass the render's, whose film holds it once; of an older report
+    there is none any more.
+    """
+    scene = mi.load_dict(mi.cornell_box() | {"integrator": {"type": "path"}})
+    parameters = mi.traverse(scene)
+    parameters["sensor.film.size"] = [16, 16]
+    parameters.update()
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 4})
+    images, reports = [], []
+
+    def watch(report):
+        images.append(np.array(report.image()))
+        reports.append(report)
+        if len(reports) == 1:
+            first.append(report.snapshot())
+
+    first = []
+    integrator.on_pass = watch
+    expected = np.array(integrator.render(scene, spp=8))
+    assert len(images) > 1 and not np.array_equal(images[0], images[1])
+    assert np.allclose(images[-1], expected, rtol=1e-5, atol=1e-7)
+    with pytest.raises(UsageError, match="came too late"):
+        reports[0].image()
+    integrator.on_pass = None
+    assert np.allclose(integrator.assemble(first[0], scene), images[0], rtol=1e-5, atol=1e-7)
