@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections import deque
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from typing import Any
 
@@ -140,9 +141,9 @@ def results(cluster: Cluster, function, arguments):
 
 def _gone() -> tuple[type[BaseException], ...]:
     """What is raised where a scheduler is gone."""
-    from distributed.client import CancelledError, ClosedClientError, FutureCancelledError
+    from distributed.client import ClosedClientError
 
-    return CancelledError, ClosedClientError, FutureCancelledError
+    return CancelledError, ClosedClientError
 
 
 def _result(future, index: int):
