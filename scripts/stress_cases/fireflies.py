@@ -37,7 +37,8 @@ def _explained(name: str) -> Outcome:
     """The worst samples of a scene found anew."""
     depth = benchmark_depth(name)
     scene = load_scene(name, resolution=RESOLUTION)
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "photon_guiding": "never"})
+    unguided = {"photon_guiding": "never", "emission_guiding": "never"}
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth} | unguided)
     target = _target(name, depth)
     found = []
     for seed in range(1, SEEDS + 1):

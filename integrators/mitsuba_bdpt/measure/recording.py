@@ -149,7 +149,7 @@ def render(scene, integrator, least, spp: int, seed: int):
 
     They are all samples larger than ``least`` (of the image's shape) in one of the colours. Lanes keep one
     light subpath each (`Plan.joined`). Raises ``CommandError`` for a film of other colours, for `merging`,
-    where s = 0 is guided, and for decisions that join more.
+    where s = 0 or emission is guided, and for decisions that join more.
     """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -161,6 +161,8 @@ def render(scene, integrator, least, spp: int, seed: int):
     def trace(traced, image, batch, points, of):
         if traced.guide is not None:
             raise CommandError("paths that are guided are not looked at; set photon_guiding=never")
+        if traced.plan.emission is not None:  # whose densities nobody but the kernel knows
+            raise CommandError("paths whose emission is guided are not looked at; set emission_guiding=never")
         if traced.plan.joined > 1:
             raise CommandError(
                 "decisions: lanes with several light subpaths are not looked at; set joined=1 in them"
