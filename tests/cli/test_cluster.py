@@ -277,6 +277,7 @@ def test_a_farm_in_a_bad_night(tmp_path):
     finally:
         for process in processes:
             process.kill()
+            process.wait()
     assert len(seen) >= 24
     found, night = image(tmp_path / "night.exr")
     options = build_parser().parse_args([*command])
