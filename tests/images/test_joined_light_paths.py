@@ -353,11 +353,14 @@ def test_the_same_seed_gives_the_same_image():
 
 
 def test_single_samples_are_looked_at_one_light_subpath_at_a_time():
-    """Rationale: what replays a lane knows of one light subpath. Expected: the tool renders so by itself, and
-    refuses decisions that say otherwise.
+    """Rationale: what replays a lane knows of one light subpath, and of no tables of emission. Expected: the
+    tool renders so by itself, and refuses decisions that say otherwise, and tables.
     """
     scene = cornell()
     method = mi.load_dict({"type": "bdpt", "max_depth": 6})
+    with pytest.raises(Exception, match="set emission_guiding=never"):
+        recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "emission_guiding": "never"})
     recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)
     assert method.statistics["decisions"][0]["joined"] == 1
     method = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": decided()})
