@@ -72,7 +72,7 @@ def test_percentages_are_those_that_farms_read():
 
 def test_which_display(monkeypatch):
     """Expected: of pytest, whose standard error is no terminal, lines, unless asked for something else."""
-    kinds = {"auto": "Lines", "bar": "Bar", "lines": "Lines", "deadline": "Percentages", "none": "Silent"}
+    kinds = {"auto": "Lines", "bar": "Bar", "lines": "Lines", "deadline": "Percentages", "none": "Display"}
     for name in progress.KINDS:
         shown = progress.display(name)
         assert type(shown).__name__ == kinds[name]

@@ -13,10 +13,11 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from typing import Protocol, TextIO
+from typing import TYPE_CHECKING, Protocol, TextIO
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+# Not here: the command declares its options, and `doctor` runs, where rich is missing.
+if TYPE_CHECKING:
+    from rich.console import Console
 
 # Seconds between two lines of a log, at least, and as a share of those that the render has taken.
 EVERY, SHARE = 10.0, 0.02
@@ -78,13 +79,30 @@ def _say(line: str, stream: TextIO | None) -> None:
             print(line, file=stream, flush=True)
 
 
-class Bar:
+class Display:
+    """Shows nothing."""
+
+    def __init__(self, limit: float | None = None):
+        self._limit = limit
+
+    def __call__(self, report: Report) -> None:
+        """Show the ``report`` of a pass."""
+
+    def close(self) -> None:
+        """Take away what is shown."""
+
+
+class Bar(Display):
     """A bar, on standard error of a terminal or under the cell of a notebook; silent elsewhere.
 
     ``console``: where else. `close` ends it; the last pass of a render does so too.
     """
 
     def __init__(self, limit: float | None = None, console: Console | None = None):
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        super().__init__(limit)
         console = console or Console(stderr=True)
         shown = console.is_terminal or console.is_jupyter
         columns = BarColumn(), TextColumn("{task.description}")
@@ -92,7 +110,6 @@ class Bar:
         self._bar = Progress(
             *columns, console=console, transient=not console.is_jupyter, auto_refresh=False, disable=not shown
         )
-        self._limit = limit
         self._task = self._bar.add_task("rendering", total=1.0)
         self._begun = False
 
@@ -117,13 +134,12 @@ class Bar:
             self.close()
 
     def close(self) -> None:
-        """Take the bar away."""
         if self._begun:
             self._bar.stop()
         self._begun = False
 
 
-class Lines:
+class Lines(Display):
     """A line for a log now and then: time, samples, share, what is left.
 
     The first after `EVERY` seconds, so that short renders are silent; later ones after `SHARE` of the time
@@ -131,7 +147,8 @@ class Lines:
     """
 
     def __init__(self, limit: float | None = None, stream: TextIO | None = None, every: float = EVERY):
-        self._limit, self._stream, self._every = limit, stream or sys.stderr, every
+        super().__init__(limit)
+        self._stream, self._every = stream or sys.stderr, every
         self._last = time.monotonic()
 
     def __call__(self, report: Report) -> None:
@@ -144,11 +161,8 @@ class Lines:
         done = share_done(report, self._limit)
         _say(f"{clock} {done:4.0%} {in_words(report, self._limit)}", self._stream)
 
-    def close(self) -> None:
-        """Nothing is left to do."""
 
-
-class Percentages:
+class Percentages(Display):
     """Whole per cents on standard output, for the schedulers of farms, each once.
 
     In the words that Deadline's plugins look for (``Progress: 42%``) and those of Alfred, which OpenCue's and
@@ -156,7 +170,8 @@ class Percentages:
     """
 
     def __init__(self, limit: float | None = None, stream: TextIO | None = None):
-        self._limit, self._stream, self._last = limit, stream, -1
+        super().__init__(limit)
+        self._stream, self._last = stream, -1
 
     def __call__(self, report: Report) -> None:
         percent = int(100 * share_done(report, self._limit))
@@ -164,21 +179,6 @@ class Percentages:
             self._last = percent
             _say(f"ALF_PROGRESS {percent}% Progress: {percent}%", self._stream or sys.stdout)
 
-    def close(self) -> None:
-        """Nothing is left to do."""
-
-
-class Silent:
-    """Shows nothing."""
-
-    def __call__(self, report: Report) -> None:
-        """Nothing is shown."""
-
-    def close(self) -> None:
-        """Nothing is left to do."""
-
-
-Display = Bar | Lines | Percentages | Silent
 
 KINDS = ("auto", "bar", "lines", "deadline", "none")
 """Names of displays on the command line."""
@@ -187,6 +187,5 @@ KINDS = ("auto", "bar", "lines", "deadline", "none")
 def display(kind: str, limit: float | None = None) -> Display:
     """The display of this name; ``auto``: a bar on a terminal, lines elsewhere."""
     if kind == "auto":
-        kind = "bar" if Console(stderr=True).is_terminal else "lines"
-    made = {"bar": Bar, "lines": Lines, "deadline": Percentages}.get(kind)
-    return Silent() if made is None else made(limit)
+        kind = "bar" if sys.stderr is not None and sys.stderr.isatty() else "lines"
+    return {"bar": Bar, "lines": Lines, "deadline": Percentages, "none": Display}[kind](limit)

@@ -120,7 +120,7 @@ def results(cluster: Cluster, function, arguments):
             index, found = running[future], None
             try:
                 if future.cancelled():  # not by this function
-                    raise _gone()[0]
+                    raise CancelledError
                 if index not in done:
                     found = _result(future, index)
             except _gone():

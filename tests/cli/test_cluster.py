@@ -16,8 +16,8 @@ from types import SimpleNamespace
 import distributed
 import mitsuba as mi
 import numpy as np
-import OpenEXR
 import pytest
+import rendered
 from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.loading import load
@@ -36,12 +36,6 @@ SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 def arguments(workers, output, *others, scene=SCENE):
     command = ["render", str(scene), "-D", "resolution=32", "--spp", "256", "--parts", "8", "-o", str(output)]
     return [*command, "--scheduler", workers.scheduler_address, *others]
-
-
-def image(path):
-    file = OpenEXR.File(str(path), separate_channels=True)
-    pixels = np.stack([file.channels()[name].pixels for name in "RGB"], axis=-1)
-    return pixels, json.loads(file.header()["bdptStatistics"])
 
 
 def test_parts_cover_the_samples_with_seeds_of_their_own():
@@ -64,7 +58,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     """
     path, given = SCENE.with_stem(name), ["-P", "merging=true"] * merges
     assert main(arguments(workers, tmp_path / "a.exr", *given, scene=path)) == 0
-    pixels, statistics = image(tmp_path / "a.exr")
+    pixels, statistics = rendered.image(tmp_path / "a.exr", "RGB")
     assert np.isfinite(pixels).all() and statistics["unbiased"] != merges
     assert not merges or statistics["merging"]["merges"]
     assert sum(statistics["passes"]) == statistics["spp"] == 256
@@ -73,7 +67,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     if name == "cornell_box":  # tables of emission and all else that was decided go to the parts
         assert decided["emission"] and decided["joined"] == 4
     assert main(arguments(workers, tmp_path / "short.exr", "--spp", "15", scene=path)) == 0
-    assert "samples are too few" in image(tmp_path / "short.exr")[1]["no_pilot"]
+    assert "samples are too few" in rendered.image(tmp_path / "short.exr", "RGB")[1]["no_pilot"]
     options = Namespace(
         scene=path,
         defines=[("resolution", "32")],
@@ -108,7 +102,7 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
         Planner, "lost_by_pilots", lambda self: lost(self) + 7 * (self.decided.pilots.asked > 0)
     )
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
-    statistics = image(tmp_path / "a.exr")[1]
+    statistics = rendered.image(tmp_path / "a.exr", "RGB")[1]
     seconds = statistics["seconds"]
     assert statistics["non_finite_in_pilot"] == 7 and seconds["pilot"] > 0
     parts = sum(seconds[name] for name in ("compile", "pilot", "render"))
@@ -116,7 +110,7 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     assert {row["level"] for row in statistics["skipped"]}.isdisjoint({"by hand"})
     given = ["-P", f"decisions={json.dumps(statistics['decisions'])}"]
     assert main(arguments(workers, tmp_path / "b.exr", *given)) == 0
-    statistics = image(tmp_path / "b.exr")[1]
+    statistics = rendered.image(tmp_path / "b.exr", "RGB")[1]
     assert statistics["non_finite_in_pilot"] == 0 == statistics["seconds"]["pilot"]
 
 
@@ -138,7 +132,10 @@ def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch)
     monkeypatch.setattr(cluster.Merged, "add", add)
     assert main(arguments(workers, tmp_path / "lost.exr")) == 0
     assert killed
-    (expected, calm), (found, lost) = image(tmp_path / "calm.exr"), image(tmp_path / "lost.exr")
+    (expected, calm), (found, lost) = (
+        rendered.image(tmp_path / "calm.exr", "RGB"),
+        rendered.image(tmp_path / "lost.exr", "RGB"),
+    )
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
     assert lost["rays"] == calm["rays"] and lost["passes"] == calm["passes"]
 
@@ -230,7 +227,7 @@ def test_an_edited_scene_is_loaded_anew(workers, tmp_path):
         scene.write_text(SKY.replace("$radiance", radiance))
         command = ["render", str(scene), "--spp", "32", "-o", str(tmp_path / "a.exr")]
         assert main([*command, "--scheduler", workers.scheduler_address]) == 0
-        means.append(image(tmp_path / "a.exr")[0].mean())
+        means.append(rendered.image(tmp_path / "a.exr", "RGB")[0].mean())
     assert means[1] == pytest.approx(2 * means[0], rel=0.1)
 
 
@@ -279,7 +276,7 @@ def test_a_farm_in_a_bad_night(tmp_path):
             process.kill()
             process.wait()
     assert len(seen) >= 24
-    found, night = image(tmp_path / "night.exr")
+    found, night = rendered.image(tmp_path / "night.exr", "RGB")
     options = build_parser().parse_args([*command])
     scene, integrator = load(options)
     merged, reports = cluster.Merged(), []

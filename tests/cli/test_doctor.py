@@ -48,6 +48,17 @@ def test_installed_script_survives_a_failing_import_too():
     assert done.returncode == 1 and "names no file" in done.stdout and done.stderr == ""
 
 
+def test_what_the_command_itself_does_not_need_may_be_missing(tmp_path):
+    """Rationale: it says what to install. Expected: without NumPy and rich it names the failing import, and
+    there is no traceback.
+    """
+    for name in ("numpy", "rich"):
+        (tmp_path / f"{name}.py").write_text(f"raise ImportError('no {name} here')")
+    done = command("doctor", PYTHONPATH=str(tmp_path))
+    assert done.returncode == 1 and "FAIL  import" in done.stdout and "no numpy here" in done.stdout
+    assert done.stderr == ""
+
+
 def test_other_commands_report_the_failure_without_a_traceback():
     done = command("render", "scene.xml", **{llvm.VARIABLE: "/no/such.so"})
     assert done.returncode == 1

@@ -1,6 +1,5 @@
 """``render`` on a farm: signals, sizes, frames, more samples, what schedulers read."""
 
-import json
 import os
 import re
 import signal
@@ -13,8 +12,8 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-import OpenEXR
 import pytest
+import rendered
 from mitsuba_bdpt.cli import render, values
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.cli.signals import TERMINATED
@@ -27,13 +26,6 @@ SMALL = ["render", str(SCENE), "--size", "16x16", "-P", "spp_per_pass=4"]
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def image(path):
-    """The colours of an EXR file, and the statistics of its header."""
-    file = OpenEXR.File(str(path), separate_channels=True)
-    channels = file.channels()
-    return np.stack([channels[n].pixels for n in "RGB"], axis=-1), json.loads(file.header()["bdptStatistics"])
 
 
 def test_sigterm_ends_as_ctrl_c_does():
@@ -54,7 +46,7 @@ def test_sigterm_ends_as_ctrl_c_does():
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=120)
     assert process.returncode == TERMINATED == 143, err
-    pixels, statistics = image("ended.exr")
+    pixels, statistics = rendered.image("ended.exr", "RGB")
     assert statistics["interrupted"] and 0 < statistics["spp"] < 4000000 and np.all(np.isfinite(pixels))
     assert out.rstrip().endswith("interrupted")
     # The signal may come between the end of a pass and its report.
@@ -68,7 +60,7 @@ def test_a_finished_render_goes_on_with_more_samples(capsys):
     """
     arguments = [*SMALL, "-o", "more.exr", "--checkpoint", "60", "--keep-checkpoint"]
     assert main([*arguments, "--spp", "8"]) == 0
-    first, before = image("more.exr")
+    first, before = rendered.image("more.exr", "RGB")
     for others, words in (
         (["--spp", "4"], "has 8 samples per pixel already"),
         (["--spp", "32", "-P", "max_depth=3"], "its max_depth is"),
@@ -77,7 +69,7 @@ def test_a_finished_render_goes_on_with_more_samples(capsys):
         assert main([*arguments, "--resume", *others]) == 1
         assert words in capsys.readouterr().err
     assert main([*arguments, "--resume", "--spp", "32"]) == 0
-    whole, after = image("more.exr")
+    whole, after = rendered.image("more.exr", "RGB")
     kept = read(Path("more.checkpoint.npz"))
     assert after["spp"] == 32 and kept.spp == 32 and len(set(kept.identity["seed"])) == 2
     assert after["rays"]["camera"] > 3 * before["rays"]["camera"]
@@ -85,7 +77,7 @@ def test_a_finished_render_goes_on_with_more_samples(capsys):
     assert abs(rest.mean() / first.mean() - 1) < 0.1 and not np.allclose(rest, first, rtol=0.05)
     assert main([*arguments, "--resume", "--spp", "64"]) == 0
     assert (
-        image("more.exr")[1]["spp"] == 64
+        rendered.image("more.exr", "RGB")[1]["spp"] == 64
         and len(set(read(Path("more.checkpoint.npz")).identity["seed"])) == 3
     )
     assert main([*arguments[:-1], "--resume", "--spp", "96"]) == 0
@@ -103,13 +95,13 @@ def test_size_and_crop():
     """
     arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "16"]
     assert main([*arguments, "-o", "whole.exr"]) == 0
-    whole = image("whole.exr")[0]
+    whole = rendered.image("whole.exr", "RGB")[0]
     assert whole.shape == (16, 24, 3)
     assert (
         main(["render", str(SCENE), "--size", "24x16", "--crop", "4,2,10,8", "--spp", "16", "-o", "part.exr"])
         == 0
     )
-    part = image("part.exr")[0]
+    part = rendered.image("part.exr", "RGB")[0]
     assert part.shape == (8, 10, 3)
     # Other points, the same picture.
     assert abs(part.mean() / whole[2:10, 4:14].mean() - 1) < 0.1
@@ -135,7 +127,7 @@ def test_sizes_that_are_refused(capsys):
         main(["render", "cropped.xml", "--size", "16x16", "--crop", "0,0,4,4", "--spp", "1", "-o", "a.exr"])
         == 0
     )
-    assert image("a.exr")[0].shape == (4, 4, 3)
+    assert rendered.image("a.exr", "RGB")[0].shape == (4, 4, 3)
 
 
 @pytest.mark.parametrize(
@@ -179,7 +171,9 @@ def test_frames_are_sensors(capsys):
     assert sorted(p.name for p in Path("out").glob("*.exr")) == ["shot.0000.exr", "shot.0002.exr"]
     for number in (0, 2):
         # Of few samples: a pixel may have a splat of its own.
-        assert abs(np.median(image(f"out/shot.{number:04d}.exr")[0]) / (number + 1) - 1) < 0.02
+        assert (
+            abs(np.median(rendered.image(f"out/shot.{number:04d}.exr", "RGB")[0]) / (number + 1) - 1) < 0.02
+        )
     assert capsys.readouterr().out.count("\n") == 2
     for arguments, words in (
         (["--frames", "0-3"], "sensor=3 is not in the scene"),
@@ -274,8 +268,8 @@ def test_a_preview_is_rewritten(monkeypatch):
 
     seen, write = [], live.write_png
 
-    def noted(film, path, exposure):
-        write(film, path, exposure)
+    def noted(film, bitmap, path, exposure):
+        write(film, bitmap, path, exposure)
         seen.append((Path(path).read_bytes(), Path("shown.exr").exists()))
 
     with monkeypatch.context() as patch:
@@ -307,7 +301,7 @@ def test_a_signal_while_the_image_is_written_changes_nothing(monkeypatch):
 
     monkeypatch.setattr(render, "write_images", interrupted)
     assert main([*SMALL, "--spp", "8", "-o", "a.exr", "--checkpoint", "0"]) == 130
-    assert image("a.exr")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
+    assert rendered.image("a.exr", "RGB")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
 
 
 def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, capsys):
@@ -324,7 +318,7 @@ def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, caps
         assert main(arguments) == 1
     assert "No space left" in capsys.readouterr().err and Path("a.checkpoint.npz").exists()
     assert main([*arguments, "--resume"]) == 0
-    assert image("a.exr")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
+    assert rendered.image("a.exr", "RGB")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
 
 
 def test_nobody_listens_any_more():
@@ -345,4 +339,4 @@ def test_nobody_listens_any_more():
     process.stdout.close()
     assert process.wait(timeout=120) == 0, process.stderr.read()
     process.stderr.close()
-    assert image("a.exr")[1]["spp"] == 8
+    assert rendered.image("a.exr", "RGB")[1]["spp"] == 8

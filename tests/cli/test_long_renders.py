@@ -1,6 +1,5 @@
 """``render`` with --checkpoint, --resume and --target-error."""
 
-import json
 import signal
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path, PurePath
 import numpy as np
 import OpenEXR
 import pytest
+import rendered
 from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.named import named_files
@@ -23,14 +23,6 @@ ARGUMENTS = ["render", str(SCENE), "-D", "resolution=16", "-P", "spp_per_pass=4"
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-
-def image(path):
-    """All channels of an EXR file, and the statistics of its header."""
-    file = OpenEXR.File(str(path), separate_channels=True)
-    channels = file.channels()
-    pixels = np.stack([channels[name].pixels for name in sorted(channels)], axis=-1)
-    return pixels, json.loads(file.header()["bdptStatistics"])
 
 
 # A render that kills itself after a pass, before the checkpoint that would hold it.
@@ -54,7 +46,7 @@ def test_a_killed_render_is_resumed():
     """
     spp = ["--spp", "256"]
     assert main([*ARGUMENTS, *spp, "-o", "whole.exr"]) == 0
-    expected, whole = image("whole.exr")
+    expected, whole = rendered.image("whole.exr")
     resumable = [*ARGUMENTS, *spp, "-o", "killed.exr", "--checkpoint", "0"]
     assert whole["decisions"]
     process = subprocess.run([sys.executable, "-c", KILLED, *resumable], timeout=600)
@@ -63,7 +55,7 @@ def test_a_killed_render_is_resumed():
     assert list(read(checkpoint).passes) == whole["passes"][:30] and not Path("killed.exr").exists()
     assert main([*resumable, "--resume"]) == 0
     assert not checkpoint.exists()
-    found, resumed = image("killed.exr")
+    found, resumed = rendered.image("killed.exr")
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
     for name in ("rays", "passes", "decisions"):
         assert resumed[name] == whole[name], name
@@ -99,7 +91,7 @@ def test_an_interrupted_render_leaves_a_checkpoint_and_is_not_begun_anew(monkeyp
         assert main([*arguments, *others]) == 1
         assert words in capsys.readouterr().err
     assert main([*arguments, "--resume"]) == 0
-    assert image("a.exr")[1]["spp"] == 32
+    assert rendered.image("a.exr")[1]["spp"] == 32
     assert main([*arguments, "--resume"]) == 1
     assert "there is no checkpoint" in capsys.readouterr().err
 
@@ -219,7 +211,7 @@ def test_an_interruption_inside_a_pass(monkeypatch):
         assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60"]) == 130
     assert read(Path("cut.checkpoint.npz")).passes == (1, 4, 3, 4)  # the next one ends a replicate
     assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60", "--resume"]) == 0
-    (expected, whole), (found, resumed) = image("whole.exr"), image("cut.exr")
+    (expected, whole), (found, resumed) = rendered.image("whole.exr"), rendered.image("cut.exr")
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-5)
     assert resumed["passes"] == whole["passes"]
     assert resumed["error"] == pytest.approx(whole["error"], rel=1e-3)
@@ -232,7 +224,7 @@ def test_an_hour_a_night():
     first = read(Path("a.checkpoint.npz")).spp
     assert main([*arguments, "--resume"]) == 0
     second = read(Path("a.checkpoint.npz")).spp
-    assert 0 < first < second == image("a.exr")[1]["spp"]
+    assert 0 < first < second == rendered.image("a.exr")[1]["spp"]
 
 
 def test_a_full_disk_does_not_cost_the_render(monkeypatch, capsys):
@@ -254,7 +246,7 @@ def test_a_render_that_had_reached_its_error_is_not_traced_on(monkeypatch):
         assert main(arguments) == 0
     kept = read(Path("a.checkpoint.npz"))
     assert main([*arguments, "--resume"]) == 0
-    assert image("a.exr")[1]["spp"] == kept.spp and not Path("a.checkpoint.npz").exists()
+    assert rendered.image("a.exr")[1]["spp"] == kept.spp and not Path("a.checkpoint.npz").exists()
 
 
 def test_an_error_that_is_not_reached_is_said(capsys):
@@ -278,7 +270,7 @@ def test_until_an_error(capsys):
     assert main([*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr"]) == 0
     channels = OpenEXR.File("a.exr", separate_channels=True).channels()
     assert "variance.R" in channels
-    statistics = image("a.exr")[1]
+    statistics = rendered.image("a.exr")[1]
     assert statistics["error"] <= 0.02 and statistics["spp"] in (32, 64, 128, 256, 512)
 
 
@@ -318,6 +310,6 @@ def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):
     asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "variance=true", "-o", "a.exr"]
     assert main([*asked, "--spp", "1024", "-P", "target_error=0.5"]) == 0
     assert not Path("a.checkpoint.npz").exists() and "asked for" not in capsys.readouterr().out
-    assert image("a.exr")[1]["spp"] < 1024
+    assert rendered.image("a.exr")[1]["spp"] < 1024
     assert main([*asked, "--spp", "32", "-P", "target_error=1e-6"]) == 0
     assert "not the 1e-06 asked for" in capsys.readouterr().out

@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import denoise
 import mitsuba as mi
 import numpy as np
 import OpenEXR
@@ -20,13 +21,6 @@ SIZE, SPP = 128, 16
 def layers(scene, sensor=0):
     """Names of the film's channels after those of the colours."""
     return [channel.name for channel in scene.sensors()[sensor].film().bitmap().struct_()]
-
-
-def guides(scene, spp=64):
-    """Albedo and normals of a scene as `denoising.GUIDES` has them, by Mitsuba's own plugin."""
-    made = mi.load_dict({"type": "aov", "aovs": denoising.GUIDES})
-    image = np.array(mi.render(scene, integrator=made, spp=spp, seed=7))
-    return image[..., -6:-3], image[..., -3:]
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -50,7 +44,7 @@ def test_what_it_does_to_the_error(name):
     assert after < 0.75 * before, (before, after)
     if name in ("cornell_box", "open_sky"):
         path = np.array(mi.load_dict({"type": "path", "max_depth": depth}).render(scene, seed=1, spp=SPP))
-        found = denoising.denoised(path[..., :3], *guides(scene))
+        found = denoising.denoised(path[..., :3], *denoise.guides(scene))
         assert rel_mse(found, expected) < 0.75 * rel_mse(path[..., :3], expected)
 
 
@@ -61,9 +55,9 @@ def test_other_layers_are_untouched():
     scene = repository.load_scene("cornell_box", resolution=16)
     more = {"aovs": "albedo:albedo,dd:depth", "variance": True, "strategy_images": True, "max_depth": 3}
     images = {}
-    for denoise in (False, True):
-        made = mi.load_dict({"type": "bdpt", "denoise": denoise, **more})
-        images[denoise] = np.array(made.render(scene, spp=16)), layers(scene)
+    for on in (False, True):
+        made = mi.load_dict({"type": "bdpt", "denoise": on, **more})
+        images[on] = np.array(made.render(scene, spp=16)), layers(scene)
     (without, names), (image, more_names) = images[False], images[True]
     first = names.index("variance.R")
     assert more_names == [*names[:first], "denoised.R", "denoised.G", "denoised.B", *names[first:]]
@@ -84,17 +78,19 @@ def test_a_film_that_keeps_alpha_or_luminance():
 
 def test_what_is_refused(monkeypatch):
     """Expected: films of bands, and a package that is missing, are said before anything is rendered."""
+    mi.set_variant("llvm_ad_spectral")
     described = mi.cornell_box()
     described["sensor"]["film"] = {
         "type": "specfilm",
         "width": 8,
         "height": 8,
-        "band": {"type": "regular", "wavelength_min": 400, "wavelength_max": 700, "values": "1, 1"},
+        "band": {"type": "spectrum", "value": [(400, 1.0), (700, 1.0)]},
     }
     made = mi.load_dict({"type": "bdpt", "denoise": True})
-    if mi.is_spectral:
-        with pytest.raises(UnsupportedError, match="denoise=True is not possible with film"):
-            made.render(mi.load_dict(described), spp=1)
+    with pytest.raises(UnsupportedError, match="denoise=True is not possible with film"):
+        made.render(mi.load_dict(described), spp=1)
+    mi.set_variant("llvm_ad_rgb")
+    made = mi.load_dict({"type": "bdpt", "denoise": True})
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
     with pytest.raises(UsageError, match=r"pip install 'mitsuba-bdpt\[denoise\]'"):
         made.render(mi.load_dict(mi.cornell_box()), spp=1)

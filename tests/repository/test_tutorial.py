@@ -13,6 +13,12 @@ def printed(cell):
     return "".join(output.get("text", "") for output in cell.get("outputs", []))
 
 
+def shown(notebook):
+    """How many images a notebook shows."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return sum("image/png" in output.get("data", {}) for output in outputs)
+
+
 def test_the_notebook_runs(monkeypatch):
     """Expected: every cell runs at a small size and its assertions hold; it prints what it explains, and
     shows images and a plot.
@@ -22,13 +28,7 @@ def test_the_notebook_runs(monkeypatch):
     text = "".join(map(printed, made.cells))
     for words in ("pilot: time to the same error", "estimated relMSE", "error of path over ours"):
         assert words in text
-    shown = [
-        output
-        for cell in made.cells
-        for output in cell.get("outputs", [])
-        if "image/png" in output.get("data", {})
-    ]
-    assert len(shown) == 3
+    assert shown(made) == 3
 
 
 def test_the_notebook_is_that_of_the_script():
@@ -37,7 +37,7 @@ def test_the_notebook_is_that_of_the_script():
     there = nbformat.read(make_notebook.NOTEBOOK, 4)
     outputs = [output for cell in there.cells for output in cell.get("outputs", [])]
     assert not [output for output in outputs if output.output_type == "error"]
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 3
+    assert shown(there) == 3
 
 
 STOPPED = """

@@ -29,11 +29,12 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line `arguments` (default: the process's own) and return its exit status."""
-    options = build_parser().parse_args(arguments)
+    parser = build_parser()
+    options = parser.parse_args(arguments)
     if options.command == "completion":
         from . import completion
 
-        return completion.run(options.shell, build_parser())
+        return completion.run(options.shell, parser)
     if options.command == "doctor":
         from . import doctor
 

@@ -53,7 +53,7 @@ def _rewrite(report: PassReport, film: mi.Film, path: Path, exposure: float) -> 
     """Put the image so far into the PNG. A full disk must not cost the render."""
     report.image()
     try:
-        write_png(film, path, exposure)
+        write_png(film, film.bitmap(), path, exposure)
     except OSError as error:
         print(f"warning: no preview {str(path)!r}: {error}", file=sys.stderr)
 
@@ -61,4 +61,5 @@ def _rewrite(report: PassReport, film: mi.Film, path: Path, exposure: float) -> 
 def _pixels(report: PassReport, film: mi.Film) -> np.ndarray:
     """The colours of the image so far, linear, shape (height, width, 3)."""
     report.image()
-    return np.array(screen_image(film).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+    shown = screen_image(film, film.bitmap())
+    return np.array(shown.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))

@@ -10,10 +10,13 @@ from __future__ import annotations
 import socket
 import struct
 import sys
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from ..errors import CommandError
+
+# Not here: `doctor` runs where it is missing.
+if TYPE_CHECKING:
+    import numpy as np
 
 PORT = 14158
 """tev's own, where none is given."""
@@ -67,7 +70,7 @@ def update(name: str, pixels: np.ndarray, channels: str) -> bytes:
     # Of each channel where its first number is, and how far apart two are.
     places = struct.pack(f"<{2 * count}q", *range(count), *[count] * count)
     head = (b"\0", _text(name), _integers(count), names, _integers(0, 0, width, height), places)
-    return message(UPDATE, *head, np.ascontiguousarray(pixels, "<f4").tobytes())
+    return message(UPDATE, *head, pixels.astype("<f4").tobytes())
 
 
 class Tev:

@@ -78,17 +78,16 @@ def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exp
     for key, value in attributes.items():
         image.metadata()[key] = value
     write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
-    write_png(film, output.with_suffix(".png"), exposure)
+    write_png(film, bitmap, output.with_suffix(".png"), exposure)
 
 
-def write_png(film: mi.Film, path: Path, exposure: float) -> None:
-    """Write the film's picture for a screen."""
-    write_whole(developed(screen_image(film), exposure), path, mi.Bitmap.FileFormat.PNG)
+def write_png(film: mi.Film, bitmap: mi.Bitmap, path: Path, exposure: float) -> None:
+    """Write the picture for a screen of the ``film``'s ``bitmap``."""
+    write_whole(developed(screen_image(film, bitmap), exposure), path, mi.Bitmap.FileFormat.PNG)
 
 
-def screen_image(film: mi.Film) -> mi.Bitmap:
-    """What of the film is shown on screens, linear: its colours, denoised if they are, or `grey`."""
-    bitmap = film.bitmap()
+def screen_image(film: mi.Film, bitmap: mi.Bitmap) -> mi.Bitmap:
+    """What of a ``film``'s ``bitmap`` is shown on screens: its colours, denoised if they are, or `grey`."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         return grey(np.array(bitmap)[..., : film.base_channels_count()])
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
