@@ -10,9 +10,10 @@ beside its file, or reference.exr in a folder of its own, in any case of letters
 as a texture; no other image is taken but by --reference. Where there is none `bdpt` makes one, with every
 strategy; a further run goes on with it.
 
-OUTPUT gets table.md, summary.md and page.html, beside all that a sweep leaves; finished renders are kept.
-What cannot be rendered is named with the reason and left out. The exit status is 1 if a scene was left out,
-or if a check finds that this package renders one wrongly.
+OUTPUT gets table.md and summary.md after each scene and page.html at the end, beside all that a sweep
+leaves; finished renders are kept, and --scenes keeps what the texts say of the others. What cannot be
+rendered is named with the reason and left out. The exit status is 1 if a scene was left out, if a check finds
+that this package renders one wrongly, or if a given image and the checks do not agree about that.
 """
 
 from __future__ import annotations
@@ -30,18 +31,17 @@ from mitsuba_bdpt.cli.values import definition, number
 from mitsuba_bdpt.errors import CommandError, did_you_mean, message
 from mitsuba_bdpt.files.images import read_layers
 from mitsuba_bdpt.files.named import named_files
-from mitsuba_bdpt.files.texts import write_text
-from mitsuba_bdpt.files.whole import check_own
-from mitsuba_bdpt.measure import agreement, analysis, given, making, page, report, showing
+from mitsuba_bdpt.measure import agreement, analysis, given, making, page, showing
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import Method, Preset, Subject
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference
-from mitsuba_bdpt.measure.rows import write_tables
-from mitsuba_bdpt.measure.scenes import SceneFile, depth_of
+from mitsuba_bdpt.measure.scenes import SceneFile
 from mitsuba_bdpt.measure.sweep import Sweep
 from mitsuba_bdpt.run.rendering import raise_interrupt
-from public_table import DEFAULT, MARK, Findings
+from public_checks import DEFAULT
+from public_table import Findings
+from public_texts import Texts, check_folder
 from repository import ROOT
 
 import mitsuba as mi  # isort: skip
@@ -78,10 +78,16 @@ def _ways() -> tuple[Method, ...]:
 
 @dataclass(frozen=True)
 class Found:
-    """A scene of the folder: its file, and the image that is taken for its reference, if there is one."""
+    """A scene of the folder.
+
+    Its file; the image that is taken for its reference, if there is one; whether --reference ``told`` it;
+    names of EXRs beside it that are not taken.
+    """
 
     scene: SceneFile
     reference: Path | None
+    told: bool
+    others: tuple[str, ...] = ()
 
 
 def found_in(folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
@@ -93,7 +99,7 @@ def found_in(folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
         if path.is_file() and path.suffix.lower() == ".xml":
             files[path.stem] = path
     for path in sorted(folder.iterdir()):
-        there = sorted(path.glob("*.xml")) if path.is_dir() else []
+        there = _with_suffix(path, ".xml") if path.is_dir() else []
         if not there:
             continue
         names = *FILES, f"{path.name}.xml"
@@ -108,15 +114,26 @@ def found_in(folder: Path) -> tuple[dict[str, Path], dict[str, str]]:
     return files, left_out
 
 
-def reference_beside(name: str, file: Path, folder: Path) -> Path | None:
-    """The image that is taken for the reference of a scene, None if there is none."""
-    wanted = [f"{name}.exr".lower(), *(["reference.exr"] if file.parent != folder else [])]
-    there = [path for path in sorted(file.parent.iterdir()) if path.name.lower() in wanted]
+def _with_suffix(folder: Path, suffix: str) -> list[Path]:
+    """The files of a folder with that suffix, in any case of letters."""
+    return sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() == suffix)
+
+
+def references_beside(name: str, file: Path, folder: Path) -> tuple[Path | None, tuple[str, ...]]:
+    """The image that is taken for the reference of a scene, None if there is none.
+
+    Also the names of other EXRs in a folder of its own, which may be references under another name.
+    """
+    own = file.parent != folder
+    wanted = [f"{name}.exr".lower(), *(["reference.exr"] if own else [])]
+    there = [path for path in _with_suffix(file.parent, ".exr") if own or path.name.lower() in wanted]
     if not there:
-        return None
+        return None, ()
     textures = {path.resolve() for path in named_files(file)}
     there = [path for path in there if path.resolve() not in textures]
-    return min(there, key=lambda path: wanted.index(path.name.lower()), default=None)
+    known = [path for path in there if path.name.lower() in wanted]
+    taken = min(known, key=lambda path: wanted.index(path.name.lower()), default=None)
+    return taken, tuple(path.name for path in there if path != taken)
 
 
 def chosen(options: Namespace) -> tuple[dict[str, Path], dict[str, str]]:
@@ -154,11 +171,13 @@ def _told(file: Path, image: str) -> Path:
 
 def found(name: str, file: Path, options: Namespace) -> Found:
     """A scene with its reference as the command line ``options`` say."""
-    told = dict(options.reference)
+    told, scene = dict(options.reference), SceneFile(name, file)
     if name in told:
-        return Found(SceneFile(name, file), _told(file, told[name]))
-    own = None if options.own_references else reference_beside(name, file, options.folder)
-    return Found(SceneFile(name, file), own)
+        return Found(scene, _told(file, told[name]), True)
+    if options.own_references:
+        return Found(scene, None, False)
+    taken, others = references_beside(name, file, options.folder)
+    return Found(scene, taken, False, () if taken else others)
 
 
 def subject_of(scene: SceneFile, options: Namespace) -> tuple[Subject, int]:
@@ -171,64 +190,84 @@ def subject_of(scene: SceneFile, options: Namespace) -> tuple[Subject, int]:
             f"no size near {options.resolution} divides its film of {width} x {height} into 4 x 4 tiles; "
             "take a larger --resolution"
         )
-    integrator = scene.load().integrator()
-    told = hasattr(integrator, "max_depth") or "max_depth" in str(integrator)
-    depth = options.max_depth or (depth_of(integrator) if told else DEPTH)
+    depth = options.max_depth or (scene.max_depth if scene.tells_depth else DEPTH)
     return Subject(scene, depth, (options.spp,), (options.seeds,)), fitting
 
 
-def referenced(job: Job, image: Path | None) -> Reference:
-    """The reference of a scene: the ``image`` that is given, or one that is made, or gone on with, now."""
-    if image is not None:
-        return given.adopt(job, image)
+def referenced(job: Job, one: Found) -> tuple[Reference, list[str]]:
+    """The reference of a scene: the image that is given, or one that is made, or gone on with, now.
+
+    Also what there is to note about it. An image beside the scene that cannot serve is noted.
+    """
+    notes = []
+    if one.others:
+        (first, *more), name = one.others, job.scene.name
+        others = f" (nor are {len(more)} others)" if more else ""
+        notes.append(
+            f"`{first}` beside it is not taken for its reference{others}; --reference {name}={first} takes it"
+        )
+    if one.reference is not None:
+        try:
+            return given.adopt(job, one.reference), notes
+        except CommandError as error:
+            if one.told:
+                raise
+            notes.append(f"`{one.reference.name}` beside it cannot be its reference, one was made: {error}")
     given.forget(job)
     print(f"{job.scene.name}: its reference, for at most about {job.seconds:g} s", flush=True)
-    return making.make(job)[0]
+    return making.make(job)[0], notes
 
 
-def rows_of(one: Found, options: Namespace, project: Project) -> list[dict]:
-    """The rows of all renders of a scene; raises an error if one of them cannot be had."""
+def rows_of(one: Found, options: Namespace, project: Project) -> tuple[list[dict], list[str]]:
+    """The rows of all renders of a scene, and notes on it; raises an error if one of them cannot be had."""
     subject, width = subject_of(one.scene, options)
     enough = agreement.FEWEST_RUNS // 2
     seconds = options.reference_seconds
     job = Job(project, one.scene, width, subject.max_depth, options.spp, seconds, by="bdpt", rounds=enough)
-    reference = referenced(job, one.reference)
+    reference, notes = referenced(job, one)
     preset = Preset((subject,), _ways(), width, None, {})
     sweep = Sweep(project, preset, project.root)
     print(f"{one.scene.name}: {width} wide, max_depth {subject.max_depth}", flush=True)
     with showing.bar() as progress:
         sweep.run(progress)
-    rows = sweep.rows()
+    found = sweep.rows()
     if sweep.failed:
         others = f" (and {len(sweep.failed) - 1} more like it)" if len(sweep.failed) > 1 else ""
         raise CommandError(f"{sweep.failed[0]}{others}")
-    if not reference.given:
-        return rows
-    return given.judged(rows, given.own_error(reference.image, _by_seed(project.root, rows)))
+    if reference.given:
+        found = given.judged(found, given.own_errors(reference.image, _by_seed(project.root, found)))
+    return found, notes
 
 
-def _by_seed(output: Path, rows: list[dict]) -> list[np.ndarray]:
+def _by_seed(output: Path, table: list[dict]) -> list[np.ndarray]:
     """The mean of our renders of each seed, which share random numbers, without path tracing alone."""
     found: dict[int, list[np.ndarray]] = {}
-    for row in rows:
+    for row in table:
         if row["method"] in (DEFAULT, analysis.NONE):
             (image,), _ = read_layers(output / "images" / row["scene"] / f"{row['key']}.exr", "")
             found.setdefault(row["seed"], []).append(image)
     return [np.mean(images, axis=0) for images in found.values()]
 
 
-def measured(options: Namespace, project: Project) -> tuple[list[dict], dict[str, str]]:
-    """The rows of all scenes, and by name why others are left out."""
-    files, left_out = chosen(options)
-    rows = []
+def measured(options: Namespace, folder: Path) -> tuple[Findings, bool]:
+    """Render the scenes and write the texts after each; what they say, and whether a scene was left out."""
+    everything = found_in(options.folder)
+    files, lost = chosen(options)
+    texts = Texts.of(folder, [*everything[0], *everything[1]], not options.scenes)
+    for name in files:
+        texts.left_out.pop(name, None)
+    texts.left_out.update(lost)
+    table, findings = [], None
     for name, file in files.items():
         try:
-            rows += rows_of(found(name, file, options), options, project)
+            rows, texts.notes[name] = rows_of(found(name, file, options), options, Project(folder))
+            table += rows
         except Exception as error:  # one scene must not cost the others
             raise_interrupt(error)
-            left_out[name] = " ".join(message(error).split())
-            print(f"{name}: left out: {left_out[name]}", flush=True)
-    return rows, left_out
+            lost[name] = texts.left_out[name] = " ".join(message(error).split())
+            print(f"{name}: left out: {lost[name]}", flush=True)
+        findings = texts.write(table)
+    return findings or texts.write(table), bool(lost)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -236,7 +275,7 @@ def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = made.add_argument
     add("folder", type=Path, metavar="FOLDER", help="folder with scenes")
-    add("-o", "--output", type=Path, help="folder; default: results/NAME_OF_FOLDER of the repository")
+    add("-o", "--output", type=Path, help="folder; default: results/public_FOLDER of the repository")
     add("--scenes", nargs="+", metavar="NAME", help="these alone")
     add("--spp", type=number(int, 1), default=64, help="of the default; default: %(default)s")
     text = "renders of each; bias is checked from 8 on; default: %(default)s"
@@ -257,21 +296,13 @@ def main(arguments=None) -> int:
     """Render what is missing, and write table, summary and page."""
     options = parser().parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
-    folder = options.output or ROOT / "results" / options.folder.resolve().name
-    files = {name: folder / name for name in ("table.md", "summary.md", "page.html")}
-    for name, mark in (("table.md", MARK), ("summary.md", MARK), ("page.html", f"<title>{page.TITLE}")):
-        check_own(files[name], mark, "move it away, or name another folder by -o")
-    rows, left_out = measured(options, Project(folder))
-    if not rows:
-        print(f"{folder}: no scene could be rendered")
-        return 1
-    write_tables(rows, folder)
-    findings = Findings(*report.load(Project(folder), folder), left_out)
-    write_text(files["table.md"], findings.tables())
-    write_text(files["summary.md"], findings.summary())
-    page.run(Namespace(project=folder, folder=str(folder), output=None))
-    print(files["table.md"], files["summary.md"], sep="\n", end=f"\n\n{findings.words()}")
-    return int(bool(left_out or findings.wrong()))
+    folder = options.output or ROOT / "results" / f"public_{options.folder.resolve().name}"
+    check_folder(folder)
+    findings, lost = measured(options, folder)
+    if findings.results.scenes:
+        page.run(Namespace(project=folder, folder=str(folder), output=None))
+    print(folder / "table.md", folder / "summary.md", sep="\n", end=f"\n\n{findings.words()}")
+    return int(lost or bool(findings.wrong()))
 
 
 if __name__ == "__main__":

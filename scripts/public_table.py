@@ -2,120 +2,42 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
-from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.measure import analysis, report
-from mitsuba_bdpt.measure.agreement import Apart, Means, apart, compare_means
-from mitsuba_bdpt.measure.analysis import ALONE, NONE, OWN, NotJudged, Refused, Results, geometric_mean
+from mitsuba_bdpt.measure.analysis import OWN, NotJudged, Refused, Results, geometric_mean
 from mitsuba_bdpt.measure.efficiency import refused_share
+from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.tables import ratio, said, table
+from public_checks import DEFAULT, OURS, Check, check
 
 MARK = "Made by `scripts/public_scenes.py`"
 """What each of its texts has in it."""
-
-DEFAULT = "bdpt"
-
-OURS = {ALONE: "path tracing alone", NONE: "`skip=none`", DEFAULT: "default"}
-"""What is compared with `path`, as the tables call it."""
-
-LISTED = 4
-"""Tiles that a text lists, at most."""
 
 KINDS = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
 
 
 @dataclass(frozen=True)
-class Check:
-    """What bias checks find in a scene, as texts.
-
-    ``path``: what it lacks, empty if nothing; ``wrong``: what this package renders wrongly; ``lacks``: which
-    of its integrators are darker than the reference, though not than `path`; ``unchecked``: why there was no
-    check, if so.
-    """
-
-    path: str = ""
-    wrong: tuple[str, ...] = ()
-    lacks: tuple[str, ...] = ()
-    unchecked: str = ""
-
-
-def _where(places: list[Apart]) -> str:
-    """Tiles, and by how much each is brighter or darker, the worst first."""
-    tiles = sorted((place for place in places if place.tile), key=lambda place: -abs(place.share))
-    if not tiles:
-        return "the whole image alone"
-    listed = ", ".join(f"{p.tile[0]},{p.tile[1]} ({_percent(p.share)})" for p in tiles[:LISTED])
-    more = f" and {len(tiles) - LISTED} more" if len(tiles) > LISTED else ""
-    return f"tile{'s' if len(tiles) > 1 else ''} {listed}{more}"
-
-
-def _percent(share: float) -> str:
-    """A difference in percent, with two digits or more."""
-    value = 100 * share
-    return f"{value:+.2g} %" if abs(value) < 99.5 else f"{value:+.0f} %"
-
-
-def check(results: Results, scene: str) -> Check:
-    """Compare all integrators with `path` and with the reference, tile by tile.
-
-    In place of a reference that is given, of unknown error, stands ``skip=none``. `path` is taken to miss
-    what it is darker by than this; this package to be wrong where it is darker than `path`, where its path
-    tracing alone differs from `path`, which has the same strategies, where it is brighter than the reference
-    and where `path` is brighter than that.
-    """
-    path = results.standard_in(scene)[0]
-    try:
-        means = {
-            method: Means.of([row["tile_means"] for row in results.of(scene, method)])
-            for method in (path, *OURS)
-        }
-    except CommandError as why:
-        return Check(unchecked=str(why))
-    judge = results.references.get(scene) or means[NONE]
-    lost, wrong, lacks = _split(apart(means[path], judge)), [], []
-    for method, name in OURS.items():
-        below, brighter = _split(apart(means[method], means[path]))
-        if below:
-            wrong.append(f"{name} is darker than `{path}` in {_where(below)}")
-        if brighter and method == ALONE:
-            wrong.append(f"{name} is brighter than `{path}` in {_where(brighter)}")
-        darker, brighter = _split(apart(means[method], judge))
-        if brighter:
-            wrong.append(f"{name} is brighter than the reference in {_where(brighter)}")
-        if darker and not below:
-            lacks.append(name)
-    if lost[1]:
-        wrong.append(f"`{path}` is brighter than the reference in {_where(lost[1])}")
-    text = ""
-    if lost[0]:
-        text = f"{analysis.missing(compare_means(means[path], judge))}: {_where(lost[0])}"
-    return Check(text, tuple(wrong), tuple(lacks))
-
-
-def _split(places: list[Apart]) -> tuple[list[Apart], list[Apart]]:
-    """Where it is darker, and where brighter."""
-    return [p for p in places if p.share < 0], [p for p in places if p.share > 0]
-
-
-@dataclass(frozen=True)
 class Findings:
-    """The results of all scenes with their references, and by name why others are left out."""
+    """The results of all scenes with their references; by name why others are left out, and notes."""
 
     results: Results
-    made: dict
-    left_out: dict
+    made: dict[str, Reference]
+    left_out: dict[str, str]
+    notes: dict[str, list[str]]
 
     @cached_property
     def checks(self) -> dict[str, Check]:
         """Of each scene."""
-        return {scene: check(self.results, scene) for scene in self.results.scenes}
+        given = {scene: kept.image for scene, kept in self.made.items() if kept.given}
+        return {scene: check(self.results, scene, given.get(scene)) for scene in self.results.scenes}
 
     def wrong(self) -> list[str]:
-        """Scenes that this package renders wrongly."""
-        return [scene for scene, found in self.checks.items() if found.wrong]
+        """Scenes that this package renders wrongly, or may: those of which the checks do not agree."""
+        return [scene for scene, found in self.checks.items() if found.wrong or found.disputed]
 
     def _figure(self, scene: str, method: str, error: str) -> analysis.Summary:
         """The efficiency of one of `OURS` over `path`, whether or not that finds all light."""
@@ -148,7 +70,7 @@ class Findings:
     def _checks(self) -> str:
         """What was rendered, against what, and what the checks say."""
         head = ["scene", "size", "max_depth", "samples per pixel, seconds of a render", "reference"]
-        head += ["its own relMSE over the default's", "`path` misses", "this package"]
+        head += ["its own relMSE over the default's, raw", "`path` misses", "this package"]
         lines = []
         for scene in self.results.scenes:
             rows, found = self.results.of(scene, DEFAULT), self.checks[scene]
@@ -177,7 +99,10 @@ class Findings:
     def tables(self) -> str:
         """Both tables, with what they mean."""
         results = self.results
-        seeds = len(results.of(results.scenes[0], DEFAULT))
+        if not results.scenes:
+            return f"# Public scenes at equal time\n\n{MARK}. No scene was rendered.\n{self._left_out()}"
+        counts = sorted({len(results.of(scene, DEFAULT)) for scene in results.scenes})
+        seeds = " to ".join(map(str, dict.fromkeys((counts[0], counts[-1]))))
         return f"""# Public scenes at equal time
 
 {MARK}. {report.machine(results)}.
@@ -191,8 +116,30 @@ error does not fall to 0, and more time is worth less to it than the figure says
 Bias: Welch's test of 4 x 4 tiles (row,column from 0 at the top left) and the whole image at a significance of
 0.1 %, each integrator against `path` and against the reference (against `skip=none` where the reference is a
 given image). The own error of a given image, which includes what else it shows, is taken from our renders.
+References that are made are this package's own: that `path` misses light by them is its word alone.
 
-{self._checks()}{self._left_out()}"""
+{self._checks()}{self._noted()}{self._left_out()}"""
+
+    def _noted(self) -> str:
+        lines = "".join(
+            f"* `{scene}`: {text}.\n" for scene in self.results.scenes for text in self._notes(scene)
+        )
+        return f"\nNotes:\n\n{lines}" if lines else ""
+
+    def _notes(self, scene: str) -> list[str]:
+        """What else there is to say of a scene: light that no render has, and notes on its reference."""
+        lost = [
+            sum(json.loads(row["statistics"]).get("lost_light", {}).values())
+            for row in self.results.of(scene, DEFAULT)
+        ]
+        found = []
+        if any(lost):
+            found.append(
+                f"about {max(lost):.1%} of its light, of delta lamps through glass on what is seen through "
+                "glass, is found by no strategy: it is in no render and no reference that is made; "
+                "`merging` finds it"
+            )
+        return found + self.notes.get(scene, [])
 
     def _left_out(self) -> str:
         if not self.left_out:
@@ -207,8 +154,10 @@ given image). The own error of a given image, which includes what else it shows,
     def words(self) -> str:
         """The summary: a sentence for each thing that one wants to know."""
         count = len(self.results.scenes)
-        lines = [f"{count} of {count + len(self.left_out)} scenes were rendered."]
+        lines = [f"{count} of {len({*self.results.scenes, *self.left_out})} scenes were rendered."]
         lines += [f"Left out: {name}: {why}" for name, why in self.left_out.items()]
+        if not count:
+            return "".join(f"* {line}\n" for line in lines)
         lines += [self._means(complete=True)]
         if any(found.path or found.unchecked for found in self.checks.values()):
             lines += [self._means(complete=False)]
@@ -248,12 +197,19 @@ given image). The own error of a given image, which includes what else it shows,
     def _bias(self) -> list[str]:
         """What the checks say of `path` and of this package."""
         checked = {scene: found for scene, found in self.checks.items() if not found.unchecked}
-        lost = {scene: found.path for scene, found in checked.items() if found.path}
+        lost = {scene: found.path for scene, found in checked.items() if found.path and not found.disputed}
         lines = [f"`path` misses energy in {len(lost)} of {len(checked)} scenes{':' if lost else '.'}"]
         lines[0] += "".join(f" `{scene}`, {text}." for scene, text in lost.items())
+        lines += [
+            f"Either `path` and what made the given image miss energy in `{scene}`, or this package is too "
+            f"bright there: {found.path}."
+            for scene, found in checked.items()
+            if found.disputed
+        ]
         wrong = {scene: found.wrong for scene, found in checked.items() if found.wrong}
-        lines.append(f"Biased by us: {len(wrong)} of {len(checked)} scenes{':' if wrong else '.'}")
-        lines[1] += "".join(f" `{scene}`: {'; '.join(texts)}." for scene, texts in wrong.items())
+        text = f"Biased by us: {len(wrong)} of {len(checked)} scenes{':' if wrong else '.'}"
+        lines.append(text + "".join(f" `{scene}`: {'; '.join(texts)}." for scene, texts in wrong.items()))
+        lines += [f"`{scene}`: {text}." for scene in self.results.scenes for text in self._notes(scene)]
         lines += [
             f"`{scene}`: {', '.join(found.lacks)}: darker than the reference, no more than `path`."
             for scene, found in checked.items()
@@ -266,27 +222,36 @@ given image). The own error of a given image, which includes what else it shows,
         return lines
 
     def _unjudged(self) -> list[str]:
-        """Scenes whose figures the reference is too noisy for, with what to do."""
+        """Scenes without some figures: why, and what to do."""
         lines = []
         for scene in self.results.scenes:
-            try:
-                for way in OURS:
-                    for error in KINDS:
-                        self._figure(scene, way, error)
-            except NotJudged as why:
+            refused = self._refused(scene)
+            noisy = [why for why in refused if isinstance(why, NotJudged)]
+            others = dict.fromkeys(str(why) for why in refused if not isinstance(why, NotJudged))
+            lines += [f"`{scene}`: no figure: {text}." for text in others]
+            if noisy:
                 remedy = (
                     "the image that is given is noisy, or shows something else (filter, max_depth, other "
                     "light): try --own-references"
                     if self.made[scene].given
                     else "run again, which goes on with it, with a larger --reference-seconds"
                 )
-                share = refused_share(why.share, 3)
+                share = refused_share(max(why.share for why in noisy), 3)
                 lines.append(
-                    f"`{scene}`: the reference carries {share} of an error, 1 % is allowed; {remedy}."
+                    f"`{scene}`: the reference carries up to {share} of an error, 1 % is allowed; {remedy}."
                 )
-            except Refused:
-                continue
         return lines
+
+    def _refused(self, scene: str) -> list[Refused]:
+        """Why figures of a scene are refused."""
+        found = []
+        for way in OURS:
+            for error in KINDS:
+                try:
+                    self._figure(scene, way, error)
+                except Refused as why:
+                    found.append(why)
+        return found
 
 
 def _ours(found: Check) -> str:

@@ -21,6 +21,9 @@ from .metrics import TRIM, rel_mse_epsilon
 from .reference import Reference, load_reference, reference_path, write
 from .scenes import digest
 
+TRIMS = {"rel_mse": 0.0, "rel_mse_trimmed": TRIM}
+"""Errors of a row, and the share of the largest values that each leaves out."""
+
 
 def adopt(job: Job, file: Path) -> Reference:
     """Store the image in an EXR ``file`` as the reference of a job's scene, and return it.
@@ -73,7 +76,12 @@ def _coverage(old: int, new: int) -> np.ndarray:
     return (high - low) * new / old
 
 
-def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float = TRIM) -> float:
+def own_errors(image: np.ndarray, renders: Sequence[np.ndarray]) -> dict[str, float]:
+    """`own_error` for each of the errors of a row, by the names in `analysis.OWN`."""
+    return {error: own_error(image, renders, trim) for error, trim in TRIMS.items()}
+
+
+def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float) -> float:
     """The relMSE of an ``image`` to what unbiased ``renders`` are of, which have seeds of their own.
 
     The mean of (r - a)(r - b) / (r^2 + eps), a and b the means of every other render: the noise of a and that
@@ -86,8 +94,8 @@ def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float = TR
     return max(float(products[kept].mean()), 0.0)
 
 
-def judged(rows: list[dict], own: float) -> list[dict]:
-    """The ``rows`` of a scene with the error that its reference has of its own, as if they had known it."""
-    known = dict.fromkeys(OWN.values(), own)
+def judged(rows: list[dict], own: dict[str, float]) -> list[dict]:
+    """The ``rows`` of a scene with the `own_errors` of its reference, as if they had known them."""
+    known = {OWN[error]: value for error, value in own.items()}
     names = {"rel_mse": "judged", "rel_mse_trimmed": "judged_trimmed"}
-    return [row | known | {names[key]: analysis.judged(own, row[key]) for key in OWN} for row in rows]
+    return [row | known | {names[key]: analysis.judged(own[key], row[key]) for key in OWN} for row in rows]

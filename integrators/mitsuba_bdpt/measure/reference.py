@@ -1,8 +1,8 @@
 """Reference images with an error estimate of their own, as they are stored.
 
-Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
-two halves of its samples (difference.R ...), which is one sample of its own error, and the provenance as JSON
-in the header, with what a bias check needs. `making` makes them.
+Files lie in the project's references/: EXR in half precision (single, if the user gave the image) with the
+image (R, G, B), half the difference of two halves of its samples (difference.R ...), which is one sample of
+its own error, and the provenance as JSON in the header, with what a bias check needs. `making` makes them.
 """
 
 from __future__ import annotations
@@ -114,13 +114,15 @@ def read_reference(path: Path) -> Reference:
 def write(path: Path, reference: Reference):
     """Write a reference; whoever looks at ``path`` never sees half a file."""
     brightest = float(reference.image.max())
-    if brightest > HALF_MAX:
+    if brightest > HALF_MAX and not reference.given:
         raise CommandError(
             f"{path.name}: radiance {brightest:g} does not fit into half precision; scale the lamps"
         )
     layers = {"": reference.image, "difference.": reference.difference}
     header = reference.provenance | {"rel_mse": reference.error, "means": kept_of(reference.means)}
-    write_layers(path, layers, {"provenance": json.dumps(header)})
+    # What a user gives has values that nobody can change.
+    dtype = np.float32 if reference.given else np.float16
+    write_layers(path, layers, {"provenance": json.dumps(header)}, dtype)
 
 
 def means_of(kept) -> Means | None:

@@ -122,8 +122,11 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
     return [row | {"first": preset.methods[0].name} for row in found]
 
 
-def beside(table: list[dict], preset: Preset, output: Path) -> list[dict]:
-    """``table`` and the rows of other scenes of the ``preset`` that OUTPUT/rows.parquet has, as they are."""
+def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:
+    """``table`` and the rows of other scenes that OUTPUT/rows.parquet has, as they are.
+
+    Of the scenes ``order``, and in their order.
+    """
     file, done = output / "rows.parquet", {row["scene"] for row in table}
     try:
         others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
@@ -131,7 +134,6 @@ def beside(table: list[dict], preset: Preset, output: Path) -> list[dict]:
         raise CommandError(
             f"{str(file)!r} is damaged ({error}); run the sweep without --scenes, which writes it anew"
         ) from error
-    order = [subject.name for subject in preset.subjects]
     found = table + [row for row in others if row["scene"] in order and row["scene"] not in done]
     return sorted(found, key=lambda row: order.index(row["scene"]))
 

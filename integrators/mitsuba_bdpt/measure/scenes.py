@@ -18,6 +18,15 @@ from ..media.media import media_of
 
 
 @dataclass(frozen=True)
+class _Look:
+    """Of a scene its ``integrator``, `has_media`, and the image's ``size``, or why it has none."""
+
+    integrator: mi.Integrator
+    has_media: bool
+    size: tuple[int, int] | CommandError
+
+
+@dataclass(frozen=True)
 class SceneFile:
     """A scene by its ``name``, under which references and rows are kept, and its XML ``file``."""
 
@@ -46,33 +55,45 @@ class SceneFile:
             _resize(scene, resolution)
         return scene
 
-    def film(self, resolution: int | None = None):
-        """The film of the first sensor.
-
-        Raises ``CommandError`` for one without colours, which no measure of errors takes.
-        """
-        film = choose_sensor(self.load(resolution), 0).film()
-        if film.base_channels_count() < 3:
-            raise CommandError(
-                f"scene={str(self.file)!r}: its film has no colours, of which errors are taken; write "
-                'pixel_format "rgb" into the scene file'
-            )
-        return film
-
     def size(self, resolution: int | None = None) -> tuple[int, int]:
-        """Width and height of the image."""
-        width, height = self.film(resolution).size()
-        return int(width), int(height)
+        """Width and height of the image.
+
+        Raises ``CommandError`` for a film without colours, which no measure of errors takes.
+        """
+        own = self._look.size
+        if isinstance(own, CommandError):
+            raise own
+        if resolution is None:
+            return own
+        if "resolution" not in parameters(self.file):
+            return _widened(own, resolution)
+        return _size_of(self.load(resolution), self.file)  # the file may set any size by its parameter
 
     @cached_property
     def max_depth(self) -> int:
         """That of the file's integrator; -1 (no limit) without one."""
-        return depth_of(self.load().integrator())
+        return depth_of(self._look.integrator)
+
+    @cached_property
+    def tells_depth(self) -> bool:
+        """Whether the file's integrator has a ``max_depth``."""
+        made = self._look.integrator
+        return hasattr(made, "max_depth") or "max_depth" in str(made)
 
     @cached_property
     def has_media(self) -> bool:
         """Whether rays can be in a medium, see `has_media`."""
-        return has_media(self.load())
+        return self._look.has_media
+
+    @cached_property
+    def _look(self) -> _Look:
+        """What one loading of the file, which may take long, tells of it."""
+        scene = self.load()
+        try:
+            size = _size_of(scene, self.file)
+        except CommandError as error:  # matters to those alone who ask for it
+            size = error
+        return _Look(scene.integrator(), has_media(scene), size)
 
     @property
     def sha256(self) -> str:
@@ -128,11 +149,27 @@ def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) 
             raise CommandError(f"{what}: {last}") from error
 
 
+def _size_of(scene: mi.Scene, file: Path) -> tuple[int, int]:
+    """Width and height of the first sensor's image; raises ``CommandError`` as `SceneFile.size`."""
+    film = choose_sensor(scene, 0).film()
+    if film.base_channels_count() < 3:
+        raise CommandError(
+            f"scene={str(file)!r}: its film has no colours, of which errors are taken; write "
+            'pixel_format "rgb" into the scene file'
+        )
+    width, height = film.size()
+    return int(width), int(height)
+
+
+def _widened(size: tuple[int, int], width: int) -> tuple[int, int]:
+    """A film's ``size`` made so many pixels wide."""
+    return width, max(round(width * size[1] / size[0]), 1)
+
+
 def _resize(scene, width: int) -> None:
     """Make the first sensor's film so many pixels wide, in its proportions, without a crop window."""
-    film = choose_sensor(scene, 0).film()
-    old_width, old_height = (int(n) for n in film.size())
-    size = [width, max(round(width * old_height / old_width), 1)]
+    old_width, old_height = choose_sensor(scene, 0).film().size()
+    size = list(_widened((int(old_width), int(old_height)), width))
     changed = mi.traverse(scene.sensors()[0])
     changed["film.size"] = size
     changed["film.crop_offset"] = [0, 0]

@@ -269,7 +269,7 @@ def run(options: Namespace) -> int:
             sweep.run(progress)
     table = sweep.rows()
     if options.scenes:
-        table = beside(table, whole, output)
+        table = beside(table, [subject.name for subject in whole.subjects], output)
     if table:
         write_tables(table, output)
     print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
