@@ -12,6 +12,11 @@ samples per pixel of a scene, and its share of these; later renders remember wha
 
 With --short: whole renders of 4 and 16 samples per pixel by `path` with multijitter, by path tracing alone,
 by the default, and by the default where the scene was just loaded and a pilot is asked.
+
+With --small: renders of 64^2 at 8 samples per pixel by `path`, path tracing alone and the default, warm:
+the best of five means over twenty, and where the time of the two goes, in means over twenty: what is asked of
+scene and pilot before anything is traced, the recording of the kernel in Python, what Dr.Jit does with the
+record (`dr.eval` of a kernel that it knows), and waiting for the kernel.
 """
 
 from __future__ import annotations
@@ -19,20 +24,38 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
+import time
+from collections import defaultdict
+from contextlib import contextmanager
 
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.measure.timing import timed
+from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.run.work import Meter
 from repository import benchmark_depth
 
 ROUNDS, SHORT, LONG = 7, 4, 64
 
 # Samples per pixel of short renders.
 BUDGETS, SHORT_ROUNDS = (4, 16), 15
+
+# A small render, and how many of them are taken together.
+SMALL_SIZE, SMALL_SPP, SMALL_RENDERS, SMALL_ROUNDS = 64, 8, 20, 5
+
+STAGES = {
+    "scene": (rendering.Render, "__init__"),
+    "pilot": (rendering.Render, "decide"),
+    "recording": (rendering, "trace"),
+    "`dr.eval`": (Accumulator, "evaluate"),
+    "waiting": (Meter, "wait"),
+}
+"""Where the time of a small render goes: what to call it, and the function."""
 
 ALONE = {"type": "bdpt", "light_paths": 0}
 SHARED = {"type": "bdpt", "light_paths": 1 / 16}
@@ -103,17 +126,69 @@ def measure_short(name: str) -> list[list[str]]:
     return rows
 
 
+@contextmanager
+def stages():
+    """Seconds by stage, see `STAGES`, of the renders within."""
+    spent, former = defaultdict(float), {}
+
+    def watched(stage, function):
+        def call(*given, **named):
+            started = time.perf_counter()
+            try:
+                return function(*given, **named)
+            finally:
+                spent[stage] += time.perf_counter() - started
+
+        return call
+
+    for stage, (owner, name) in STAGES.items():
+        former[stage] = getattr(owner, name)
+        setattr(owner, name, watched(stage, former[stage]))
+    try:
+        yield spent
+    finally:
+        for stage, (owner, name) in STAGES.items():
+            setattr(owner, name, former[stage])
+
+
+def measure_small(name: str) -> list[list[str]]:
+    """The rows of the table of small renders."""
+    depth = benchmark_depth(name)
+    scene = repository.load_scene(name, resolution=SMALL_SIZE, sampler="independent")
+    ways = {"`path`": {"type": "path"}, "path tracing alone": ALONE, "default": {"type": "bdpt"}}
+    made = {way: mi.load_dict(parameters | {"max_depth": depth}) for way, parameters in ways.items()}
+
+    def several(integrator) -> float:
+        return statistics.mean(timed(scene, integrator, SMALL_SPP, seed)[1] for seed in range(SMALL_RENDERS))
+
+    best = {
+        way: [several(integrator) for _ in range(SMALL_ROUNDS + 1)][1:] for way, integrator in made.items()
+    }
+    base, rows = min(best["`path`"]), []
+    for way, found in best.items():
+        with stages() as spent:
+            several(made[way])
+        each = [f"{1e3 * spent[stage] / SMALL_RENDERS:.1f}" if spent else "–" for stage in STAGES]
+        rows.append([f"`{name}`", way, f"{1e3 * min(found):.1f} ms", f"{min(found) / base:.2f}", *each])
+    return rows
+
+
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
     parser.add_argument("--short", action="store_true", help="renders of 4 and 16 samples per pixel")
+    parser.add_argument("--small", action="store_true", help="renders of 64^2 at 8 samples per pixel")
     options = parser.parse_args(arguments)
     names = options.scenes
     mi.set_variant("llvm_ad_rgb")
     if options.short:
         head = ["scene", "spp", "`path` multijitter", "path tracing alone", "default", "the same, first"]
         print(table(head, [row for name in names for row in measure_short(name)]))
+        return 0
+    if options.small:
+        head = ["scene", "by", "a render", "over `path`", *(f"{stage}, ms" for stage in STAGES)]
+        print(table(head, [row for name in names for row in measure_small(name)]))
         return 0
     head = ["scene", "`path`, per sample and pixel", *list(METHODS)[1:], "a render of 1 sample"]
     head += [f"pilot at {spp}" for spp in (LONG, 4 * LONG)]

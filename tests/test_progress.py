@@ -21,9 +21,12 @@ def test_a_bar_shows_rate_and_time_left():
     bar(report(1, total=4))
     assert bar.description == "1/4 spp, 2.5 M rays/s, 6 s left" and bar.completed == 0.25
     bar.close()
-    bar = progress.Bar(8.0, Console(file=io.StringIO()))
-    bar(report(8, total=progress.OPEN_ENDED, rays=2000))
+    bar = progress.Bar(8.0, True, console=Console(file=io.StringIO()))
+    bar(report(8, total=1 << 16, rays=2000))
     assert bar.description == "8 spp, 1 k rays/s, 6 s left" and bar.completed == 0.25
+    bar = progress.Bar(console=Console(file=io.StringIO()))
+    bar(report(1 << 14, total=1 << 16))
+    assert bar.description.startswith("16384/65536 spp, ") and bar.description.endswith(" s left")
 
 
 def test_a_bar_is_drawn_on_terminals_alone():
@@ -60,12 +63,15 @@ def test_lines_come_now_and_then(monkeypatch):
 
 def test_percentages_are_those_that_farms_read():
     """Expected: each whole per cent once, in lines that the expressions of Deadline's plugins
-    (``.*Progress: (\\d+)%.*``) and of Alfred's readers (``ALF_PROGRESS\\s+([0-9]+)%``) find.
+    (``.*Progress: (\\d+)%.*``) and of Alfred's readers (``ALF_PROGRESS\\s+([0-9]+)%``) find; 100 at the end
+    of a render that has ended before its samples or its time.
     """
     stream = io.StringIO()
-    show = progress.Percentages(10.0, stream)
-    for done, seconds in ((0.2, 0.01), (1, 0.1), (1.4, 0.1), (50, 1.0), (60, 9.0), (100, 9.5)):
+    show = progress.Percentages(10.0, stream=stream)
+    for done, seconds in ((0.2, 0.01), (1, 0.1), (1.4, 0.1), (50, 1.0), (60, 9.0)):
         show(report(done, seconds=seconds))
+    show.finish()
+    show(report(100, seconds=9.5))
     expected = [f"ALF_PROGRESS {n}% Progress: {n}%" for n in (0, 1, 50, 90, 100)]
     assert stream.getvalue().splitlines() == expected
 
@@ -77,6 +83,7 @@ def test_which_display(monkeypatch):
         shown = progress.display(name)
         assert type(shown).__name__ == kinds[name]
         shown(report(1))
+        shown.finish()
         shown.close()
 
 

@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 # Seconds between two lines of a log, at least, and as a share of those that the render has taken.
 EVERY, SHARE = 10.0, 0.02
 
-# A total of so many samples per pixel stands for as many as time allows.
-OPEN_ENDED = 1 << 16
-
 
 class Report(Protocol):
     """What displays ask of a `PassReport`."""
@@ -53,9 +50,11 @@ def seconds_left(report: Report, limit: float | None = None) -> float:
     return max(0.0, min(left, limit - report.seconds)) if limit else left
 
 
-def in_words(report: Report, limit: float | None = None) -> str:
-    """Samples per pixel, rays per second, what is left, and the estimated error if there is one."""
-    open_ended = report.spp_total == OPEN_ENDED
+def in_words(report: Report, limit: float | None = None, open_ended: bool = False) -> str:
+    """Samples per pixel, rays per second, what is left, and the estimated error if there is one.
+
+    ``open_ended``: the total is not what somebody asked for.
+    """
     rate = readable(report.rays / max(report.seconds, 1e-9))
     text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp, {rate} rays/s"
     if limit or not open_ended:
@@ -80,13 +79,19 @@ def _say(line: str, stream: TextIO | None) -> None:
 
 
 class Display:
-    """Shows nothing."""
+    """Shows nothing.
 
-    def __init__(self, limit: float | None = None):
-        self._limit = limit
+    ``open_ended``: time or an error ends the render, not its total of samples.
+    """
+
+    def __init__(self, limit: float | None = None, open_ended: bool = False):
+        self._limit, self._open_ended = limit, open_ended
 
     def __call__(self, report: Report) -> None:
         """Show the ``report`` of a pass."""
+
+    def finish(self) -> None:
+        """Show that the render has come to its end, which reports of passes need not say."""
 
     def close(self) -> None:
         """Take away what is shown."""
@@ -98,11 +103,13 @@ class Bar(Display):
     ``console``: where else. `close` ends it; the last pass of a render does so too.
     """
 
-    def __init__(self, limit: float | None = None, console: Console | None = None):
+    def __init__(
+        self, limit: float | None = None, open_ended: bool = False, *, console: Console | None = None
+    ):
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 
-        super().__init__(limit)
+        super().__init__(limit, open_ended)
         console = console or Console(stderr=True)
         shown = console.is_terminal or console.is_jupyter
         columns = BarColumn(), TextColumn("{task.description}")
@@ -128,7 +135,8 @@ class Bar(Display):
             self._bar.start()
             self._begun = True
         done = share_done(report, self._limit)
-        self._bar.update(self._task, completed=done, description=in_words(report, self._limit))
+        text = in_words(report, self._limit, self._open_ended)
+        self._bar.update(self._task, completed=done, description=text)
         self._bar.refresh()
         if report.spp_done >= report.spp_total:
             self.close()
@@ -146,8 +154,15 @@ class Lines(Display):
     that the render has taken.
     """
 
-    def __init__(self, limit: float | None = None, stream: TextIO | None = None, every: float = EVERY):
-        super().__init__(limit)
+    def __init__(
+        self,
+        limit: float | None = None,
+        open_ended: bool = False,
+        *,
+        stream: TextIO | None = None,
+        every: float = EVERY,
+    ):
+        super().__init__(limit, open_ended)
         self._stream, self._every = stream or sys.stderr, every
         self._last = time.monotonic()
 
@@ -159,7 +174,7 @@ class Lines(Display):
         minutes, seconds = divmod(int(report.seconds), 60)
         clock = f"{minutes // 60:02d}:{minutes % 60:02d}:{seconds:02d}"
         done = share_done(report, self._limit)
-        _say(f"{clock} {done:4.0%} {in_words(report, self._limit)}", self._stream)
+        _say(f"{clock} {done:4.0%} {in_words(report, self._limit, self._open_ended)}", self._stream)
 
 
 class Percentages(Display):
@@ -169,12 +184,17 @@ class Percentages(Display):
     others' logs know (``ALF_PROGRESS 42%``).
     """
 
-    def __init__(self, limit: float | None = None, stream: TextIO | None = None):
-        super().__init__(limit)
+    def __init__(self, limit: float | None = None, open_ended: bool = False, *, stream: TextIO | None = None):
+        super().__init__(limit, open_ended)
         self._stream, self._last = stream, -1
 
     def __call__(self, report: Report) -> None:
-        percent = int(100 * share_done(report, self._limit))
+        self._show(int(100 * share_done(report, self._limit)))
+
+    def finish(self) -> None:
+        self._show(100)
+
+    def _show(self, percent: int) -> None:
         if percent > self._last:
             self._last = percent
             _say(f"ALF_PROGRESS {percent}% Progress: {percent}%", self._stream or sys.stdout)
@@ -184,8 +204,8 @@ KINDS = ("auto", "bar", "lines", "deadline", "none")
 """Names of displays on the command line."""
 
 
-def display(kind: str, limit: float | None = None) -> Display:
-    """The display of this name; ``auto``: a bar on a terminal, lines elsewhere."""
+def display(kind: str, limit: float | None = None, open_ended: bool = False) -> Display:
+    """The `Display` of this name; ``auto``: a bar on a terminal, lines elsewhere."""
     if kind == "auto":
         kind = "bar" if sys.stderr is not None and sys.stderr.isatty() else "lines"
-    return {"bar": Bar, "lines": Lines, "deadline": Percentages, "none": Display}[kind](limit)
+    return {"bar": Bar, "lines": Lines, "deadline": Percentages, "none": Display}[kind](limit, open_ended)

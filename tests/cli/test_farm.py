@@ -1,5 +1,6 @@
 """``render`` on a farm: signals, sizes, frames, more samples, what schedulers read."""
 
+import errno
 import os
 import re
 import signal
@@ -235,6 +236,22 @@ def test_progress_for_farms(capsys):
     *lines, last = capsys.readouterr().out.splitlines()
     found = [int(re.fullmatch(r"ALF_PROGRESS (\d+)% Progress: \1%", line)[1]) for line in lines]
     assert found == sorted(set(found)) and found[-1] == 100 and last.startswith("a.exr: ")
+    plain = SMALL[: SMALL.index("-P")]
+    for words in ([*SMALL, "--target-error", "0.5"], [*plain, "--spp", "4", "--integrator", "path"]):
+        assert main([*words, "--progress", "deadline", "-o", "b.exr"]) == 0
+        assert "ALF_PROGRESS 100% Progress: 100%" in capsys.readouterr().out
+
+
+def test_a_full_disk_is_said_with_the_file_and_a_remedy(capsys, monkeypatch):
+    """Expected: the error of the system names the file, and what to do."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "a.exr")
+
+    monkeypatch.setattr(render, "write_images", full)
+    assert main([*SMALL, "--spp", "4", "-o", "a.exr"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("error: 'a.exr': No space left on device; free some space")
 
 
 def test_a_scheduler_that_does_not_answer_is_said_soon(capsys):

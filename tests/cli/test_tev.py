@@ -111,9 +111,10 @@ def test_a_viewer_that_is_closed_does_not_end_the_render(capsys):
     assert capsys.readouterr().err.count("tev is gone") == 1
 
 
-@pytest.mark.parametrize("text", ["", ":1", "host:x", "host:0", "host:70000"])
+@pytest.mark.parametrize("text", ["", ":1", "host:x", "host:0", "host:70000", "::1", "[::1]:x", "[]:5"])
 def test_addresses(text):
     assert tev.address("host") == ("host", tev.PORT) and tev.address("10.0.0.1:5") == ("10.0.0.1", 5)
+    assert tev.address("[::1]:5") == ("::1", 5) and tev.address("[::1]") == ("::1", tev.PORT)
     with pytest.raises(ValueError, match="HOST:PORT"):
         tev.address(text)
     with pytest.raises(SystemExit):

@@ -212,12 +212,12 @@ def behind_glass(**shapes):
 
 def test_parameters_are_read_once(monkeypatch):
     """Rationale: it takes up to 8 ms; pilot and look for lost light both need them. Expected: once
-    in a render, twice where ``on_pass`` was called, which may edit them."""
+    in a render, twice where ``on_pass`` was called, which may edit them; beside those of shapes alone."""
     read, original = [], State.of
 
-    def of(owners):
-        read.append(owners)
-        return original(owners)
+    def of(owners, deep=True):
+        read.extend([owners] * deep)
+        return original(owners, deep)
 
     monkeypatch.setattr(State, "of", of)
     integrator = bdpt()

@@ -173,11 +173,11 @@ def test_geometric_mean():
 @pytest.fixture
 def results():
     """`path` half as good, with multijitter a quarter better, in `box`; in `dark` path misses a tenth."""
-    rows = noisy("bdpt", 16) + noisy("path", 16, rel_mse=0.04, rel_mse_trimmed=0.04)
+    rows = noisy("bdpt", 16, spread_trimmed=0.02) + noisy("path", 16, rel_mse=0.04, rel_mse_trimmed=0.04)
     rows += noisy("path multijitter", 16, rel_mse=0.016, rel_mse_trimmed=0.016)
     rows += noisy("bdpt skip=none", 16, seconds=3.0) + noisy("ptracer", 16, 0.5)
     rows += noisy("bdpt skip=impossible", 16, seconds=1.5)
-    rows += noisy("bdpt emission_guiding=never", 16, rel_mse_trimmed=0.05)
+    rows += noisy("bdpt emission_guiding=never", 16, rel_mse_trimmed=0.05, spread_trimmed=0.06)
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
     values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}
@@ -304,7 +304,9 @@ def test_goals_stand_beside_what_is_measured(results):
         "fewer than two renders at 64 spp, fewer than two renders at 256 spp",
     ]
     assert cells(text, "none") == ["2x", "–", "3x, 2 of 2 scenes"]
-    assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5)"]
+    assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5); by the spread over seeds 3x (3–3)"]
+    with pytest.raises(Refused, match="not measured"):
+        results.efficiency("box", "path", "spread_trimmed")
     assert cells(text, "cold") == ["4x", "–", "4.00 s, 2x (2–2) `path`'s"]
     assert cells(text, "memory") == ["1 GiB", "–", "not measured"]
     assert cells(text, "floor") == ["1x", "–", "1.3x (1.2–1.4) `box`"]

@@ -3,6 +3,7 @@
 Each docstring or comment has the arithmetic. Where a bound is statistical it is named; seeds are fixed.
 """
 
+import math
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.measure import agreement, efficiency, metrics
 from mitsuba_bdpt.measure.agreement import Sample
 from mitsuba_bdpt.measure.checks import Estimate
@@ -93,6 +95,25 @@ def test_trimming_only_lowers(image, reference, trim):
     raw = metrics.rel_mse(image, reference)
     assert 0 <= metrics.rel_mse(image, reference, trim) <= raw * (1 + 1e-12)
     assert metrics.rel_mse(reference, reference, trim) == 0
+
+
+def test_the_spread_of_renders():
+    """Expected: without bias the mean relMSE, within three standard errors of 2 / sqrt(values); with an error
+    that all have, such as light that none finds, that of before; trimmed, less for a value that one alone
+    has."""
+    rng = np.random.default_rng(3)
+    truth = rng.uniform(0.5, 2, (40, 40, 3))
+    images = [truth * (1 + 0.1 * rng.standard_normal(truth.shape)) for _ in range(6)]
+    errors = [metrics.rel_mse(image, truth) for image in images]
+    found = metrics.spread(images, truth)
+    assert np.mean(found) == pytest.approx(np.mean(errors), rel=6 / math.sqrt(5 * truth.size))
+    darker = [image - 0.2 for image in images]
+    np.testing.assert_allclose(metrics.spread(darker, truth), found)
+    images[2][3, 4, 1] += 50
+    raw, trimmed = (metrics.spread(images, truth, trim) for trim in (0.0, 0.001))
+    assert raw[2] > 5 * found[2] and trimmed[2] == pytest.approx(found[2], rel=0.1)
+    with pytest.raises(CommandError, match="1 images"):
+        metrics.spread(images[:1], truth)
 
 
 def test_energy_in_black():

@@ -80,10 +80,12 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     """Render as the command line ``options`` say on a cluster, into the sensor's film.
 
     The cluster is that of ``options.scheduler``; ``on_part`` is called after each part. Returns the
-    statistics, whose seconds are those of the pilot and all parts together, and whether Ctrl-C came: then
-    they are of the parts before the first one that had not come. Raises what `connected` does.
+    statistics, whose seconds are those of the pilot and all parts together, and what ended the render early,
+    None if nothing did: Ctrl-C, a scheduler that is gone, a part that failed. Then they are of the parts
+    before the first one that had not come. Raises what `connected` does, and what ends the render before the
+    first part.
     """
-    started, merged, interrupted = time.perf_counter(), Merged(), False
+    started, merged, ended = time.perf_counter(), Merged(), None
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
         asked = integrator.statistics  # before the parts, whose own take their place
@@ -98,12 +100,14 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
                     seconds = time.perf_counter() - started
                     image = partial(integrator.assemble, done, scene, options.sensor)
                     on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s, image))
-        except KeyboardInterrupt:
-            interrupted = True
+        except (KeyboardInterrupt, OSError, RuntimeError) as error:
+            ended = error
     if merged.snapshot is None:
-        return {"passes": []}, interrupted
+        if isinstance(ended, Exception):
+            raise ended
+        return {"passes": []}, ended
     integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
-    return _with_pilot(integrator.statistics, asked), interrupted
+    return _with_pilot(integrator.statistics, asked), ended
 
 
 def _with_pilot(parts: dict, asked: dict) -> dict:

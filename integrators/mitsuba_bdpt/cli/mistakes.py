@@ -43,8 +43,7 @@ def answered(main: Callable[[], Status]) -> Status | int:
             raise KeyboardInterrupt from error
         if not is_mistake(error):
             raise
-        text = _of_system(error) if isinstance(error, OSError) else message(error)
-        print(f"error: {' '.join(text.split())}", file=sys.stderr)
+        print(f"error: {' '.join(in_words(error).split())}", file=sys.stderr)
         return STATUS
 
 
@@ -62,10 +61,10 @@ REMEDIES = {
 """What to do about errors of the system."""
 
 
-def _of_system(error: OSError) -> str:
-    """What the system could not do, with which file, and what to do about it."""
-    if error.strerror is None or error.filename is None:
-        return str(error)
+def in_words(error: Exception) -> str:
+    """What went wrong; of what the system could not do, with which file, and what to do about it."""
+    if not isinstance(error, OSError) or error.strerror is None or error.filename is None:
+        return message(error)
     remedy = REMEDIES.get(error.errno or 0)
     return f"{str(error.filename)!r}: {error.strerror}" + (f"; {remedy}" if remedy else "")
 

@@ -15,17 +15,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError, message
+from ..errors import CommandError
 from ..files.images import check_channels, check_png, prepare_output, write_images
 from ..files.loading import check_file, choose_sensor, load
 from ..host.versions import versions
-from ..progress import OPEN_ENDED, display, readable
+from ..progress import display, readable
 from ..run.rendering import PassReport
 from . import checkpoints, cluster, extension, live
-from .mistakes import INTERRUPTED
+from .mistakes import INTERRUPTED, in_words
 from .signals import Ending, terminable
 
-UNLIMITED_SPP = OPEN_ENDED
+UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""
 
 PASS_SPP = 16
@@ -43,6 +43,8 @@ class Outcome:
     spp: int
     interrupted: bool = False
     statistics: dict = field(default_factory=dict)
+    error: Exception | None = None
+    """What has ended it before its end, if something else than a signal has."""
     written: Callable[[], object] = lambda: None
     """To be called when the image is written."""
 
@@ -69,7 +71,7 @@ def run(options: Namespace) -> int:
             print("interrupted; no image written", file=sys.stderr)
             return ending.status
         except (OSError, RuntimeError, TypeError, ValueError) as error:
-            print(f"error: {message(error)}", file=sys.stderr)
+            print(f"error: {in_words(error)}", file=sys.stderr)
             return 1
     return 0
 
@@ -111,8 +113,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
     Once rendered, it is written whatever signals come, and only then a checkpoint is removed.
     """
     sensor = choose_sensor(scene, job.sensor)
-    open_ended = job.time is not None or job.target_error is not None
-    spp = job.spp or (UNLIMITED_SPP if open_ended else sensor.sampler().sample_count())
+    spp = job.spp or (UNLIMITED_SPP if is_open_ended(job) else sensor.sampler().sample_count())
     if not spp:
         raise CommandError("The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N.")
     outcome = render(scene, integrator, job, spp)
@@ -127,7 +128,14 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
         say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
     finally:
         ending.patient = False
+    if outcome.error is not None:
+        raise outcome.error
     return not outcome.interrupted and not ending.asked
+
+
+def is_open_ended(options: Namespace) -> bool:
+    """Whether a render ends by its time or its error, where no number of samples is asked for."""
+    return options.time is not None or options.target_error is not None
 
 
 def say(line: str) -> None:
@@ -150,7 +158,7 @@ def explain(options: Namespace) -> int:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
     except (OSError, RuntimeError, TypeError, ValueError) as error:
-        print(f"error: {message(error)}", file=sys.stderr)
+        print(f"error: {in_words(error)}", file=sys.stderr)
         return 1
     return 0
 
@@ -213,10 +221,12 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
         shown = display(options.progress)
         try:
             watch = all_of([shown, *watchers])
-            statistics, interrupted = cluster.render(scene, integrator, options, spp, watch)
+            statistics, ended = cluster.render(scene, integrator, options, spp, watch)
         finally:
             shown.close()
-        return Outcome(time.perf_counter() - started, sum(statistics["passes"]), interrupted, statistics)
+        seconds, done = time.perf_counter() - started, sum(statistics["passes"])
+        error = ended if isinstance(ended, Exception) else None
+        return Outcome(seconds, done, ended is not None, statistics, error)
 
 
 def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
@@ -244,7 +254,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     if options.checkpoint is not None:
         kept = checkpoints.Checkpoints(options, options.output)
         watchers = [kept.after_pass, *watchers]
-    shown = display(options.progress, limit)
+    shown = display(options.progress, limit, not options.spp and is_open_ended(options))
     try:
         if hasattr(integrator, "on_pass"):
             watch = all_of([*watchers, shown])
@@ -252,6 +262,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
         arguments = {} if start is None else {"start": start}
         integrator.render(scene, options.sensor, seed, spp, develop=False, evaluate=True, **arguments)
         dr.sync_thread()
+        shown.finish()
     except KeyboardInterrupt:
         interrupted = True
     finally:

@@ -31,10 +31,14 @@ CREATE, UPDATE = 4, 6
 
 
 def address(text: str) -> tuple[str, int]:
-    """Host and port of ``HOST`` or ``HOST:PORT``; raises ``ValueError``."""
+    """Host and port of ``HOST`` or ``HOST:PORT``, IPv6 addresses in brackets; raises ``ValueError``."""
     host, colon, port = text.rpartition(":")
-    if not colon:
+    if not colon or text.endswith("]"):
         host, port = text, str(PORT)
+    if host.startswith("[") and host.endswith("]"):
+        host = host[1:-1]
+    elif ":" in host:
+        host = ""
     if not host or not port.isdecimal() or not 0 < int(port) < 1 << 16:
         raise ValueError(f"got {text!r}, which must have the form HOST or HOST:PORT")
     return host, int(port)

@@ -104,7 +104,7 @@ class AreaEmitters(Group):
 
     def __init__(self, emitters, context: Context):
         self._emitters = emitters
-        spheres = spheres_of(emitters)
+        spheres = spheres_of(emitters, context)
         pairs = list(zip(emitters, spheres, strict=True))
         by_texture = [e and not context.ask_shapes and is_sampled_by_texture(e, s) for e, s in pairs]
         by_shape = [e and is_textured(e) and not b for (e, _), b in zip(pairs, by_texture, strict=True)]

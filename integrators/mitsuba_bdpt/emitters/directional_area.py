@@ -22,7 +22,7 @@ class DirectionalAreaEmitters(Group):
     limits = "its light leaves in one direction only"
 
     def __init__(self, emitters, context: Context):
-        self._surfaces = Surfaces(emitters, context, spheres_of(emitters))
+        self._surfaces = Surfaces(emitters, context, spheres_of(emitters, context))
         # Its radiance is told by its texture alone.
         self._radiances = [(i, children(e)["radiance"]) for i, e in enumerate(emitters) if e is not None]
 

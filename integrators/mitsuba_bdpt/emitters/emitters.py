@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from ..errors import UsageError
 from ..geometry import rounding
+from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
 from .emission_tables import Cell, EmissionGuide, EmissionTables, cell_at, side_of
@@ -46,13 +47,16 @@ class Emitters:
     an emission (else 0).
     """
 
-    def __init__(self, scene: mi.Scene):
+    def __init__(self, scene: mi.Scene, facts: ShapeFacts | None = None):
         self.scene = scene
-        self.shape_errors = rounding.ShapeErrors(scene)
+        facts = facts or ShapeFacts(scene)
+        self.shape_errors = facts.errors
         emitters = scene.emitters()
         types = [group_of(emitter) for emitter in emitters]
         weights = [number(emitter.sampling_weight()) for emitter in emitters]
+        registered = registered_emitters()
         self._summarize(emitters, types, weights)
+        self.evaluated = any(map(needs_evaluation, registered))
         self.groups, self.disks, self.side, self.first = (), None, 0, None
         if not emitters:
             return
@@ -61,7 +65,7 @@ class Emitters:
         sampling_weight = mi.Float(weights)
         self._pmf, self._inverse = sampling_weight / dr.sum(sampling_weight), inverse_table(self._pointers)
         dr.schedule(self._pmf)  # so that groups' tables and it are one kernel
-        context = Context(scene, self.shape_errors, self._cannot_be_asked())
+        context = Context(scene, facts, self._cannot_be_asked(registered))
         present = [group for group in GROUPS if group in types]
         self.groups = tuple(
             group([e if t is group else None for e, t in zip(emitters, types, strict=True)], context)
@@ -92,18 +96,17 @@ class Emitters:
         of_groups = list(zip(weights, types, strict=True))
         far = sum(w for w, t in of_groups if t.at_infinity)
         self.far_share = far / sum(w for w, t in of_groups if t.supports_emission) if far > 0 else 0.0
-        self.evaluated = any(needs_evaluation(name) for name in registered_emitters())
         self.tables = [t.tables(e) for e, t in zip(emitters, types, strict=True)]
         self.left_out: list[tuple[str, str]] = [
             text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)
         ]
 
-    def _cannot_be_asked(self) -> bool:
-        """Whether `sample_position` cannot be called on emitters.
+    def _cannot_be_asked(self, registered: list[str]) -> bool:
+        """Whether `sample_position` cannot be called on emitters, of these classes in the process.
 
         A call visits every living one, those of other scenes too, and classes of the user's need not have it.
         """
-        if not any(is_third_party(name) for name in registered_emitters()):
+        if not any(map(is_third_party, registered)):
             return False
         try:
             self._pointers.sample_position(mi.Float(0), mi.Point2f(0.5), mi.Bool(True))

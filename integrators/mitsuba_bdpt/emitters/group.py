@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays, rounding
+from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import named
 from .emission_tables import EmissionGuide, Factor, Place
 from .records import Chosen, Direct, Emission, Hit
@@ -18,13 +19,18 @@ from .records import Chosen, Direct, Emission, Hit
 class Context:
     """What groups of emitters are made in.
 
-    The ``scene``, the `rounding.ShapeErrors` of its shapes (``shape_errors``), and whether points on shapes
-    are asked of the shapes (``ask_shapes``) since emitters cannot be asked.
+    The ``scene``, the `ShapeFacts` of its shapes, and whether points on shapes are asked of the shapes
+    (``ask_shapes``) since emitters cannot be asked.
     """
 
     scene: mi.Scene
-    shape_errors: rounding.ShapeErrors
+    facts: ShapeFacts
     ask_shapes: bool
+
+    @property
+    def shape_errors(self) -> rounding.ShapeErrors:
+        """The `rounding.ShapeErrors` of the scene's shapes."""
+        return self.facts.errors
 
 
 class Group:

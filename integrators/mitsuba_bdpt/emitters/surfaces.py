@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -41,8 +42,11 @@ class Surfaces:
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
-        for emitter in filter(None, emitters):
-            _check(emitter, context)
+        for number, emitter in enumerate(emitters):
+            if emitter is not None:
+                context.facts.about("to_world", number, partial(_check_to_world, emitter))
+                if context.ask_shapes:
+                    refuse_curves(context.scene, emitter, "lives with a class that has no sample_position")
         # Before areas are asked for: of a mesh whose faces have vertices that do not exist it is any number.
         self._smooth_meshes = SmoothMeshes.of(emitters)
         self.smooth = self._smooth_meshes is not None
@@ -107,15 +111,17 @@ class Surfaces:
         return rays.sampled_anchor(p, n, reference, errors)
 
 
-def spheres_of(emitters) -> list[Sphere | None]:
+def spheres_of(emitters, context: Context) -> list[Sphere | None]:
     """The shapes of ``emitters`` that are spheres."""
-    return rows(emitters, None, lambda emitter: Sphere.of(emitter.get_shape()))
+
+    def sphere(number: int, emitter: mi.Emitter) -> Sphere | None:
+        return context.facts.about("sphere", number, lambda: Sphere.of(emitter.get_shape()))
+
+    return [None if emitter is None else sphere(n, emitter) for n, emitter in enumerate(emitters)]
 
 
-def _check(emitter, context: Context):
+def _check_to_world(emitter: mi.Emitter) -> None:
     check_to_world(emitter.get_shape(), f"emitter {named(emitter)}")
-    if context.ask_shapes:
-        refuse_curves(context.scene, emitter, "lives with a class that has no sample_position")
 
 
 def refuse_curves(scene, emitter, why: str):

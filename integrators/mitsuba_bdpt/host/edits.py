@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .introspection import all_parameters
+from .introspection import all_parameters, own_parameters
 
 # Arrays of up to so many entries are kept, so that no other gets their number. Larger ones would outlive a
 # scene that takes gigabytes.
@@ -31,10 +31,11 @@ class State:
     kept: tuple[Any, ...] = field(compare=False, repr=False)
 
     @classmethod
-    def of(cls, owners: Iterable[mi.Object]) -> State:
-        """The present state of ``owners`` and of all that they hold."""
+    def of(cls, owners: Iterable[mi.Object], deep: bool = True) -> State:
+        """The present state of ``owners``, and of all that they hold if ``deep``."""
         marks, kept = [], []
-        for value in all_parameters(owners):
+        own = (value for owner in owners for value in own_parameters(owner).values())
+        for value in all_parameters(owners) if deep else own:
             indices = dr.detail.collect_indices(value)
             if not indices:
                 marks.append(repr(value))

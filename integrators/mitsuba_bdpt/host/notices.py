@@ -55,16 +55,21 @@ def _alone() -> int:
 
 
 def remembered(
-    scene: mi.Scene, sensor: mi.Sensor, kind: str, key: Hashable, find: Callable[[], Found]
+    scene: mi.Scene,
+    sensor: mi.Sensor,
+    kind: str,
+    key: Hashable,
+    find: Callable[[], Found],
+    most: int = FINDINGS,
 ) -> tuple[Found, bool]:
     """Return what ``find()`` returned for this ``key``, and whether it is remembered from an earlier call.
 
-    Of each ``kind`` the latest `FINDINGS` are kept.
+    Of each ``kind`` the latest ``most`` are kept.
     """
     known = notes(scene, sensor).setdefault(kind, {})
     is_known, found = key in known, known.pop(key, None)
     known[key] = found = found if is_known else find()
-    while len(known) > FINDINGS:
+    while len(known) > most:
         del known[next(iter(known))]
     return found, is_known
 

@@ -91,7 +91,12 @@ def judged(own: float, measured: float) -> bool:
 
 
 def check_judged(rows, error: str) -> None:
-    """Raise `Refused` if the reference is too noisy for the median of the errors."""
+    """Raise `Refused` if the reference is too noisy for the median of the errors.
+
+    Those that are not among `OWN` need none.
+    """
+    if error not in OWN:
+        return
     measured, own = (float(np.median([row[key] for row in rows])) for key in (error, OWN[error]))
     if judged(own, measured):
         return
@@ -134,9 +139,14 @@ def pair_ratios(ours, theirs, error="rel_mse_trimmed") -> list[float]:
 
 
 def efficiency(ours, theirs, error="rel_mse_trimmed") -> Summary:
-    """Summary of `pair_ratios`; raises `Refused` where the reference is too noisy or an error is 0."""
+    """Summary of `pair_ratios`; raises `Refused` where the reference is too noisy or an error is 0.
+
+    ``error``: one of `OWN`, or ``spread`` or ``spread_trimmed``: see `metrics.spread`.
+    """
     if len(ours) < 2 or len(theirs) < 2:
         raise Refused("fewer than two renders")
+    if any(row.get(error) is None for row in (*ours, *theirs)):
+        raise Refused("not measured")
     for rows in (ours, theirs):
         if any(row[error] == 0 for row in rows):
             raise Refused(f"{rows[0]['method']} is exact here")

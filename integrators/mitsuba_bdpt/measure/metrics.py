@@ -61,6 +61,26 @@ def rel_mse(image, reference, trim=0.0) -> float:
     return float(error[kept].mean())
 
 
+def spread(images, reference, trim=0.0) -> list[float]:
+    """Of each of n independent ``images`` of one mean, what `rel_mse` would be without bias.
+
+    The mean of (x - m)^2 n / (n - 1) / (r^2 + eps), m the mean of the n images and r the ``reference``, which
+    weighs pixels and may have an error of its own: what all images lack counts as little as what it has too
+    much.
+    """
+    centre = np.mean(images, axis=0)
+    if len(images) < 2:
+        raise CommandError(f"images has {len(images)} images; a spread takes 2 or more.")
+    scale = len(images) / (len(images) - 1)
+    weights = 1 / np.sqrt(image_of("reference", reference) ** 2 + rel_mse_epsilon(reference))
+    return [scale * _kept_mean((((image - centre) * weights) ** 2).ravel(), trim) for image in images]
+
+
+def _kept_mean(errors, trim) -> float:
+    """The mean of ``errors`` without the share ``trim`` of the largest."""
+    return float(errors[_smallest(errors, trim)].mean())
+
+
 def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
     """What the reference's own error adds to ``rel_mse(image, reference, trim)``.
 
@@ -77,13 +97,18 @@ def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
 def _relative_errors(image, reference, trim):
     """Squared relative errors (n,), and the indices of those that are not trimmed."""
     image, reference = pair_of(image, reference)
+    error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
+    return error, _smallest(error, trim)
+
+
+def _smallest(errors, trim):
+    """The indices of ``errors`` without the share ``trim`` of the largest."""
     if trim != 0:
         trim = number_of("trim", trim, 0, 1)
-    error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
-    keep = len(error) - round(trim * len(error))
+    keep = len(errors) - round(trim * len(errors))
     if keep == 0:
-        raise CommandError(f"trim={trim} leaves none of {len(error)} values; choose a smaller share.")
-    return error, np.argpartition(error, keep - 1)[:keep]
+        raise CommandError(f"trim={trim} leaves none of {len(errors)} values; choose a smaller share.")
+    return np.argpartition(errors, keep - 1)[:keep]
 
 
 def mape(image, reference) -> float:

@@ -405,7 +405,11 @@ def _against_none(results: Results) -> str:
 
 
 def _unaimed(results: Results, scene: str) -> str:
-    return ranged(results.efficiency(scene, UNAIMED))
+    error, noise = (
+        said(partial(results.efficiency, scene, UNAIMED, error))
+        for error in ("rel_mse_trimmed", "spread_trimmed")
+    )
+    return f"{error}; by the spread over seeds {noise}"
 
 
 def _alone(results: Results, scene: str) -> str:

@@ -119,7 +119,30 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
     if cells.more is not None:
         wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
     found = read_rows(output, cells, wanted.values())
-    return [row | {"first": preset.methods[0].name} for row in found]
+    spreads = _spreads(output, cells, list(wanted.values()), found) if found else {}
+    return [row | spreads[row["key"]] | {"first": preset.methods[0].name} for row in found]
+
+
+def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[dict]) -> dict[str, dict]:
+    """`metrics.spread` of the renders of each integrator and budget, raw and trimmed, by the rows' keys.
+
+    None where there are fewer than two, or several numbers of samples.
+    """
+    reference = load_reference(*cells.where()).image
+    there = {row["key"]: row for row in table}
+    groups: dict[tuple[str, int], list[Cell]] = {}
+    for cell in wanted:
+        if cell.key in there:
+            groups.setdefault((cell.method, cell.budget), []).append(cell)
+    found = {key: {"spread": None, "spread_trimmed": None} for key in there}
+    for group in groups.values():
+        if len(group) < 2 or len({there[cell.key]["spp"] for cell in group}) > 1:
+            continue
+        images = [_image(output, cell) for cell in group]
+        raw, trimmed = (metrics.spread(images, reference, trim) for trim in (0.0, metrics.TRIM))
+        for cell, *both in zip(group, raw, trimmed, strict=True):
+            found[cell.key] = dict(zip(("spread", "spread_trimmed"), both, strict=True))
+    return found
 
 
 def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:

@@ -81,6 +81,21 @@ class Decided:
     pilots: Pilots = Pilots()
 
 
+@dataclass(frozen=True)
+class _Answer:
+    """What a pilot says.
+
+    The ``table`` of its predictions, the best first, and what that leaves out; the ``moments`` that they
+    follow from, those of the pilot ``with_tables`` of emission if there was one; how many were ``asked``.
+    """
+
+    table: tuple[choice.Prediction, ...]
+    left_out: tuple[dict[str, str], ...]
+    moments: Moments
+    with_tables: Moments | None
+    asked: int
+
+
 class Planner:
     """The ``plan`` of one render of ``spp`` samples per pixel, and who decides it.
 
@@ -127,10 +142,26 @@ class Planner:
     def ask(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Ask a pilot and adopt what it says; returns its predictions, the best first."""
         samples = self._expected(passes)
+        if self.decided.pilots.asked:
+            answer = self._answer(samples)
+        else:  # that of each render of the scene
+            key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
+            answer, is_known = self._findings.find("answers", key, lambda: self._answer(samples))
+            if is_known:
+                pilots = self.decided.pilots._replace(asked=answer.asked, remembered=answer.asked)
+                self.decided = replace(self.decided, pilots=pilots, moments=answer.moments)
+                self._with_tables = answer.with_tables
+        if answer.table:
+            self.adopt(answer.table[0].decided(len(passes), answer.moments.mean), answer.left_out)
+        self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
+        return list(answer.table)
+
+    def _answer(self, samples: int) -> _Answer:
+        """What a pilot, and the earlier ones of this render with it, say of so many ``samples``."""
         found, before = self._measured(samples), self.decided.moments
         moments = found if before is None else before.joined(found)
         self.decided = replace(self.decided, moments=moments)
-        alternatives = self._alternatives(samples)
+        alternatives, left_out = self._alternatives(samples), ()
         table = choice.choose(moments, alternatives)
         if not moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
             table = []
@@ -139,10 +170,11 @@ class Planner:
             table[0] = self._joined(table[0], samples)
             gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
-            left_out = choice.left_out(table, gain, name) + emission.left_out(table[0].candidate, learnt)
-            self.adopt(table[0].decided(len(passes), moments.mean), left_out)
-        self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
-        return table
+            left_out = (
+                *choice.left_out(table, gain, name),
+                *emission.left_out(table[0].candidate, learnt),
+            )
+        return _Answer(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)
 
     def _aimed(
         self, table: list[choice.Prediction], moments: Moments, samples: int

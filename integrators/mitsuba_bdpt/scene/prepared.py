@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.emitters import Emitters
+from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, children, is_instance
 from ..media.media import Media, Space
 from ..sensors.kinds import prepare
@@ -27,7 +28,7 @@ class PreparedScene:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
         self.scene = scene
         self.surfaces = bool(scene.shapes())
-        self.emitters = Emitters(scene)
+        self.emitters = Emitters(scene, ShapeFacts.of(scene, sensor))
         self.camera = prepare(sensor, self.emitters.shape_errors, self.surfaces)
         found = bsdfs(scene)
         _prepare_bitmaps(found)
