@@ -250,14 +250,17 @@ def _by_seed(output: Path, table: list[dict]) -> list[np.ndarray]:
 
 
 def measured(options: Namespace, folder: Path) -> tuple[Findings, bool]:
-    """Render the scenes and write the texts after each; what they say, and whether a scene was left out."""
+    """Render the scenes and write the texts after each; what they say, and whether all is well.
+
+    It is where none of this run's scenes is left out, or rendered wrongly as far as checks tell.
+    """
     everything = found_in(options.folder)
     files, lost = chosen(options)
     texts = Texts.of(folder, [*everything[0], *everything[1]], not options.scenes)
     for name in files:
         texts.left_out.pop(name, None)
     texts.left_out.update(lost)
-    table, findings = [], None
+    table = []
     for name, file in files.items():
         try:
             rows, texts.notes[name] = rows_of(found(name, file, options), options, Project(folder))
@@ -266,8 +269,9 @@ def measured(options: Namespace, folder: Path) -> tuple[Findings, bool]:
             raise_interrupt(error)
             lost[name] = texts.left_out[name] = " ".join(message(error).split())
             print(f"{name}: left out: {lost[name]}", flush=True)
-        findings = texts.write(table)
-    return findings or texts.write(table), bool(lost)
+        texts.write(table, is_over=False)
+    findings = texts.write(table, is_over=True)
+    return findings, not lost and files.keys().isdisjoint(findings.wrong())
 
 
 def parser() -> argparse.ArgumentParser:
@@ -298,11 +302,11 @@ def main(arguments=None) -> int:
     mi.set_variant("llvm_ad_rgb")
     folder = options.output or ROOT / "results" / f"public_{options.folder.resolve().name}"
     check_folder(folder)
-    findings, lost = measured(options, folder)
+    findings, is_well = measured(options, folder)
     if findings.results.scenes:
         page.run(Namespace(project=folder, folder=str(folder), output=None))
     print(folder / "table.md", folder / "summary.md", sep="\n", end=f"\n\n{findings.words()}")
-    return int(lost or bool(findings.wrong()))
+    return int(not is_well)
 
 
 if __name__ == "__main__":

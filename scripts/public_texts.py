@@ -11,6 +11,8 @@ from mitsuba_bdpt.files.whole import check_own
 from mitsuba_bdpt.measure import page, report, rows
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.reference import reference_path
+from mitsuba_bdpt.measure.scenes import digest
 from public_table import MARK, Findings
 
 SAID = "said.json"
@@ -52,12 +54,23 @@ class Texts:
         )
         return Texts(folder, order, whole, left_out, notes)
 
-    def write(self, table: list[dict]) -> Findings:
-        """Write the rows ``table`` of this run, and the texts about them and what else there is."""
-        write_json(self.folder / SAID, {"left_out": self.left_out, "notes": self.notes})
-        if not self.whole:
+    def _is_old(self, row: dict) -> bool:
+        """Whether the reference of a row's scene is another one now; then the scene is left out."""
+        file = reference_path(Project(self.folder), row["scene"], row["resolution"], row["max_depth"])
+        is_old = not file.is_file() or digest(file) != row["reference_sha256"]
+        if is_old:
+            self.left_out[row["scene"]] = "its reference is another one now; run again, with this scene"
+        return is_old
+
+    def write(self, table: list[dict], is_over: bool) -> Findings:
+        """Write the rows ``table`` of this run, and the texts about them and what else there is.
+
+        Rows of other runs stay, until one of the whole folder ``is_over``.
+        """
+        if not (self.whole and is_over):
             table = rows.beside(table, self.order, self.folder)
-            table = [row for row in table if row["scene"] not in self.left_out]
+            table = [row for row in table if row["scene"] not in self.left_out and not self._is_old(row)]
+        write_json(self.folder / SAID, {"left_out": self.left_out, "notes": self.notes})
         if table:
             rows.write_tables(table, self.folder)
             loaded = report.load(Project(self.folder), self.folder)

@@ -55,8 +55,9 @@ def in_words(report: Report, limit: float | None = None, open_ended: bool = Fals
 
     ``open_ended``: the total is not what somebody asked for.
     """
-    rate = readable(report.rays / max(report.seconds, 1e-9))
-    text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp, {rate} rays/s"
+    text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp"
+    if report.rays:  # of other integrators they are not known
+        text += f", {readable(report.rays / max(report.seconds, 1e-9))} rays/s"
     if limit or not open_ended:
         text += f", {seconds_left(report, limit):.0f} s left"
     error = getattr(report, "error", None)

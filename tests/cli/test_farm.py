@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -92,20 +93,26 @@ def test_what_is_kept_needs_checkpoints(capsys):
 
 def test_size_and_crop():
     """Expected: the image's size and its proportions are those asked for; a crop window is that part of the
-    whole image, sample by sample.
+    whole image, by other points: of all parts of that size it is nearest to the one that was asked for, by
+    far (measured: 0.03 there, 0.88 one pixel beside it).
     """
-    arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "16"]
+    arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "64"]
     assert main([*arguments, "-o", "whole.exr"]) == 0
     whole = rendered.image("whole.exr", "RGB")[0]
     assert whole.shape == (16, 24, 3)
     assert (
-        main(["render", str(SCENE), "--size", "24x16", "--crop", "4,2,10,8", "--spp", "16", "-o", "part.exr"])
+        main(["render", str(SCENE), "--size", "24x16", "--crop", "4,2,10,8", "--spp", "64", "-o", "part.exr"])
         == 0
     )
     part = rendered.image("part.exr", "RGB")[0]
     assert part.shape == (8, 10, 3)
-    # Other points, the same picture.
-    assert abs(part.mean() / whole[2:10, 4:14].mean() - 1) < 0.1
+    off = {
+        (x, y): np.sqrt(np.mean((part - whole[y : y + 8, x : x + 10]) ** 2))
+        for x in range(15)
+        for y in range(9)
+    }
+    nearest, second = sorted(off, key=off.get)[:2]
+    assert nearest == (4, 2) and off[nearest] < 0.2 * off[second]
 
 
 def test_sizes_that_are_refused(capsys):
@@ -237,7 +244,8 @@ def test_progress_for_farms(capsys):
     found = [int(re.fullmatch(r"ALF_PROGRESS (\d+)% Progress: \1%", line)[1]) for line in lines]
     assert found == sorted(set(found)) and found[-1] == 100 and last.startswith("a.exr: ")
     plain = SMALL[: SMALL.index("-P")]
-    for words in ([*SMALL, "--target-error", "0.5"], [*plain, "--spp", "4", "--integrator", "path"]):
+    path = [*plain, "--integrator", "path"]
+    for words in ([*SMALL, "--target-error", "0.5"], [*path, "--spp", "4"], [*path, "--time", "0.2"]):
         assert main([*words, "--progress", "deadline", "-o", "b.exr"]) == 0
         assert "ALF_PROGRESS 100% Progress: 100%" in capsys.readouterr().out
 
@@ -252,6 +260,27 @@ def test_a_full_disk_is_said_with_the_file_and_a_remedy(capsys, monkeypatch):
     assert main([*SMALL, "--spp", "4", "-o", "a.exr"]) == 1
     said = capsys.readouterr().err
     assert said.startswith("error: 'a.exr': No space left on device; free some space")
+
+
+def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_path):
+    """Rationale: a network drive may be there when a render begins and gone when it ends. Expected: the image
+    is among the temporary files, the error says where, and the exit status is 1."""
+    original = render.write_images
+
+    def gone(film, output, *others):
+        if output == Path("a.exr"):
+            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), str(output))
+        original(film, output, *others)
+
+    monkeypatch.setattr(render, "write_images", gone)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert main([*SMALL, "--spp", "4", "-o", "a.exr"]) == 1
+    (rescued,) = tmp_path.glob("mitsuba-bdpt-*/a.exr")
+    assert rendered.image(rescued, "RGB")[0].shape == (16, 16, 3)
+    said = capsys.readouterr().err
+    assert (
+        said.startswith("error: 'a.exr': No such file") and f"the image is {str(rescued)!r} instead" in said
+    )
 
 
 def test_a_scheduler_that_does_not_answer_is_said_soon(capsys):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.errors import UsageError
 from mitsuba_bdpt.geometry import quadrics, rounding, shape_facts
+from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.jit import registered_emitters
 
 SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -90,6 +91,21 @@ def test_what_cannot_be_rendered_is_said_each_time():
             else:
                 with pytest.raises(UsageError, match="to_world"):
                     image(scene)
+
+
+def test_facts_are_not_those_of_another_scene(found, monkeypatch):
+    """Rationale: a scene may lie in memory where one was that is gone, and be rendered by the same sensor.
+    Expected: what is remembered for the one is not taken for the other, though all parameters are alike, if
+    Dr.Jit has given other numbers to its shapes, or normals are flipped."""
+    sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}})
+    monkeypatch.setattr(notices, "id", lambda scene: 0, raising=False)
+    kept = []
+    for flipped in (False, False, True):
+        ball = {"type": "sphere", "flip_normals": flipped}
+        kept.append(mi.load_dict({"type": "scene", "ball": ball}))
+        facts = [shape_facts.ShapeFacts.of(kept[-1], sensor) for _ in range(2)]
+        assert facts[0] is facts[1]
+    assert found.count("errors") == 3
 
 
 def test_no_scene_is_kept_alive():

@@ -66,14 +66,17 @@ def test_other_layers_are_untouched():
 
 
 def test_a_film_that_keeps_alpha_or_luminance():
-    """Expected: three denoised channels, whatever the film makes of the colours; alpha is no colour."""
+    """Expected: three denoised channels, whatever the film makes of the colours; alpha is no colour. The mean
+    of the denoised channels is that of the colours within a tenth, though the denoiser blurs: a 1 of alpha
+    among them would move it by half and more."""
     for pixel_format, channels in (("rgba", 4), ("luminance", 1)):
         described = mi.cornell_box()
         described["sensor"]["film"] |= {"width": 16, "height": 16, "pixel_format": pixel_format}
         scene = mi.load_dict(described)
         image = np.array(mi.load_dict({"type": "bdpt", "denoise": True}).render(scene, spp=4))
         assert image.shape[-1] == channels + 3 and np.all(np.isfinite(image))
-        assert abs(image[..., -3:].mean() / image[..., :channels].mean() - 1) < (1 if channels == 4 else 0.5)
+        colours = image[..., : min(channels, 3)]
+        assert abs(image[..., -3:].mean() / colours.mean() - 1) < 0.1
 
 
 def test_what_is_refused(monkeypatch):

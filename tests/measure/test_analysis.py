@@ -304,6 +304,12 @@ def test_goals_stand_beside_what_is_measured(results):
         "fewer than two renders at 64 spp, fewer than two renders at 256 spp",
     ]
     assert cells(text, "none") == ["2x", "–", "3x, 2 of 2 scenes"]
+    fog = noisy("bdpt", 16) + noisy("bdpt skip=none", 16, seconds=24.0) + noisy("volpath", 16)
+    with_fog = Results(results.rows + [r | {"scene": "fog"} for r in fog], results.references, {})
+    assert (
+        cells(report.goals_table(with_fog, goals), "none")[2]
+        == "6x, 3 of 3 scenes; without media: 3x, 2 of 2 scenes"
+    )
     assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5); by the spread over seeds 3x (3–3)"]
     with pytest.raises(Refused, match="not measured"):
         results.efficiency("box", "path", "spread_trimmed")

@@ -89,6 +89,17 @@ def test_the_command_on_scenes_of_this_project(tmp_path, capsys, monkeypatch):
     assert len(before) == 2 * 4 * 8 and public_scenes.main([*words, "--scenes", "box"]) == 0
     assert sorted((output / "cells").iterdir()) == before
     assert [(output / name).read_text() for name in ("table.md", "summary.md")] == [table, summary]
+    assert len((output / "rows.csv").read_text().splitlines()) == 1 + len(before)
+    # Without the images of what is finished rows stay, but for the spread over seeds, which is kept; with the
+    # reference of one scene another one now, the others' texts are written all the same.
+    shutil.rmtree(output / "images" / "point")
+    (reference,) = (output / "references").glob("point_*.exr")
+    reference.write_bytes(reference.read_bytes() + b"0")
+    assert public_scenes.main([*words, "--scenes", "box"]) == 0
+    said = (output / "summary.md").read_text()
+    assert (
+        "1 of 3 scenes were rendered" in said and "Left out: point: its reference is another one now" in said
+    )
 
 
 def test_scenes_are_found_in_both_layouts(tmp_path):
@@ -224,6 +235,7 @@ def test_what_another_run_left_stays(tmp_path):
     assert public_scenes.main([str(scenes), "-o", str(output), *TINY]) == 1
     assert "0 of 1 scenes were rendered" in (output / "summary.md").read_text()
     assert "gone.obj" in (output / "table.md").read_text() and not (output / "rows.csv").exists()
+    assert not (output / "rows.parquet").exists()
     texts = public_texts.Texts.of(output, ["broken", "new"], False)
     assert list(texts.left_out) == ["broken"] and not public_texts.Texts.of(output, ["broken"], True).left_out
 

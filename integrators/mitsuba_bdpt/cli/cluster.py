@@ -17,7 +17,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..errors import CommandError
+from ..errors import CommandError, behind
 from ..files.loading import load
 from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
@@ -70,6 +70,12 @@ class Merged:
             self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
             self._next += 1
 
+    def close(self) -> None:
+        """Add the parts behind one that will not come, in their order."""
+        for index in sorted(self._waiting):
+            part = self._waiting.pop(index)
+            self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
+
     @property
     def count(self) -> int:
         """Parts that have come."""
@@ -82,10 +88,10 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     The cluster is that of ``options.scheduler``; ``on_part`` is called after each part. Returns the
     statistics, whose seconds are those of the pilot and all parts together, and what ended the render early,
     None if nothing did: Ctrl-C, a scheduler that is gone, a part that failed. Then they are of the parts
-    before the first one that had not come. Raises what `connected` does, and what ends the render before the
-    first part.
+    that had come. Raises what `connected` does, and what ends the render before the first part.
     """
-    started, merged, ended = time.perf_counter(), Merged(), None
+    started, merged = time.perf_counter(), Merged()
+    ended: BaseException | None = None
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
         asked = integrator.statistics  # before the parts, whose own take their place
@@ -100,8 +106,9 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
                     seconds = time.perf_counter() - started
                     image = partial(integrator.assemble, done, scene, options.sensor)
                     on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s, image))
-        except (KeyboardInterrupt, OSError, RuntimeError) as error:
-            ended = error
+        except (KeyboardInterrupt, Exception) as error:
+            ended = behind(error, KeyboardInterrupt) or error
+    merged.close()
     if merged.snapshot is None:
         if isinstance(ended, Exception):
             raise ended

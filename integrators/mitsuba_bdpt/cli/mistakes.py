@@ -55,8 +55,8 @@ REMEDIES = {
     errno.EEXIST: "a file stands where a folder is needed: move it away, or give another path",
     errno.ENOTDIR: "a file stands where a folder is needed: move it away, or give another path",
     errno.EISDIR: "a folder stands where a file is needed: give another path",
-    errno.ENOSPC: "free some space and run the command again; what was finished is kept",
-    errno.EDQUOT: "free some space and run the command again; what was finished is kept",
+    errno.ENOSPC: "free some space and run the command again",
+    errno.EDQUOT: "free some space and run the command again",
 }
 """What to do about errors of the system."""
 

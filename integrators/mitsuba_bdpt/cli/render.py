@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping
@@ -123,7 +124,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
             return False
         attributes = {"bdptSettings": settings(job, spp), "bdptStatistics": report(outcome)}
-        write_images(sensor.film(), job.output, attributes, job.exposure)
+        write(sensor.film(), job, attributes)
         outcome.written()
         say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
     finally:
@@ -136,6 +137,23 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
 def is_open_ended(options: Namespace) -> bool:
     """Whether a render ends by its time or its error, where no number of samples is asked for."""
     return options.time is not None or options.target_error is not None
+
+
+def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
+    """Write the image of a job with these attributes.
+
+    Where that is not possible any more, among the files of the system that are temporary: hours of rendering
+    must not be lost with a network drive. That is an error all the same, which says where the image is.
+    """
+    try:
+        write_images(film, job.output, attributes, job.exposure)
+    except OSError as error:
+        rescued = Path(tempfile.mkdtemp(prefix="mitsuba-bdpt-")) / job.output.name
+        try:
+            write_images(film, rescued, attributes, job.exposure)
+        except OSError:
+            raise error from None
+        raise CommandError(f"{in_words(error)}; the image is {str(rescued)!r} instead") from error
 
 
 def say(line: str) -> None:
@@ -300,6 +318,16 @@ def reached(asked: float, statistics: Mapping) -> bool:
     return 0 < asked and statistics["error"] <= asked
 
 
+@dataclass(frozen=True)
+class _Report:
+    """What displays ask of a `PassReport`, of an integrator that tells nothing of its rays."""
+
+    spp_done: int
+    spp_total: int
+    seconds: float
+    rays: int = 0
+
+
 def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
     """Render with one seed after the other until the time is over, and leave the mean in the film.
 
@@ -307,6 +335,7 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
     """
     started, done, total, interrupted = time.perf_counter(), 0, 0.0, False
     film = choose_sensor(scene, options.sensor).film()
+    shown = display(options.progress, options.time, not options.spp)
     try:
         while done < spp and (done == 0 or time.perf_counter() - started < options.time):
             size, seed = min(PASS_SPP, spp - done), options.seed + done // PASS_SPP
@@ -314,8 +343,12 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
             # Raw sums with their weights: passes of any size and filter add up.
             total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
             done += size
+            shown(_Report(done, spp, time.perf_counter() - started))
+        shown.finish()
     except KeyboardInterrupt:
         interrupted = True
+    finally:
+        shown.close()
     if done:
         film.prepare(integrator.aov_names())
         mean = mi.TensorXf((total / done).astype(np.float32))

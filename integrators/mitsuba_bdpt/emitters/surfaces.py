@@ -42,11 +42,10 @@ class Surfaces:
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
-        for number, emitter in enumerate(emitters):
-            if emitter is not None:
-                context.facts.about("to_world", number, partial(_check_to_world, emitter))
-                if context.ask_shapes:
-                    refuse_curves(context.scene, emitter, "lives with a class that has no sample_position")
+        for emitter in filter(None, emitters):
+            context.facts.about("to_world", emitter.get_shape(), partial(_check_to_world, emitter))
+            if context.ask_shapes:
+                refuse_curves(context.scene, emitter, "lives with a class that has no sample_position")
         # Before areas are asked for: of a mesh whose faces have vertices that do not exist it is any number.
         self._smooth_meshes = SmoothMeshes.of(emitters)
         self.smooth = self._smooth_meshes is not None
@@ -114,10 +113,11 @@ class Surfaces:
 def spheres_of(emitters, context: Context) -> list[Sphere | None]:
     """The shapes of ``emitters`` that are spheres."""
 
-    def sphere(number: int, emitter: mi.Emitter) -> Sphere | None:
-        return context.facts.about("sphere", number, lambda: Sphere.of(emitter.get_shape()))
+    def sphere(emitter: mi.Emitter) -> Sphere | None:
+        shape = emitter.get_shape()
+        return context.facts.about("sphere", shape, lambda: Sphere.of(shape))
 
-    return [None if emitter is None else sphere(n, emitter) for n, emitter in enumerate(emitters)]
+    return rows(emitters, None, sphere)
 
 
 def _check_to_world(emitter: mi.Emitter) -> None:

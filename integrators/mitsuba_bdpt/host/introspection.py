@@ -71,7 +71,7 @@ def _value(value, cpptype, owner):
 
 
 def all_parameters(owners):
-    """The parameters of ``owners`` and of all that they hold, each object's once."""
+    """The parameters of ``owners`` and of all that they hold, each object's once, after its class's name."""
     collector = _collector(mi.variant())()
     left, seen = list(owners), {}
     while left:
@@ -79,6 +79,7 @@ def all_parameters(owners):
         if id(owner) in seen:
             continue
         seen[id(owner)] = owner  # which lives as long as its number is known
+        yield owner.class_name()
         for name, value in collector.of(owner).items():
             if isinstance(value, mi.Object):
                 left.append(value)

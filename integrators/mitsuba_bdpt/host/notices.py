@@ -1,6 +1,6 @@
 """State that is kept with a scene from render to render.
 
-Warnings that were logged, and the results of pilots and of estimates of lost light.
+Warnings that were logged, what follows from the shapes, the results of pilots and of estimates of lost light.
 """
 
 from __future__ import annotations

@@ -68,9 +68,9 @@ def spread(images, reference, trim=0.0) -> list[float]:
     weighs pixels and may have an error of its own: what all images lack counts as little as what it has too
     much.
     """
-    centre = np.mean(images, axis=0)
     if len(images) < 2:
         raise CommandError(f"images has {len(images)} images; a spread takes 2 or more.")
+    centre = np.mean(images, axis=0)
     scale = len(images) / (len(images) - 1)
     weights = 1 / np.sqrt(image_of("reference", reference) ** 2 + rel_mse_epsilon(reference))
     return [scale * _kept_mean((((image - centre) * weights) ** 2).ravel(), trim) for image in images]

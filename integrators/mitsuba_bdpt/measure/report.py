@@ -389,19 +389,26 @@ def _worst(results: Results) -> str:
 
 
 def _against_none(results: Results) -> str:
-    medians = []
-    for scene in results.scenes:
-        try:
-            medians.append(results.efficiency(scene, NONE).median)
-        except Refused:
-            continue
-    if not medians:
-        raise Refused("no scene can be judged")
-    others = len(results.scenes) - len(medians)
-    text = f"{ratio(geometric_mean(medians))}, {len(medians)} of {len(results.scenes)} scenes"
-    return text + (
-        f" ({ratio(geometric_mean(medians + [1] * others))} with 1x for the others)" if others else ""
-    )
+    plain = [scene for scene in results.scenes if not any(results.of(scene, name) for name in MEDIA_RIVALS)]
+    sets = {"": results.scenes} | ({"without media: ": plain} if 0 < len(plain) < len(results.scenes) else {})
+    return "; ".join(f"{name}{_mean_over_none(results, scenes)}" for name, scenes in sets.items())
+
+
+def _mean_over_none(results: Results, scenes: list[str]) -> str:
+    """The mean over the scenes that can be judged, by the errors and by the spread over seeds."""
+    found = []
+    for error in ("rel_mse_trimmed", "spread_trimmed"):
+        medians = []
+        for scene in scenes:
+            try:
+                medians.append(results.efficiency(scene, NONE, error).median)
+            except Refused:
+                continue
+        if medians:
+            found.append(f"{ratio(geometric_mean(medians))}, {len(medians)} of {len(scenes)} scenes")
+        elif not found:
+            raise Refused("no scene can be judged")
+    return ", by the spread over seeds ".join(found)
 
 
 def _unaimed(results: Results, scene: str) -> str:

@@ -126,23 +126,43 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
 def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[dict]) -> dict[str, dict]:
     """`metrics.spread` of the renders of each integrator and budget, raw and trimmed, by the rows' keys.
 
-    None where there are fewer than two, or several numbers of samples.
+    None where there are fewer than two, several numbers of samples, or no image any more. They are kept in
+    OUTPUT/spreads: reading thousands of images takes minutes.
     """
-    reference = load_reference(*cells.where()).image
     there = {row["key"]: row for row in table}
     groups: dict[tuple[str, int], list[Cell]] = {}
     for cell in wanted:
         if cell.key in there:
             groups.setdefault((cell.method, cell.budget), []).append(cell)
-    found = {key: {"spread": None, "spread_trimmed": None} for key in there}
+    file = output / "spreads" / f"{cells.subject.name}.json"
+    kept = read_json(file, "delete it, to take the spread anew") if file.exists() else {}
+    now = {}
     for group in groups.values():
-        if len(group) < 2 or len({there[cell.key]["spp"] for cell in group}) > 1:
-            continue
-        images = [_image(output, cell) for cell in group]
-        raw, trimmed = (metrics.spread(images, reference, trim) for trim in (0.0, metrics.TRIM))
-        for cell, *both in zip(group, raw, trimmed, strict=True):
-            found[cell.key] = dict(zip(("spread", "spread_trimmed"), both, strict=True))
-    return found
+        mark = " ".join([there[group[0].key]["reference_sha256"], *(cell.key for cell in group)])
+        now[mark] = kept[mark] if mark in kept else _spread(output, cells, group, there)
+    if now != kept:
+        write_json(file, now)
+    found = {key: {"spread": None, "spread_trimmed": None} for key in there}
+    return found | {key: value for group in now.values() for key, value in group.items()}
+
+
+def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, dict]) -> dict[str, dict]:
+    """As `_spreads`, of renders that are compared, whose rows are ``there``."""
+    files = [image_file(output, cell) for cell in group]
+    if (
+        len(group) < 2
+        or len({there[cell.key]["spp"] for cell in group}) > 1
+        or not all(file.exists() for file in files)
+    ):
+        return {}
+    reference = load_reference(*cells.where()).image
+    images = [_image(output, cell) for cell in group]
+    raw, trimmed = (metrics.spread(images, reference, trim) for trim in (0.0, metrics.TRIM))
+    pairs = zip(raw, trimmed, strict=True)
+    return {
+        cell.key: dict(zip(("spread", "spread_trimmed"), pair, strict=True))
+        for cell, pair in zip(group, pairs, strict=True)
+    }
 
 
 def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:

@@ -145,7 +145,8 @@ class Planner:
         if self.decided.pilots.asked:
             answer = self._answer(samples)
         else:  # that of each render of the scene
-            key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
+            stratified = self._has_stratified_points()
+            key = self._settings, self.pilot_seed, samples, self._pixels, JOINED, stratified
             answer, is_known = self._findings.find("answers", key, lambda: self._answer(samples))
             if is_known:
                 pilots = self.decided.pilots._replace(asked=answer.asked, remembered=answer.asked)

@@ -43,7 +43,7 @@ def statistics(render) -> dict:
         **({"media": {n: counts[n] for n in MEDIA}} if render.prepared.space is not None else {}),
         **({"merging": {n: counts[n] for n in MERGING}} if render.settings.merging else {}),
         "unbiased": not render.plan.merging,
-        "skipped": list(render.plan.skipped),
+        "skipped": [dict(left_out) for left_out in render.plan.skipped],
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,
         "pilots": {"asked": decided.pilots.asked, "remembered": decided.pilots.remembered},
