@@ -307,12 +307,12 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
     Expected: where a pilot asks for more than they gain the ball is rendered without them, in words, and the
     point lamp with them.
     """
-    scene = under_glass(light())
-    scene["sensor"]["film"] |= {"width": 64, "height": 64}
-    scene = mi.load_dict(scene)
+    described = under_glass(light())
+    described["sensor"]["film"] |= {"width": 64, "height": 64}
     method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
     for least, used in ((choice.GUIDE_GAIN, True), (1e9, needed)):
         monkeypatch.setattr(choice, "GUIDE_GAIN", least)
+        scene = mi.load_dict(described)  # anew: what a pilot has chosen is remembered
         mi.render(scene, integrator=method, spp=8)
         assert method.statistics["unbiased"] != used
         text = method.explain(scene, spp=8)
