@@ -265,6 +265,7 @@ def measured(options: Namespace, folder: Path) -> tuple[Findings, bool]:
         try:
             rows, texts.notes[name] = rows_of(found(name, file, options), options, Project(folder))
             table += rows
+            texts.left_out.pop(name, None)
         except Exception as error:  # one scene must not cost the others
             raise_interrupt(error)
             lost[name] = texts.left_out[name] = " ".join(message(error).split())

@@ -54,13 +54,14 @@ class Texts:
         )
         return Texts(folder, order, whole, left_out, notes)
 
-    def _is_old(self, row: dict) -> bool:
-        """Whether the reference of a row's scene is another one now; then the scene is left out."""
-        file = reference_path(Project(self.folder), row["scene"], row["resolution"], row["max_depth"])
-        is_old = not file.is_file() or digest(file) != row["reference_sha256"]
-        if is_old:
-            self.left_out[row["scene"]] = "its reference is another one now; run again, with this scene"
-        return is_old
+    def _current(self, table: list[dict]) -> list[dict]:
+        """Rows whose errors were taken against the references that there are; other scenes are left out."""
+        own = ("scene", "resolution", "max_depth", "reference_sha256")
+        for scene, *where, sha256 in dict.fromkeys(tuple(row[key] for key in own) for row in table):
+            file = reference_path(Project(self.folder), scene, *where)
+            if not file.is_file() or digest(file) != sha256:
+                self.left_out[scene] = "its reference is another one now; run again, with this scene"
+        return [row for row in table if row["scene"] not in self.left_out]
 
     def write(self, table: list[dict], is_over: bool) -> Findings:
         """Write the rows ``table`` of this run, and the texts about them and what else there is.
@@ -68,8 +69,7 @@ class Texts:
         Rows of other runs stay, until one of the whole folder ``is_over``.
         """
         if not (self.whole and is_over):
-            table = rows.beside(table, self.order, self.folder)
-            table = [row for row in table if row["scene"] not in self.left_out and not self._is_old(row)]
+            table = self._current(rows.beside(table, self.order, self.folder))
         write_json(self.folder / SAID, {"left_out": self.left_out, "notes": self.notes})
         if table:
             rows.write_tables(table, self.folder)
