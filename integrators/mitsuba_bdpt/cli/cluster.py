@@ -66,15 +66,17 @@ class Merged:
         if index >= self._next:
             self._waiting[index] = snapshot
         while self._next in self._waiting:
-            part = self._waiting.pop(self._next)
-            self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
+            self._join(self._next)
             self._next += 1
 
     def close(self) -> None:
         """Add the parts behind one that will not come, in their order."""
         for index in sorted(self._waiting):
-            part = self._waiting.pop(index)
-            self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
+            self._join(index)
+
+    def _join(self, index: int) -> None:
+        part = self._waiting.pop(index)
+        self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
 
     @property
     def count(self) -> int:

@@ -101,9 +101,8 @@ def loaded(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
         levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
         mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
     found = load(options)
-    if (
-        options.threads is not None
-    ):  # after the scene: with one thread Mitsuba reads no EXR, see `two_threads`
+    # After the scene: with one thread Mitsuba reads no EXR, see `two_threads`.
+    if options.threads is not None:
         dr.set_thread_count(options.threads)
     return found
 
@@ -114,7 +113,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
     Once rendered, it is written whatever signals come, and only then a checkpoint is removed.
     """
     sensor = choose_sensor(scene, job.sensor)
-    spp = job.spp or (UNLIMITED_SPP if is_open_ended(job) else sensor.sampler().sample_count())
+    spp = UNLIMITED_SPP if is_open_ended(job) else job.spp or sensor.sampler().sample_count()
     if not spp:
         raise CommandError("The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N.")
     outcome = render(scene, integrator, job, spp)
@@ -135,8 +134,8 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
 
 
 def is_open_ended(options: Namespace) -> bool:
-    """Whether a render ends by its time or its error, where no number of samples is asked for."""
-    return options.time is not None or options.target_error is not None
+    """Whether time or error alone ends a render, of which no number of samples is asked for."""
+    return not options.spp and (options.time is not None or options.target_error is not None)
 
 
 def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
@@ -272,7 +271,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     if options.checkpoint is not None:
         kept = checkpoints.Checkpoints(options, options.output)
         watchers = [kept.after_pass, *watchers]
-    shown = display(options.progress, limit, not options.spp and is_open_ended(options))
+    shown = display(options.progress, limit, is_open_ended(options))
     try:
         if hasattr(integrator, "on_pass"):
             watch = all_of([*watchers, shown])
@@ -335,7 +334,7 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
     """
     started, done, total, interrupted = time.perf_counter(), 0, 0.0, False
     film = choose_sensor(scene, options.sensor).film()
-    shown = display(options.progress, options.time, not options.spp)
+    shown = display(options.progress, options.time, is_open_ended(options))
     try:
         while done < spp and (done == 0 or time.perf_counter() - started < options.time):
             size, seed = min(PASS_SPP, spp - done), options.seed + done // PASS_SPP

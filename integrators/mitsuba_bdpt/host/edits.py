@@ -5,6 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 import drjit as dr
@@ -34,8 +35,8 @@ class State:
     def of(cls, owners: Iterable[mi.Object], deep: bool = True) -> State:
         """The present state of ``owners``, and of all that they hold if ``deep``."""
         marks, kept = [], []
-        own = (value for owner in owners for value in own_parameters(owner).values())
-        for value in all_parameters(owners) if deep else own:
+        own = (own_parameters(owner).values() for owner in owners)
+        for value in all_parameters(owners) if deep else chain.from_iterable(own):
             indices = dr.detail.collect_indices(value)
             if not indices:
                 marks.append(repr(value))
