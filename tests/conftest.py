@@ -3,8 +3,9 @@
 import mitsuba_bdpt  # noqa: F401, I001  (chooses the LLVM library; must precede mitsuba)
 import mitsuba as mi
 import pytest
+import variants
 
-VARIANT = "llvm_ad_rgb"
+VARIANT = variants.of("rgb")
 mi.set_variant(VARIANT)
 
 

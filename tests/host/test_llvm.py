@@ -235,6 +235,37 @@ def test_remedies_of_an_import_after_drjit_help():
     assert [done.returncode for done in sort] == [0, 1]
 
 
+def test_a_machine_with_cuda_needs_no_llvm(library):
+    """Expected: with a driver of CUDA the choice is none, whatever unusable there is, also in a process that
+    inherits the choice of its parent, and where Dr.Jit came first; a usable library is chosen nevertheless.
+    """
+    cuda = replace(BARE, has_cuda=lambda: True)
+    old = replace(cuda, system=(library("libLLVM-15.so.1"),))
+    choice = llvm.choose(old)
+    assert (choice.path, choice.origin) == (None, "none")
+    assert "only variants of CUDA" in str(choice) and "LLVM 15, too old" in str(choice)
+    assert llvm.choose(replace(old, env={llvm.VARIABLE: os.devnull})).origin == "none"
+    assert llvm.check_loaded((-1, 0, 0), cuda).origin == "none"
+    with pytest.raises(llvm.LLVMNotFoundError, match="too old"):
+        llvm.check_loaded((15, 0, 7), old)
+    with pytest.raises(llvm.LLVMNotFoundError, match="names no file"):
+        llvm.choose(replace(BARE, env={llvm.VARIABLE: os.devnull}))
+    assert llvm.choose(replace(old, system=(library("libLLVM.so.22.1"),))).origin == "system"
+
+
+@pytest.mark.parametrize("found, named", [((), None), (("libLLVM-15.so.1",), os.devnull)])
+def test_unusable_libraries_are_kept_from_drjit(library, monkeypatch, found, named):
+    """Rationale: Dr.Jit looks for a library by itself, and old ones abort the process. Expected: where there
+    are only such, the variable names an empty file; where there is none, it is left as it was.
+    """
+    machine = replace(BARE, system=tuple(map(library, found)), has_cuda=lambda: True)
+    monkeypatch.setattr(llvm.Machine, "here", lambda: machine)
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    assert llvm.prepare().origin == "none"
+    assert os.environ.get(llvm.VARIABLE) == named
+
+
 def test_import_after_drjit_does_not_ask_for_llvm_on_a_cuda_variant():
     code = """
 mitsuba = types.ModuleType("mitsuba")

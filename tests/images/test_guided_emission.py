@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
+import variants
 import welch as st
 from mitsuba_bdpt.emitters.emission_tables import EmissionTables, side_of
 from mitsuba_bdpt.emitters.emitters import Emitters
@@ -120,7 +121,7 @@ def test_parameters(parameters):
     st.assert_same_tiles(a, b)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+@pytest.mark.parametrize("variant", [variants.of("spectral"), variants.of("mono")])
 def test_variants(variant):
     """Expected: the same tiles as without tables."""
     mi.set_variant(variant)

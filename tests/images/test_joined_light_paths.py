@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
+import variants
 import welch as st
 from mitsuba_bdpt.measure import recording
 from mitsuba_bdpt.planning import choice, planner
@@ -126,7 +127,7 @@ def test_lamps(lamp):
     st.assert_same_tiles(a, b, at_least=8)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+@pytest.mark.parametrize("variant", [variants.of("spectral"), variants.of("mono")])
 def test_variants(variant):
     """Expected: the same tiles as with all connections."""
     mi.set_variant(variant)

@@ -26,6 +26,7 @@ import media_parts as parts
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 import welch as st
 from mitsuba_bdpt.image.layers import strategies
 from mitsuba_bdpt.media.media import interaction
@@ -255,7 +256,7 @@ def test_thinned_light_subpaths(monkeypatch):
     st.assert_agree(st.Comparisons.join(family), at_least=20)
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", [variants.of("mono"), variants.of("spectral")])
 def test_colours_agree_with_volpathmis(variant):
     """Rationale: monochromatic variants have one channel, spectral ones four wavelengths that differ from
     sample to sample, for which a medium has no table. Expected: a chromatic ball and a chromatic room beside

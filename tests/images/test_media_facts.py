@@ -10,6 +10,7 @@ import media_parts as parts
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 from mitsuba_bdpt.media.media import interaction
 
 N = 4096
@@ -30,7 +31,7 @@ def rendered(scene, kind, spp=1024, seed=1, **parameters):
     return np.array(mi.render(scene, integrator=method, spp=spp, seed=seed)).mean()
 
 
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"])
+@pytest.mark.parametrize("variant", [variants.of("rgb"), variants.of("mono"), variants.of("spectral")])
 def test_media_can_be_indexed(variant):
     """For `media.media`: a `MediumPtr` is a number in the registry, 0 for none; its calls answer in a
     ``dr.dispatch`` with one call per medium; a homogeneous majorant is sigma_t, a grid's one number for all

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 import views
 import welch as st
 from mitsuba_bdpt.run import rendering
@@ -221,7 +222,7 @@ def test_spectral():
     colour of a coloured floor under a coloured lamp is what s = 0 finds, in tiles; in one pass of many
     samples and in passes of less than one for each set.
     """
-    mi.set_variant("llvm_ad_spectral")
+    mi.set_variant(variants.of("spectral"))
     lamp = ball() | {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10, 6, 2]}}}
     floor = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.4]}}
     scene = mi.load_dict(under_glass(lamp, floor))

@@ -10,6 +10,7 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 from mitsuba_bdpt.emitters import infinite
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.scene import diagnostics
@@ -229,7 +230,7 @@ def test_coefficients_of_spectra_are_no_reflectances():
     """Rationale: a spectral variant keeps three coefficients for each colour of a texture, above 1 for one of
     more than 0.85. Expected: nothing is said of it; a number above 1 is still named."""
     before = mi.variant()
-    mi.set_variant("llvm_ad_spectral")
+    mi.set_variant(variants.of("spectral"))
     try:
         bright = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.95, np.float32))}
         loud = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 1.5, np.float32)), "raw": True}

@@ -13,6 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 from scipy import stats
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -140,7 +141,7 @@ def test_image_with_media_is_mitsubas(name, colour, skip):
 
 def compare(path: Path, colour: str, skip: str):
     """Render the scene and compare it with its reference."""
-    mi.set_variant(f"llvm_ad_{colour}")
+    mi.set_variant(variants.of(colour))
     scene = mi.load_file(str(path))
     ref, ref_variance = reference(path, colour)
     pixels = ref.shape[0] * ref.shape[1]

@@ -11,6 +11,7 @@ import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 import numpy as np
 import pytest
+import variants
 from mitsuba_bdpt.scene.prepared import PreparedScene
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,7 +62,7 @@ BODIES = {"cloudy_ball": 2.0, "skin_ball": 20.0, "glass_slab": 10.0}
 
 @pytest.fixture(autouse=True)
 def variant():
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(variants.of("rgb"))
 
 
 def load(name, **parameters):

@@ -14,6 +14,7 @@ import warnings
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 import views
 from mitsuba_bdpt.image.layers import strategies
 from welch import Comparisons, assert_agree, compare_images, tile_means, welch
@@ -27,7 +28,7 @@ RUNS = 24
 CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
 
 # The variants in which a scene has colours of its own: one number, four wavelengths per sample.
-VARIANTS = ["llvm_ad_mono", "llvm_ad_spectral"]
+VARIANTS = [variants.of("mono"), variants.of("spectral")]
 
 
 def transform():
@@ -149,7 +150,7 @@ def test_colour_chart(name, skip):
     Expected: with the white square beside them for the scale, deltaE 2000 below 0.5 for every patch: half of
     what is just visible. 64 pixels x 1024 samples per patch leave 0.07 to 0.17 of noise in the worst patch.
     """
-    mi.set_variant("llvm_ad_spectral")
+    mi.set_variant(variants.of("spectral"))
     illuminant = ILLUMINANTS[name]
     reflectances = [*CHART.values(), np.ones(len(illuminant))]
     assert len(reflectances) == 25
@@ -171,7 +172,7 @@ def test_interreflections_multiply_spectra(skip):
     of the sphere seen directly, which must have the luminance of L to 0.3 % (Mitsuba's constant for the
     observer's integral is 0.1 % smaller than the sum of its table).
     """
-    mi.set_variant("llvm_ad_spectral")
+    mi.set_variant(variants.of("spectral"))
     light = ILLUMINANTS["A"]
     names = ["blue", "green", "red", "white 9.5 (.05 D)"]
     series = [(1 + r + r**2 + r**3) / 4 for r in (CHART[name] for name in names)]
@@ -299,13 +300,13 @@ def test_scene_equals_path(variant, make):
     assert_agree(Comparisons.join(family), at_least=24)
 
 
-UNPOLARIZED = [v for v in mi.variants() if v.startswith("llvm") and not v.endswith("polarized")]
+UNPOLARIZED = [v for v in mi.variants() if v.startswith(variants.BACKEND) and not v.endswith("polarized")]
 
 
 def test_every_colour_mode_is_there():
     """The wheel has a variant of each colour mode for the test below (the others are refused in words, see
     ``test_properties``)."""
-    assert {"llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_spectral"} <= set(UNPOLARIZED)
+    assert {variants.of("rgb"), variants.of("mono"), variants.of("spectral")} <= set(UNPOLARIZED)
 
 
 @pytest.mark.parametrize("variant", UNPOLARIZED)

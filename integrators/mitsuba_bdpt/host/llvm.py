@@ -6,20 +6,22 @@ machines with AVX-512, so a library is chosen here before ``drjit`` is imported:
 
 1. the one the user named in ``DRJIT_LIBLLVM_PATH``, as it is;
 2. the one the wheel ``karellen-llvm-core`` put into the Python environment;
-3. the newest on the system whose version is known to work.
+3. the newest on the system whose version is known to work;
+4. none where there is a driver of CUDA, whose variants need no LLVM: the import goes on.
 
 ``choose`` is a function of a `Machine` record alone; only `prepare` touches the process.
 """
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
 import os
 import platform
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,6 +47,8 @@ class Choice:
     version: int | None
 
     def __str__(self) -> str:
+        if self.path is None and self.version is None:
+            return self.why
         version = f"LLVM {self.version}" if self.version else "LLVM of unknown version"
         return f"{version}, {self.path or 'loaded before'} ({self.why})"
 
@@ -60,6 +64,8 @@ class Machine:
     """Other LLVM libraries that exist."""
     system_name: str = "Linux"
     architecture: str = "x86_64"
+    has_cuda: Callable[[], bool] = lambda: False
+    """Whether a driver of CUDA can be loaded; asked only where no LLVM is found, since that takes a while."""
 
     @classmethod
     def here(cls) -> Machine:
@@ -70,13 +76,14 @@ class Machine:
             system=tuple(system_libraries(library_directories(Path(sys.prefix)))),
             system_name=platform.system(),
             architecture=platform.machine(),
+            has_cuda=cuda_driver,
         )
 
 
 def choose(machine: Machine) -> Choice:
     """Return the library to load on `machine`, or raise `LLVMNotFoundError`."""
     named = machine.env.get(VARIABLE)
-    if named:
+    if named and not (named == os.devnull and machine.has_cuda()):
         path = Path(named)
         if not path.is_file():
             raise LLVMNotFoundError(
@@ -84,6 +91,8 @@ def choose(machine: Machine) -> Choice:
                 "or set it to the path of a libLLVM shared library."
             )
         return Choice(path, "variable", f"named by {VARIABLE}", major_version(path))
+    if named:
+        return _without_llvm(f"{VARIABLE}={named} asks for none")
     for path in machine.wheel:
         if major_version(path) in KNOWN_GOOD:
             return Choice(path, "wheel", f"installed by {WHEEL}", major_version(path))
@@ -92,10 +101,17 @@ def choose(machine: Machine) -> Choice:
         # Ties keep the order of the search.
         path = max(usable, key=lambda path: major_version(path) or 0)
         return Choice(path, "system", "found on the system, known to work", major_version(path))
+    found = _describe(machine.wheel + machine.system)
+    if machine.has_cuda():
+        return _without_llvm(found)
     raise LLVMNotFoundError(
-        f"No usable LLVM library: {_describe(machine.wheel + machine.system)}. "
-        f"Versions known to work: {_versions()}. {remedy(machine)}"
+        f"No usable LLVM library: {found}. Versions known to work: {_versions()}. {remedy(machine)}"
     )
+
+
+def _without_llvm(found: str) -> Choice:
+    why = f"no usable LLVM ({found}): only variants of CUDA can be used"
+    return Choice(None, "none", why, None)
 
 
 def check_loaded(version: tuple[int, ...], machine: Machine) -> Choice:
@@ -107,6 +123,8 @@ def check_loaded(version: tuple[int, ...], machine: Machine) -> Choice:
         "Import mitsuba_bdpt before drjit and mitsuba (where an import sorter puts it below them: "
         f"`import mitsuba_bdpt  # isort: skip`), or {_before_start(machine)} (later it has no effect)."
     )
+    if version[0] < 0 and machine.has_cuda():
+        return _without_llvm("drjit was imported first and found none")
     if version[0] < 0:
         raise LLVMNotFoundError(f"drjit was imported first and found no usable LLVM. {how}")
     if version[0] < min(KNOWN_GOOD):
@@ -122,8 +140,11 @@ def prepare() -> Choice:
     """Choose for this process and tell Dr.Jit; check instead where Dr.Jit is already imported."""
     drjit = sys.modules.get("drjit")
     if drjit is None:
-        choice = choose(Machine.here())
-        os.environ[VARIABLE] = str(choice.path)
+        machine = Machine.here()
+        choice = choose(machine)
+        if choice.path or machine.wheel or machine.system:
+            # Without a usable LLVM, Dr.Jit must not find the unusable ones by itself.
+            os.environ[VARIABLE] = str(choice.path or os.devnull)
         return choice
     mitsuba = sys.modules.get("mitsuba")
     if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
@@ -131,10 +152,19 @@ def prepare() -> Choice:
     return check_loaded(drjit.detail.llvm_version(), Machine.here())
 
 
+def cuda_driver() -> bool:
+    """Whether the library of a CUDA driver can be loaded in this process."""
+    try:
+        ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
 def _before_start(machine: Machine) -> str:
     """What makes Dr.Jit load a usable library of `machine` by itself, to be done before Python starts."""
     try:
-        path = choose(replace(machine, env={})).path
+        path = choose(replace(machine, env={}, has_cuda=lambda: False)).path
     except LLVMNotFoundError:
         return f"install a newer one and set {VARIABLE} to its path before Python starts"
     return f"set {VARIABLE}={path} before Python starts"
