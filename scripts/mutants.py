@@ -921,9 +921,35 @@ MUTANTS = (
     Mutant(
         "guided emission: both halves of a pilot teach and judge",
         "planning/emission.py",
-        "halves = [_fitted(half) for half in heard]",
-        "halves = [_fitted(heard[1 - i]) for i in range(HALVES)]",
-        ("tests/images/test_guided_emission.py::test_noise_teaches_nothing",),
+        "halves = [_fitted(half, times) for half in heard]",
+        "halves = [_fitted(heard[1 - i], times) for i in range(HALVES)]",
+        ("tests/images/test_guided_emission.py::test_noise_teaches_nothing[24]",),
+    ),
+    Mutant(
+        "guided emission: tables that are blurred more come first",
+        "planning/emission.py",
+        "for times in BLURS[side]]",
+        "for times in BLURS[side][::-1]]",
+        ("tests/images/test_guided_emission.py::test_detail_is_kept_where_it_pays",),
+    ),
+    Mutant(
+        "guided emission: tables that are blurred more are not tried",
+        "planning/emission.py",
+        "for times in BLURS[side]]",
+        "for times in BLURS[side][:1]]",
+        ("tests/images/test_guided_emission.py::test_noise_is_blurred_where_it_would_not_pay",),
+    ),
+    Mutant(
+        "guided emission: the last cell of a row is found in rows of a power of two alone",
+        "emitters/emission_tables.py",
+        "cells -= step",
+        "cells = step",
+        (
+            (
+                "tests/emitters/test_emission_tables.py::"
+                "test_warped_numbers_are_distributed_as_the_tables_say[24]"
+            ),
+        ),
     ),
     Mutant(
         "guided emission: what camera subpaths find is aimed at",

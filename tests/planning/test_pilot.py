@@ -556,10 +556,10 @@ def test_what_renders_do_not_meet_does_not_decide(monkeypatch):
     """Rationale: paths that path tracing alone makes once in a billion samples have a huge second moment and
     are in no render. Expected: in `window_room`, where the sun shines on gloss, path tracing alone is
     predicted to take at most 4 times as long as the best (renders show 1.1; without the bound of `RAREST`
-    one of these seeds says 16)."""
+    one of these seeds says 4.5). Without guided emission, which makes light subpaths better than that."""
     file = Path(__file__).parents[2] / "scenes" / "window_room.xml"
     target = mi.load_file(str(file), resolution=128)
-    integrator = bdpt(max_depth=target.integrator().max_depth)
+    integrator = bdpt(max_depth=target.integrator().max_depth, emission_guiding="never")
     for seed in range(6):
         monkeypatch.setattr(Planner, "pilot_seed", seed)
         render = rendering.Render(target, target.sensors()[0], integrator.settings, seed, 64)

@@ -20,9 +20,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Cells of a table in each direction, and of all tables together at most; else tables are smaller.
-SIDES = (16, 8, 4)
-MOST_CELLS = 8192
+# Cells of a table in each direction, and of all tables together at most; else tables are smaller. (Those of a
+# sky and a sun, 17, still have 24 x 24.)
+SIDES = (24, 16, 8, 4)
+MOST_CELLS = 9792
 
 # Bins of directions in each of two dimensions for which light from a sky has tables of its own.
 SKY_BINS = 4
@@ -182,11 +183,12 @@ class EmissionGuide:
 def _found(sums: mi.Float, begin: mi.UInt32, side: int, u: mi.Float, active) -> tuple[mi.UInt32, mi.Float]:
     """The cell of a row of cells with these ``sums`` in which ``u`` lies, and the number there in [0, 1)."""
     at = mi.UInt32(0)
-    step = side // 2
-    while step:
+    cells = side  # in which it may lie, from ``at`` on
+    while cells > 1:
+        step = cells // 2
         beyond = dr.gather(mi.Float, sums, begin + at + (step - 1), active) <= u
         at = dr.select(beyond, at + step, at)
-        step //= 2
+        cells -= step
     low = dr.select(at > 0, dr.gather(mi.Float, sums, begin + dr.maximum(at, 1) - 1, active), 0)
     high = dr.gather(mi.Float, sums, begin + at, active)
     inside = dr.clip((u - low) / (high - low), 0, _BELOW_ONE)
