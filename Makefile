@@ -39,6 +39,7 @@ pictures: $(INSTALLED)
 	mkdir -p docs/images
 	$(VENV)/bin/python scripts/equal_time.py veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
+	$(VENV)/bin/python scripts/polarization.py pictures
 	for scene in glass_caustics pool_floor lamp_in_glass_seen; do \
 		$(VENV)/bin/python scripts/equal_time.py $$scene --spp 64 -o docs/images/$${scene}_merging.png \
 			-i bdpt path "bdpt merging=true" || exit 1; \

@@ -556,6 +556,52 @@ MUTANTS = (
         ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[mask]",),
     ),
     Mutant(
+        "polarized: matrices of light subpaths in the order of camera subpaths",
+        "geometry/polarization.py",
+        "return event * throughput if adjoint and mi.is_polarized else throughput * event",
+        "return throughput * event",
+        ("tests/images/test_polarized.py::test_strategies_agree_in_every_component",),
+    ),
+    Mutant(
+        "polarized: evaluations in the frames of the way back",
+        "transport/bsdf.py",
+        "polarization.in_world(si, value, -wo, si.wi)",
+        "polarization.in_world(si, value, -si.wi, wo)",
+        (
+            "tests/transport/test_bsdf_polarized.py::test_evaluations_are_of_light_from_either_side[roughconductor]",
+        ),
+    ),
+    Mutant(
+        "polarized: matrices of delta events are those of the way back",
+        "transport/bsdf.py",
+        "return traits.round_trip or (adjoint and bool(mi.is_polarized))",
+        "return traits.round_trip",
+        (
+            "tests/transport/test_bsdf_polarized.py::test_delta_events_are_of_light_from_either_side[retarder]",
+        ),
+    ),
+    Mutant(
+        "polarized: merged photons are not",
+        "transport/merging.py",
+        "value = z.throughput * f.value * estimate",
+        "value = z.throughput * f.value * mi.Spectrum(mi.unpolarized_spectrum(estimate))",
+        ("tests/images/test_polarized.py::test_isolated_paths_are_polarized",),
+    ),
+    Mutant(
+        "polarized: splats arrive from where they go",
+        "transport/techniques.py",
+        "sides=sides, towards=join.d)",
+        "sides=sides, towards=-join.d)",
+        ("tests/images/test_polarized.py::test_strategies_agree_in_every_component",),
+    ),
+    Mutant(
+        "polarized: Stokes vectors of an upright sensor",
+        "image/stokes.py",
+        "sensor.world_transform() @ mi.Vector3f(0, 1, 0)",
+        "mi.Vector3f(0, 1, 0)",
+        ("tests/images/test_polarized.py::test_stokes_vectors_are_mitsubas[rough metal and plastic]",),
+    ),
+    Mutant(
         "media: one channel's density",
         "media/flight.py",
         "mean = dr.mean(edge.ratio * densities)",

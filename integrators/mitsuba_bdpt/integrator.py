@@ -42,7 +42,8 @@ receive; one after it the lamps without area of whose light more than a hundredt
 because they shine through glass on what is seen through glass. ``statistics["lost_light"]`` has the estimated
 shares by the number of the emitter; what is lost is estimated at the first render, and again after edits.
 
-Layers of the film come in this order: colours and alpha, features, denoised colours, variance, strategies.
+Layers of the film come in this order: colours and alpha, Stokes vectors, features, denoised colours,
+variance, strategies.
 
 ``statistics["decisions"]`` is what was decided, by a pilot, by the scene alone or as given, and
 ``statistics["no_pilot"]`` why no pilot was asked, or none decided: an empty text where one did, and where
@@ -52,7 +53,7 @@ what they found. They draw the same numbers for all seeds, so that all renders o
 Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
 that is called with a `rendering.PassReport` after each pass.
 
-Not supported, and refused in words: scalar, polarized and Metal variants, derivatives (all other methods of
+Not supported, and refused in words: scalar and Metal variants, derivatives (all other methods of
 ``integrator`` ignore gradients), renders under ``dr.freeze``, ``strategy_images`` on a ``specfilm``. In
 scenes with participating media edges count as in ``volpath``; the medium that an emitter declares is ignored,
 as by ``volpath``: it is found from the boundaries around it. Threads need a scene each: Mitsuba's film
@@ -245,14 +246,16 @@ class BDPTIntegrator:
         settings = self.settings
         depth, merges = settings.strategy_depth, settings.merge_images
         names = feature_names(settings.aovs)
-        return layer_names(depth, settings.variance, names, merges=merges, denoise=settings.denoise)
+        return layer_names(
+            depth, settings.variance, names, merges=merges, denoise=settings.denoise, stokes=settings.stokes
+        )
 
     def sample(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""
         raise UnsupportedError(
             "cannot be nested in another integrator (aov, moment, stokes): light subpaths "
-            "reach pixels other than their own; render with bdpt itself, which has a parameter aovs "
-            "(the command's --integrator bdpt takes layers of aov over)"
+            "reach pixels other than their own; render with bdpt itself, which has parameters aovs and "
+            "stokes (the command's --integrator bdpt takes those of aov and stokes over)"
         )
 
     def render_forward(self, *args, **kwargs):

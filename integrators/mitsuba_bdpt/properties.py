@@ -15,6 +15,7 @@ from .image import denoising, features, film_limits
 from .image.channels import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
+from .image.stokes import POLARIZED
 from .planning.decision import read_decisions
 from .settings import ALIASES, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
@@ -153,7 +154,9 @@ def _check_layers(settings: Settings):
     seen = set()
     names = features.feature_names(settings.aovs)
     depth, merges = settings.strategy_depth, settings.merge_images
-    for layer in layer_names(depth, settings.variance, names, merges=merges, denoise=settings.denoise):
+    for layer in layer_names(
+        depth, settings.variance, names, merges=merges, denoise=settings.denoise, stokes=settings.stokes
+    ):
         if layer in seen:
             raise UsageError(
                 f"aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
@@ -216,6 +219,11 @@ def _check_together(settings: Settings):
             "contradictory; leave out one or the other"
         )
     _check_layers(settings)
+    if settings.stokes and not mi.is_polarized:
+        raise UsageError(
+            f"stokes=True needs a polarized variant, {mi.variant()} has no Stokes vectors; use one, for "
+            "example mi.set_variant('llvm_ad_spectral_polarized')"
+        )
     if settings.target_error and not settings.variance:
         raise UsageError(
             f"target_error={settings.target_error} follows from the variance; set variance to true"
@@ -239,11 +247,6 @@ def check_variant():
         raise UnsupportedError(
             f"the variant {variant} runs on {variant.partition('_')[0]}, where this method was never "
             "tried; use a variant of LLVM or CUDA, for example mi.set_variant('llvm_ad_rgb')"
-        )
-    if mi.is_polarized:
-        raise UnsupportedError(
-            f"the variant {variant} is polarized, which is not supported; use "
-            f"{variant.replace('_polarized', '')}"
         )
 
 
@@ -278,7 +281,12 @@ def check_film(sensor, settings: Settings):
     Raises ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without pixels
     or too large.
     """
-    colour = film_colours(sensor)
+    colour = film_colours(sensor, settings.stokes)
+    if settings.stokes and isinstance(colour, Bands):
+        raise UnsupportedError(
+            f"stokes=True is not possible with film {named(sensor.film())} of class SpecFilm: these layers "
+            "are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
+        )
     if settings.strategy_images and isinstance(colour, Bands):
         raise UnsupportedError(
             f"strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
@@ -294,7 +302,8 @@ def check_film(sensor, settings: Settings):
         denoising.check_installed()
         count += denoising.GUIDE_CHANNELS
     _check_has_pixels(sensor.film())
-    channels = Channels.of(sensor.film(), len(colour.names), count)
+    stokes = POLARIZED if settings.stokes else 0
+    channels = Channels.of(sensor.film(), len(colour.names), count, stokes)
     film_limits.check_film(sensor.film(), channels, settings.variance)
     film_limits.check_strategies(sensor.film(), settings.strategy_depth, settings.merge_images)
     return colour

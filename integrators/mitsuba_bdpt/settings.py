@@ -198,6 +198,12 @@ class Settings:
         Denoise (package mitsuba-oidn, extra ``[denoise]``), which is told albedo and normals of what is seen
         first. The image itself stays as it is. For previews: a denoised image is biased.""",
     )
+    stokes: bool = _parameter(
+        False,
+        "true or false",
+        """Adds the layers ``S0.R`` to ``S3.B``: the Stokes vector of each pixel in the sensor's frame, as
+        Mitsuba's integrator ``stokes`` writes them. In polarized variants only.""",
+    )
     target_error: float = _parameter(
         0.0,
         "the relMSE to stop at, or 0 for none",

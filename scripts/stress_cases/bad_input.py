@@ -43,6 +43,7 @@ SENSIBLE = {
     "strategy_images": (False, True),
     "variance": (False, True),
     "denoise": (False, True),
+    "stokes": (False,),  # of polarized variants alone
     "target_error": (0.0, 0.1),
     "spp_per_pass": (0, 1, 3),
     "timeout": (-1.0, 0.0, 1e9),

@@ -103,10 +103,12 @@ def test_which_variants_can_render_here():
     """Expected: each variant once, with the reason where it cannot."""
     installed = ["scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral_polarized", "cuda_ad_rgb", "metal_ad_rgb"]
     finding = doctor.variants(installed, ["LLVM"])
-    assert finding.state == "ok" and finding.text.startswith("here: llvm_ad_rgb; not: scalar_rgb (")
+    assert finding.state == "ok" and finding.text.startswith(
+        "here: llvm_ad_rgb, llvm_ad_spectral_polarized; not: scalar_rgb ("
+    )
     assert "cuda_ad_rgb (no CUDA device or driver was found)" in finding.text
     assert doctor.variants(installed, ["LLVM", "CUDA"]).text.startswith(
-        "here: llvm_ad_rgb, cuda_ad_rgb; not: "
+        "here: llvm_ad_rgb, llvm_ad_spectral_polarized, cuda_ad_rgb; not: "
     )
     assert doctor.variants(["llvm_ad_rgb"], []).state == "note"
 

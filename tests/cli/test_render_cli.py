@@ -265,7 +265,6 @@ def test_other_integrators_take_the_place_inside(around):
     ("change", "words"),
     [
         (('type="aov" name="in"', 'type="moment" name="in"'), "integrator moment.*second moments.*variance"),
-        (('type="aov">', 'type="stokes">'), "integrator stokes.*Stokes vectors.*write the inner"),
         (('<integrator name="img"', '<integrator type="path"/><integrator name="img"'), "'img'.*just one"),
     ],
 )
@@ -274,6 +273,17 @@ def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
     around.write_text(around.read_text().replace(*change))
     assert main(["render", str(around), "--integrator", "bdpt"]) == 1
     assert re.search(words, capsys.readouterr().err)
+
+
+def test_bdpt_in_place_of_stokes_has_its_layers(around):
+    """Expected: in a polarized variant the parameter ``stokes`` and the other layers, named as in Mitsuba; in
+    others words."""
+    around.write_text(around.read_text().replace('type="aov">', 'type="stokes">'))
+    polarized = "-m", "llvm_ad_mono_polarized"
+    settings = loaded(around, "--integrator", "bdpt", *polarized).settings
+    assert settings.stokes and settings.aovs == "uv:uv" and settings.timeout == 50
+    with pytest.raises(ValueError, match="stokes needs a polarized variant, not llvm_ad_rgb.*-m llvm"):
+        loaded(around, "--integrator", "bdpt")
 
 
 def test_direct_is_replaced_with_its_depth(around):

@@ -42,6 +42,7 @@ MEDIA_SCENES = [
     "participating_media/test_hetero_sigmat_volpath",
 ]
 COLOURS = ["rgb", "mono", "spectral"]  # each has references of its own
+POLARIZED = "spectral_polarized"  # of scenes without media; intensities alone
 SAMPLES = 2e6  # per scene, as in Mitsuba's test
 REFERENCE_SPP = 32_000
 # The references' conversion between colour spaces: white is (0.95075, 1, 1.08846) in them where it
@@ -99,9 +100,9 @@ def test_depths_are_found():
     assert set(depths.values()) == {2}
 
 
-def cases(scenes):
+def cases(scenes, colours=COLOURS):
     """Every scene, colour mode and choice of skipping; by default one of the two choices for each image."""
-    product = itertools.product(enumerate(scenes), enumerate(COLOURS), enumerate(("none", "auto")))
+    product = itertools.product(enumerate(scenes), enumerate(colours), enumerate(("none", "auto")))
     return [
         pytest.param(name, colour, skip, marks=[] if (i + j + k) % 2 else [pytest.mark.slow])
         for (i, name), (j, colour), (k, skip) in product
@@ -109,7 +110,7 @@ def cases(scenes):
 
 
 @needs(DATA)
-@pytest.mark.parametrize("name, colour, skip", cases(SCENES))
+@pytest.mark.parametrize("name, colour, skip", cases(SCENES, [*COLOURS, POLARIZED]))
 def test_image_is_mitsubas(name, colour, skip):
     """Our image equals the reference that Mitsuba ships for the colour mode.
 

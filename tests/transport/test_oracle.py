@@ -502,7 +502,7 @@ class Nothing:
     """Accepts any call: film, and points (every number is a half)."""
 
     alpha = False
-    features = None
+    features = stokes = None
 
     def colour(self, value, _):
         return mi.Color3f(value)

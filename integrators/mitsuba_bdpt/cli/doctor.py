@@ -149,8 +149,6 @@ def why_not(variant: str, backends: list[str]) -> str:
     """Why bdpt cannot render with a ``variant``; empty if it can."""
     if variant.startswith("scalar"):
         return "bdpt has no scalar variant"
-    if "polarized" in variant:
-        return "bdpt has no polarization"
     if variant.startswith("metal"):
         return "bdpt does not support Metal"
     if variant.startswith("cuda"):

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..errors import CommandError, did_you_mean
 from ..image import features
-from ..settings import ALIASES
+from ..settings import ALIASES, PARAMETERS
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
@@ -26,14 +26,13 @@ DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
 
 NOT_CARRIED = {
     "moment": "second moments, which bdpt has not: its parameter variance adds the variance of each pixel",
-    "stokes": "Stokes vectors, which bdpt has not: it is not polarized",
 }
 """Integrators around another whose layers `bdpt` cannot have."""
 
 CROP = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 """Parameters of a film's crop window."""
 
-AROUND = ("aov", *NOT_CARRIED)
+AROUND = ("aov", "stokes", *NOT_CARRIED)
 """Mitsuba's integrators around another one."""
 
 LISTED = 8
@@ -156,7 +155,7 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     if around and (options.integrator != "aov" or not overrides.get("aovs")):
         raise CommandError(
             f"integrator={options.integrator} is for one around another, which the command line cannot "
-            "name: write both into the scene file (-P aovs=NAME:KIND adds layers to bdpt)."
+            "name: write both into the scene file (-P aovs=NAME:KIND and -P stokes=true add layers to bdpt)."
         )
     if node is not None:
         replace_integrator(state.nodes, node, options.integrator, overrides)
@@ -300,7 +299,9 @@ def _in_words(error: str, options: Namespace) -> str | None:
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
     given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
     if strange and given:
-        return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out"
+        ours = all(key in PARAMETERS for key, _ in options.properties)
+        other = " or use --integrator bdpt" if ours and strange[1] != "bdpt" else ""
+        return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out{other}"
     other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
     if other and other[1] == options.integrator:
         return _no_integrator(other[1], f"of type {other[2]}")
@@ -396,11 +397,19 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
                 f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
                 f"adds {NOT_CARRIED[kind]}; in the scene file, write the inner integrator alone."
             )
-        aovs += [prefix + pair for pair in features.pairs(node.props.get("aovs", ""))]
+        if kind == "stokes":
+            if not mi.is_polarized:
+                raise CommandError(
+                    f"the scene's integrator stokes needs a polarized variant, not {mi.variant()}; use for "
+                    "example -m llvm_ad_spectral_polarized."
+                )
+            carried["stokes"] = True
+        else:
+            aovs += [prefix + pair for pair in features.pairs(node.props.get("aovs", ""))]
         if "timeout" in node.props:
             carried.setdefault("timeout", node.props["timeout"])
         name, node = _nested(nodes, node)
-        prefix += f"{name}."
+        prefix += f"{name}." if kind == "aov" else ""
     if kind == "bdpt":
         aovs += features.pairs(node.props.get("aovs", ""))
     return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
-from . import denoising
+from . import denoising, stokes
 from .block import Block
 from .channels import Channels
 from .layers import image_count, layer_names, strategies, strategy_count, strategy_index
@@ -48,8 +48,13 @@ class Accumulator:
         self.variance, self.replicates = variance, Replicates()
         names = features.names if features else []
         guides = features is not None and features.guides
-        colour.prepare(layer_names(depth, variance, names, colour.names, merges, guides))
-        self._channels = Channels.of(film, len(colour.names), features.count if features else 0)
+        self.stokes = colour.stokes
+        colour.prepare(
+            layer_names(depth, variance, names, colour.names, merges, guides, self.stokes is not None)
+        )
+        self._channels = Channels.of(
+            film, len(colour.names), features.count if features else 0, stokes.POLARIZED if self.stokes else 0
+        )
         self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf)
         # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
@@ -69,13 +74,16 @@ class Accumulator:
         """Whether the film keeps alpha."""
         return bool(self._channels.alpha)
 
-    def put_camera(self, position, colours, alpha, features, active):
-        """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1."""
-        self.camera.put(position, self._channels.sample(colours, alpha, features), active)
+    def put_camera(self, position, values, active):
+        """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1.
 
-    def put_light(self, position, colours, active):
-        """Add a splat at a continuous film position."""
-        self.light.put(position, [*colours], active)
+        ``values``: colours, alpha, features, and what `Stokes` says, or nothing.
+        """
+        self.camera.put(position, self._channels.sample(*values), active)
+
+    def put_light(self, position, colours, polarized, active):
+        """Add a splat at a continuous film position; ``polarized``: what `Stokes` says of it, or nothing."""
+        self.light.put(position, [*colours, *polarized], active)
 
     def put_strategy(self, position, weighted, unweighted, c, active):
         """Add to the technique images of the strategy of the contribution ``c``."""
@@ -157,6 +165,7 @@ class Accumulator:
             weight=camera[..., channels.weight, None],
             features=camera[..., channels.of_features],
             light=light[..., channels.of_colours],
+            polarized=(camera[..., channels.of_stokes], light[..., channels.of_stokes_light]),
         )
 
     def mean(self):
@@ -201,9 +210,14 @@ class Accumulator:
         pixels = self._pixels(*(np.array(s) for s in sums[:2]))
         to_film = pixels.weight / self._splat_weight(spp)[..., None]
         colours = np.concatenate([pixels.colours + pixels.light * to_film, pixels.alpha], axis=-1)
-        layers = [pixels.features]
+        layers = []
+        if self.stokes is not None:
+            of_camera, of_light = pixels.polarized
+            layers += [colours[..., : self._channels.colours], of_camera + of_light * to_film]
         if self.features is not None and self.features.guides:
-            layers = self._denoised(pixels, colours)
+            layers += self._denoised(pixels, colours)
+        else:
+            layers.append(pixels.features)
         if self.variance:
             layers.append(self.replicates.variance(spp, pixels.colours.shape) * pixels.weight)
         if self.depth:
@@ -236,7 +250,7 @@ class Accumulator:
 class _Pixels:
     """Sums of an image, shape (height, width, numbers of each kind).
 
-    Those of camera samples, and of ``light``, the splats.
+    Those of camera samples, and of ``light``, the splats; ``polarized`` of both.
     """
 
     colours: np.ndarray
@@ -244,3 +258,4 @@ class _Pixels:
     weight: np.ndarray
     features: np.ndarray
     light: np.ndarray
+    polarized: tuple[np.ndarray, np.ndarray]

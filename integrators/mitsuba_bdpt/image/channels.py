@@ -16,18 +16,19 @@ def even(count: int) -> int:
 class Channels:
     """Order of a pixel's sums of camera samples.
 
-    So many ``colours``, ``alpha`` (0 or 1 of it), the filter's weight W, so many ``features``. Splats have
-    the colours alone.
+    So many ``colours``, ``alpha`` (0 or 1 of it), the filter's weight W, so many ``features``, and numbers
+    of ``stokes`` vectors besides the colours. Splats have colours and Stokes vectors alone.
     """
 
     colours: int
     alpha: int
     features: int
+    stokes: int = 0
 
     @classmethod
-    def of(cls, film, colours: int, features: int) -> Channels:
-        """Those of a film that keeps so many colours and features."""
-        return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features)
+    def of(cls, film, colours: int, features: int, stokes: int) -> Channels:
+        """Those of a film that keeps so many colours, features, and numbers of Stokes vectors."""
+        return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features, stokes)
 
     @property
     def of_colours(self) -> slice:
@@ -45,15 +46,25 @@ class Channels:
         return slice(self.weight + 1, self.weight + 1 + self.features)
 
     @property
+    def of_stokes(self) -> slice:
+        """Place of the Stokes vectors."""
+        return slice(self.of_features.stop, self.of_features.stop + self.stokes)
+
+    @property
+    def of_stokes_light(self) -> slice:
+        """Place of the Stokes vectors among the sums of splats."""
+        return slice(self.colours, self.colours + self.stokes)
+
+    @property
     def camera(self) -> int:
         """Numbers of a pixel in the sums of camera samples."""
-        return even(self.of_features.stop)
+        return even(self.of_stokes.stop)
 
     @property
     def light(self) -> int:
         """Numbers of a pixel in the sums of splats."""
-        return even(self.colours)
+        return even(self.of_stokes_light.stop)
 
-    def sample(self, colours, alpha, features) -> list:
+    def sample(self, colours, alpha, features, stokes) -> list:
         """A camera sample of filter weight 1, in the order of the sums."""
-        return [*colours, *[alpha] * self.alpha, mi.Float(1), *features]
+        return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes]

@@ -13,19 +13,20 @@ import mitsuba as mi
 
 from ..errors import UnsupportedError
 from ..host.introspection import children, named
+from .stokes import Stokes
 
 # Wavelengths at which a film is asked for its response to a spectrum of 1.
 RESPONSE_SAMPLES = 4096
 
 
-def film_colours(sensor):
-    """Return the kind of colours that the film of ``sensor`` keeps.
+def film_colours(sensor, stokes: bool = False):
+    """Return the kind of colours that the film of ``sensor`` keeps; ``stokes``: and Stokes vectors.
 
     Raises ``UnsupportedError`` for films other than Mitsuba's.
     """
     film = sensor.film()
     if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        return Rgb(film)
+        return Rgb(film, Stokes(sensor, srgb) if stokes else None)
     if film.class_name() != "SpecFilm":
         raise UnsupportedError(
             f"film {named(film)} of class {film.class_name()} is not supported; use hdrfilm or specfilm"
@@ -33,26 +34,31 @@ def film_colours(sensor):
     return Bands(film, sensor)
 
 
+def srgb(value: mi.UnpolarizedSpectrum, wavelengths) -> mi.Color3f:
+    """Linear sRGB of a spectrum."""
+    if mi.is_spectral:
+        return mi.spectrum_to_srgb(value, wavelengths)
+    if mi.is_monochromatic:
+        return mi.Color3f(value.x)
+    return mi.Color3f(value)
+
+
 class Rgb:
     """Linear sRGB, which ``hdrfilm`` keeps in every pixel format.
 
-    ``names`` of the colours; ``unit`` what a spectrum of 1 gives, roughly: the scale of a colour.
+    ``names`` of the colours; ``unit`` what a spectrum of 1 gives, roughly: the scale of a colour; ``stokes``
+    the `Stokes` that are kept besides, or None.
     """
 
     names = ("R", "G", "B")
     unit = (1.0, 1.0, 1.0)
 
-    def __init__(self, film):
-        self._film = film
+    def __init__(self, film, stokes: Stokes | None):
+        self._film, self.stokes = film, stokes
 
     def __call__(self, value, wavelengths):
-        """Linear sRGB of a spectrum."""
-        value = mi.unpolarized_spectrum(value)
-        if mi.is_spectral:
-            return mi.spectrum_to_srgb(value, wavelengths)
-        if mi.is_monochromatic:
-            return mi.Color3f(value.x)
-        return mi.Color3f(value)
+        """Linear sRGB of a spectrum's intensity."""
+        return srgb(mi.unpolarized_spectrum(value), wavelengths)
 
     def prepare(self, layers):
         """Make the film ready for its colours and these layers."""
@@ -65,6 +71,8 @@ class Rgb:
 
 class Bands:
     """The bands of a ``specfilm``, each the integral of radiance times a sensor response, see `Rgb`."""
+
+    stokes = None
 
     def __init__(self, film, sensor):
         self._film, self._sensor = film, sensor

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from . import stokes as stokes_layers
+
 # Names of the layers of a denoised image.
 DENOISED = ("denoised.R", "denoised.G", "denoised.B")
 
@@ -28,14 +30,21 @@ def strategy_index(s, t):
 
 
 def layer_names(
-    depth: int, variance: bool, features=(), colours=("R", "G", "B"), merges: bool = False, denoise=False
+    depth: int,
+    variance: bool,
+    features=(),
+    colours=("R", "G", "B"),
+    merges: bool = False,
+    denoise: bool = False,
+    stokes: bool = False,
 ) -> list[str]:
     """Names of the film's layers, in the order in which `Accumulator` keeps them.
 
-    ``features``, those of ``denoise``, the variance of the pixels in the film's ``colours``, and technique
-    images of paths of up to ``depth`` edges, with one of all ``merges`` if there are some.
+    Those of ``stokes``, ``features``, those of ``denoise``, the variance of the pixels in the film's
+    ``colours``, and technique images of paths of up to ``depth`` edges, with one of all ``merges`` if there
+    are some.
     """
-    names = [*features, *(DENOISED if denoise else ())]
+    names = [*(stokes_layers.NAMES if stokes else ()), *features, *(DENOISED if denoise else ())]
     names += [f"variance.{colour}" for colour in colours if variance]
     of_strategies = [f"s{s}t{t}" for _, s, t in strategies(depth)] + ["merged"] * merges
     return names + [

@@ -10,6 +10,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from ..geometry import polarization
 from ..transport import connections
 from ..transport.counters import Counters, one
 
@@ -52,9 +53,11 @@ class Image:
         Colours that are not finite (`contribution.drop_non_finite` has seen the contribution, not what the
         film makes of it) count as zero.
         """
-        value = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
-        finite = dr.all(dr.isfinite(value))
-        self._film.put_light(c.position, value, c.active & finite)
+        whole = polarization.scaled(c.weighted(), shared.weight)
+        value = self._film.colour(whole, shared.wavelengths)
+        polarized = self._polarized(whole, shared, c.towards)
+        finite = dr.all(dr.isfinite(value)) & _all_finite(polarized)
+        self._film.put_light(c.position, value, polarized, c.active & finite)
         if kernel.strategy_images:
             self._put_strategy(c, c.position, shared)
         return Counters(non_finite=one(c.active & ~finite))
@@ -67,17 +70,31 @@ class Image:
             features, finite = film.features.sample(
                 kernel.points, sample.stream, start.position, sample.u_lens, shared.time, sample.covered
             )
-        colours = film.colour(total * shared.weight, shared.wavelengths)
-        shown = dr.all(dr.isfinite(colours))
+        whole = polarization.scaled(total, shared.weight)
+        colours = film.colour(whole, shared.wavelengths)
+        polarized = self._polarized(whole, shared, -start.ray.d)
+        shown = dr.all(dr.isfinite(colours)) & _all_finite(polarized)
         alpha = _alpha(kernel, seen)
-        film.put_camera(start.counted, dr.select(shown, colours, 0), alpha, features, sample.covered)
+        polarized = [dr.select(shown, value, 0) for value in polarized]
+        values = dr.select(shown, colours, 0), alpha, features, polarized
+        film.put_camera(start.counted, values, sample.covered)
         return Counters(non_finite=one(sample.covered & ~finite) + one(sample.covered & ~shown))
 
+    def _polarized(self, value, shared, towards) -> list:
+        """What the film keeps of a Stokes vector besides the intensity, of light that travels ``towards``."""
+        stokes = self._film.stokes
+        return [] if stokes is None else stokes(value, shared.wavelengths, towards)
+
     def _put_strategy(self, c, position, shared):
-        weighted = self._film.colour(c.weighted() * shared.weight, shared.wavelengths)
-        unweighted = self._film.colour(c.value * shared.weight, shared.wavelengths)
+        weighted = self._film.colour(polarization.scaled(c.weighted(), shared.weight), shared.wavelengths)
+        unweighted = self._film.colour(polarization.scaled(c.value, shared.weight), shared.wavelengths)
         finite = dr.all(dr.isfinite(weighted)) & dr.all(dr.isfinite(unweighted))
         self._film.put_strategy(position, weighted, unweighted, c, c.active & finite)
+
+
+def _all_finite(values):
+    """Whether all are; recorded where there are some."""
+    return dr.isfinite(sum(values)) if values else True
 
 
 def _alpha(kernel, seen):

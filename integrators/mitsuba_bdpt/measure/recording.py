@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
+from ..geometry import polarization
 from ..host.jit import gc_paused
 from ..image import sink
 from ..planning import planner
@@ -83,12 +84,18 @@ class Collector(sink.Image):
 
     def splat(self, kernel, c, shared):
         """Add a contribution with t <= 1."""
-        self._keep(c.position, c.weighted() * shared.weight, shared, (c.s, c.t), c.active)
+        self._keep(c.position, polarization.scaled(c.weighted(), shared.weight), shared, (c.s, c.t), c.active)
         return super().splat(kernel, c, shared)
 
     def end(self, kernel, lane, sample, total, seen):
         """Add a camera sample."""
-        self._keep(sample.start.counted, total * lane.shared.weight, lane.shared, (0, 0), sample.covered)
+        self._keep(
+            sample.start.counted,
+            polarization.scaled(total, lane.shared.weight),
+            lane.shared,
+            (0, 0),
+            sample.covered,
+        )
         return super().end(kernel, lane, sample, total, seen)
 
     def _keep(self, position, value, shared, strategy, active):

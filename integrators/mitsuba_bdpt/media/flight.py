@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..geometry import rays
+from ..geometry import polarization, rays
 from . import tracking
 from .media import Media, Space, coefficients, depth_of, interaction, of_depth
 
@@ -27,13 +27,13 @@ class Edge:
 
     medium: mi.UInt32
     maxt: mi.Float
-    depth: mi.Float | mi.Spectrum
+    depth: mi.Float | mi.UnpolarizedSpectrum
     rest: mi.Float
     event: mi.UInt32
     rays: mi.UInt32
     collisions: mi.UInt32 | None = None
     channel: mi.UInt32 | None = None
-    ratio: mi.Spectrum | None = None
+    ratio: mi.UnpolarizedSpectrum | None = None
     lit: mi.Bool | None = None
 
     @staticmethod
@@ -41,11 +41,11 @@ class Edge:
         """The first edge of a subpath; ``u`` decides its flight, ``u_channel()`` the channel."""
         channel = ratio = None
         if not media.gray:
-            channel, ratio = choose_channel(u_channel()), mi.Spectrum(1)
+            channel, ratio = choose_channel(u_channel()), mi.UnpolarizedSpectrum(1)
         return Edge(
             medium=mi.UInt32(medium),
             maxt=mi.Float(maxt),
-            depth=mi.Float(0) if media.gray else mi.Spectrum(0),
+            depth=mi.Float(0) if media.gray else mi.UnpolarizedSpectrum(0),
             rest=tracking.exponential(u),
             event=mi.UInt32(1),
             rays=mi.UInt32(1),
@@ -94,7 +94,7 @@ class Landing:
 
 def choose_channel(u: mi.Float) -> mi.UInt32:
     """One of the channels of a spectrum, uniformly."""
-    count = len(mi.Spectrum(0))
+    count = len(mi.UnpolarizedSpectrum(0))
     return dr.minimum(mi.UInt32(u * count), count - 1)
 
 
@@ -117,9 +117,8 @@ def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:
     """
     number = landing.edge.medium
     endless = active & ~landing.collided & ~landing.pi.is_valid() & media.is_homogeneous(number)
-    dark = endless & (mi.Spectrum(media.extinction(number, ray.d, ray, endless)) > 0)
-    lit = type(landing.throughput)(dr.select(dark, 0, landing.throughput))
-    return replace(landing, throughput=lit)
+    dark = endless & (mi.UnpolarizedSpectrum(media.extinction(number, ray.d, ray, endless)) > 0)
+    return replace(landing, throughput=polarization.darkened(landing.throughput, dark))
 
 
 @dr.syntax
@@ -171,7 +170,7 @@ def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
     return dr.select(collides, t, dr.inf), depth, rest
 
 
-def at(spectrum: mi.Spectrum, channel: mi.UInt32):
+def at(spectrum: mi.UnpolarizedSpectrum, channel: mi.UInt32):
     """The entry ``channel`` of a spectrum."""
     value = spectrum[0]
     for i in range(1, len(spectrum)):
@@ -191,7 +190,7 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
     sigma_s, sigma_t = media.ask(edge.medium, coefficients, mei, collided)
     albedo = sigma_s / dr.mean(sigma_t)
     if media.gray:
-        return dr.select(collided, throughput * albedo, throughput), edge
+        return dr.select(collided, polarization.scaled(throughput, albedo), throughput), edge
     homogeneous = media.is_homogeneous(edge.medium) & active
     transmittance = dr.exp(-depth)
     densities = dr.select(collided, sigma_t, 1) * transmittance
@@ -199,7 +198,7 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
     estimate = dr.select(collided, sigma_s, 1) * transmittance / mean
     estimate = dr.select(homogeneous, estimate, dr.select(collided, albedo, 1))
     ratio = dr.select(homogeneous, edge.ratio * densities / mean, edge.ratio)
-    return throughput * estimate, replace(edge, ratio=ratio)
+    return polarization.scaled(throughput, estimate), replace(edge, ratio=ratio)
 
 
 def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum:
@@ -210,7 +209,7 @@ def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum
     if edge.ratio is None:
         return throughput
     transmittance = dr.exp(-depth)
-    return throughput * (transmittance / dr.mean(edge.ratio * transmittance))
+    return polarization.scaled(throughput, transmittance / dr.mean(edge.ratio * transmittance))
 
 
 def _passes(media: Media, si, hidden) -> mi.Bool:

@@ -83,7 +83,7 @@ class Media:
         if not self._spectral_table:
             return None
         entries = np.array([np.zeros(len(majorants[0])), *majorants])
-        return mi.Float(entries[:, 0]) if self.gray else mi.Spectrum(entries.T)
+        return mi.Float(entries[:, 0]) if self.gray else mi.UnpolarizedSpectrum(entries.T)
 
     def number_of(self, medium: mi.Medium | None) -> int:
         """The number of a medium of the scene, 0 for none."""
@@ -127,7 +127,7 @@ class Media:
         return extinction if self.gray else extinction[0]
 
     def _majorant(self, medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
-        majorant = mi.Spectrum(medium.get_majorant(mei, active))
+        majorant = mi.UnpolarizedSpectrum(medium.get_majorant(mei, active))
         return majorant[0] if self.gray else majorant
 
     def ask(self, number: mi.UInt32, question, *args):
@@ -151,7 +151,7 @@ class Space:
     scene: mi.Scene
     media: Media
     shape_errors: ShapeErrors
-    null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Spectrum]
+    null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.UnpolarizedSpectrum]
     clipped: bool = False
 
 
@@ -186,19 +186,19 @@ def symmetric_frame(n: mi.Vector3f) -> mi.Frame3f:
 def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
     """sigma_s and sigma_t of a medium (1 / scene unit), for `Media.ask`."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei, active)
-    return mi.Spectrum(sigma_s), mi.Spectrum(sigma_t)
+    return mi.UnpolarizedSpectrum(sigma_s), mi.UnpolarizedSpectrum(sigma_t)
 
 
-def depth_of(sigma: mi.Float | mi.Spectrum, length: mi.Float) -> mi.Float | mi.Spectrum:
+def depth_of(sigma: mi.Float | mi.UnpolarizedSpectrum, length: mi.Float) -> mi.Float | mi.UnpolarizedSpectrum:
     """Optical depth of a ``length``, which may be infinite, in a medium of extinction ``sigma``."""
     # (In spectral variants the choice by entries is no `Spectrum`.)
     return type(sigma)(dr.select(sigma > 0, sigma * length, 0))
 
 
-def of_depth(depth: mi.Float | mi.Spectrum):
+def of_depth(depth: mi.Float | mi.UnpolarizedSpectrum):
     """T~ of an optical depth: the mean over the channels of exp(-depth), not below that of `DEEPEST`."""
     transmittance = dr.exp(-depth)
-    if isinstance(depth, mi.Spectrum):
+    if isinstance(depth, mi.UnpolarizedSpectrum):
         transmittance = dr.mean(transmittance)
     return dr.maximum(transmittance, _LEAST)
 
@@ -255,7 +255,9 @@ def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray)
 
 def _majorants(medium: mi.Medium, mei: mi.MediumInteraction3f) -> np.ndarray:
     """Majorants at `probes`: (channels, probes)."""
-    return np.array(mi.Spectrum(medium.get_majorant(mei)) + dr.zeros(mi.Spectrum, _PROBES))
+    return np.array(
+        mi.UnpolarizedSpectrum(medium.get_majorant(mei)) + dr.zeros(mi.UnpolarizedSpectrum, _PROBES)
+    )
 
 
 def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
@@ -269,7 +271,9 @@ def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
     mei.wi, mei.sh_frame = wi, symmetric_frame(wi)
     if mi.is_spectral:
         low, high = mi.MI_CIE_MIN, mi.MI_CIE_MAX
-        mei.wavelengths = mi.Spectrum(rng.uniform(low, high, (len(mi.Spectrum(0)), _PROBES)))
+        mei.wavelengths = mi.UnpolarizedSpectrum(
+            rng.uniform(low, high, (len(mi.UnpolarizedSpectrum(0)), _PROBES))
+        )
     extinction, volumes = children(medium).get("sigma_t"), _volumes(medium)
     if not medium.is_homogeneous() and isinstance(extinction, mi.Volume):
         volumes = [extinction]
@@ -344,7 +348,9 @@ class _Look:
         mei, homogeneous = probes(medium), medium.is_homogeneous()
         majorant = _majorants(medium, mei)
         _check(medium, mei, majorant)
-        sigma_s, _, sigma_t = (np.array(mi.Spectrum(s)) for s in medium.get_scattering_coefficients(mei))
+        sigma_s, _, sigma_t = (
+            np.array(mi.UnpolarizedSpectrum(s)) for s in medium.get_scattering_coefficients(mei)
+        )
         self.strange = _strange(medium, sigma_s, sigma_t)
         self.majorant, self.least = majorant.max(1), float(majorant.min())
         # A grid's flights are sampled with one number for all channels.

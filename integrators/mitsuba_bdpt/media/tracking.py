@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..geometry import polarization
 from ..sampling.points import sequential
 from .media import Media, coefficients, interaction
 
@@ -61,7 +62,7 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
     low, high, inside = _within(media, number, ray, end, active)
     majorant = media.majorant(number, ray, active)
     t, met = mi.Float(low), mi.Float(dr.inf)
-    rest, throughput, word = mi.Float(rest), mi.Spectrum(throughput), mi.UInt32(word)
+    rest, throughput, word = mi.Float(rest), type(throughput)(throughput), mi.UInt32(word)
     collisions = mi.UInt32(0)
     going, throughput = _tracks(majorant, throughput, inside)
     while dr.hint(
@@ -77,7 +78,8 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
         u, word = sequential(word)
         # The probability of a real collision is the mean over channels, whose ratios are left.
         passed = tentative & (u * majorant < null)
-        throughput = dr.select(passed, throughput * ((majorant - sigma_t) / null), throughput)
+        left_over = polarization.scaled(throughput, (majorant - sigma_t) / null)
+        throughput = dr.select(passed, left_over, throughput)
         met = dr.select(tentative & ~passed, t, met)
         u, word = sequential(word)
         rest = dr.select(passed, exponential(u), rest)
@@ -96,7 +98,7 @@ def ratio(media: Media, number, ray, end, word, active):
     """
     low, high, inside = _within(media, number, ray, end, active)
     majorant = media.majorant(number, ray, active)
-    t, transmittance, word = mi.Float(low), mi.Spectrum(1), mi.UInt32(word)
+    t, transmittance, word = mi.Float(low), mi.UnpolarizedSpectrum(1), mi.UInt32(word)
     collisions = mi.UInt32(0)
     going, transmittance = _tracks(majorant, transmittance, inside)
     while dr.hint(

@@ -22,8 +22,8 @@ class Crossing:
     (None without any).
     """
 
-    transmittance: mi.Spectrum
-    depth: mi.Float | mi.Spectrum
+    transmittance: mi.UnpolarizedSpectrum
+    depth: mi.Float | mi.UnpolarizedSpectrum
     clear: mi.Bool
     segments: mi.UInt32
     collisions: mi.UInt32 | None
@@ -76,7 +76,7 @@ def _along(media: Media, medium, ray, length, word, active):
     """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word, collisions."""
     sigma = media.extinction(medium, ray.d, ray, active)
     depth = depth_of(sigma, length)
-    transmittance, collisions = mi.Spectrum(dr.exp(-depth)), None
+    transmittance, collisions = mi.UnpolarizedSpectrum(dr.exp(-depth)), None
     if media.grids:
         grid = active & (medium != 0) & ~media.is_homogeneous(medium)
         estimate, of_mean, word, collisions = tracking.ratio(media, medium, ray, length, word, grid)
@@ -89,9 +89,9 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
     """`between` where there are surfaces to pass."""
     media, scene = space.media, space.scene
     o, left, medium = mi.Point3f(ray.o), mi.Float(ray.maxt), mi.UInt32(medium)
-    transmittance, word, going = mi.Spectrum(1), mi.UInt32(word), mi.Bool(active)
+    transmittance, word, going = mi.UnpolarizedSpectrum(1), mi.UInt32(word), mi.Bool(active)
     clear = mi.Bool(active)
-    depth = mi.Float(0) if media.gray else mi.Spectrum(0)
+    depth = mi.Float(0) if media.gray else mi.UnpolarizedSpectrum(0)
     segments, collisions = mi.UInt32(0), mi.UInt32(0) if media.grids else None
     while dr.hint(going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
@@ -120,7 +120,7 @@ def _is_end(si, own, t) -> mi.Bool:
     return (met(si.shape, si.instance) == own.number) & (t >= own.t)
 
 
-def _onward(space: Space, si, active, hidden: bool) -> mi.Spectrum:
+def _onward(space: Space, si, active, hidden: bool) -> mi.UnpolarizedSpectrum:
     """What the surface ``si`` lets pass."""
     passed = space.null_transmission(si, active)
     if not hidden:

@@ -120,7 +120,7 @@ class _Walk:
     """
 
     ray: mi.Ray3f
-    weight: mi.Spectrum
+    weight: mi.UnpolarizedSpectrum
     edges: mi.UInt32
     distance: mi.Float
     active: mi.Bool
@@ -224,10 +224,10 @@ def _shared(prepared: PreparedScene, generator: PCG32) -> Shared:
     sensor = prepared.camera.sensor
     time = sensor.shutter_open() + generator.next_float32() * sensor.shutter_open_time()
     if not mi.is_spectral:
-        return Shared(time, mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+        return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
     u = generator.next_float32()
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
-    return Shared(time, wavelengths, weight, u)
+    return Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u)
 
 
 def _two(generator: PCG32) -> mi.Point2f:
@@ -254,7 +254,7 @@ def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi
     e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
     active = e.delta & ~bsdf.is_zero(e.weight)  # what is not finite is kept, to be said
     ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
-    weight, index = mi.Spectrum(e.weight), e.index
+    weight, index = mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(e.weight)), e.index
     ray.maxt = dr.full(mi.Float, dr.inf, SUBPATHS)  # as wide as those of the sensor, for the same kernel
     dr.make_opaque(ray, weight, active, beam, index, generator)
     astray = active & ~(dr.all(dr.isfinite(ray.o)) & dr.all(dr.isfinite(ray.d)))
@@ -278,7 +278,7 @@ def _seen(prepared: PreparedScene, plan: Plan, max_depth: int) -> _Ends:
     pixel = camera.region.pixel(dr.minimum(mi.UInt32(place), pixels - 1))
     start = camera.start(pixel, _two(generator), _two(generator), shared)
     ray, pdf_w = mi.Ray3f(start.ray), mi.Float(start.pdf_w)
-    weight = start.weight * dr.opaque(mi.Spectrum, 1, SUBPATHS)
+    weight = mi.unpolarized_spectrum(start.weight) * dr.opaque(mi.UnpolarizedSpectrum, 1, SUBPATHS)
     active = dr.full(mi.Bool, True, SUBPATHS)
     dr.make_opaque(ray, weight, active, pdf_w, generator)
     ends = _follow(prepared, ray, weight, active, generator, max_depth, False)
@@ -293,13 +293,13 @@ def _seen(prepared: PreparedScene, plan: Plan, max_depth: int) -> _Ends:
 def _follow(
     prepared: PreparedScene,
     ray: mi.Ray3f,
-    weight: mi.Spectrum,
+    weight: mi.UnpolarizedSpectrum,
     active: mi.Bool,
     generator: PCG32,
     max_depth: int,
     adjoint: bool,
 ) -> _Ends:
-    """Follow rays by delta events to the first surface that has another lobe.
+    """Follow rays by delta events to the first surface that has another lobe, by intensity alone.
 
     Where one has both, a coin decides. One kernel for both sides.
     """
@@ -322,6 +322,7 @@ def _follow(
         active = active & ~here & delta & (walk.edges < last)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        factor = mi.unpolarized_spectrum(factor)
         factor *= dr.select(is_adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
         active &= ~bsdf.is_zero(weight)
@@ -349,13 +350,13 @@ def _reflectance(si: mi.SurfaceInteraction3f, surface: mi.BSDFPtr, generator: PC
 
     Known for diffuse ones; of others one sample, whose mean it is.
     """
-    even = surface.eval_diffuse_reflectance(si, active)
+    even = mi.unpolarized_spectrum(surface.eval_diffuse_reflectance(si, active))
     flags = mi.BSDFFlags.Smooth
     context = mi.BSDFContext(mi.TransportMode.Radiance, +flags)
     _, glossy = surface.sample(context, si, generator.next_float32(), _two(generator), active)
     diffuse = _has(surface, mi.BSDFFlags.Diffuse)
     # Mitsuba's answer of BSDFs that do not know their own is a value in one direction, which has no bound.
-    return _carried(dr.select(diffuse, dr.minimum(even, 1), glossy))
+    return _carried(dr.select(diffuse, dr.minimum(even, 1), mi.unpolarized_spectrum(glossy)))
 
 
 def _end(
@@ -365,7 +366,8 @@ def _end(
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
     seen = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, front, back)  # the other side of most BSDFs is black
-    opacity = 1 - surface.eval_null_transmission(si, walk.active)  # `mask` answers for what is inside of it
+    # `mask` answers for what is inside of it.
+    opacity = 1 - mi.unpolarized_spectrum(surface.eval_null_transmission(si, walk.active))
     return _Ends(
         p=mi.Point3f(si.p),
         n=mi.Normal3f(dr.mulsign(si.n, -dr.dot(si.n, walk.ray.d))),

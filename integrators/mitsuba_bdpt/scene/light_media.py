@@ -92,10 +92,10 @@ class LightMedia:
         n = each * count
         u = rng.random((3, n))
         u_point = mi.Point2f((np.arange(n) + rng.random(n)) / n, u[0])
-        zeros = dr.zeros(mi.Spectrum if mi.is_spectral else mi.Color0f, n)
+        zeros = dr.zeros(mi.UnpolarizedSpectrum if mi.is_spectral else mi.Color0f, n)
         if mi.is_spectral:
             zeros += 550
-        shared = Shared(mi.Float(0), zeros, mi.Spectrum(1), mi.Float(0.5))
+        shared = Shared(mi.Float(0), zeros, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(u_point, mi.Point2f(u[1], u[2]), shared, mi.Bool(True))
         number = np.array(self._near_side(e, mi.Bool(True)) + dr.zeros(mi.UInt32, n))
         index = np.array(e.index + dr.zeros(mi.UInt32, n))

@@ -8,8 +8,9 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.emitters import Emitters
+from ..errors import UnsupportedError
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import all_shapes, children, is_instance
+from ..host.introspection import all_shapes, children, is_instance, named
 from ..media.media import Media, Space
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
@@ -38,6 +39,7 @@ class PreparedScene:
         self.traits = bsdf.Traits.of(found)
         self.space = self.light_media = None
         if media := Media.of(scene, sensor, found):
+            _check_passed(found)
             space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
             far = medium_at_far_plane(space, sensor)
             self.space = replace(space, clipped=far > 0 and media.objects[far - 1].is_homogeneous())
@@ -50,6 +52,15 @@ class PreparedScene:
         if settings.stored_vertices > 0:
             return settings.stored_vertices
         return DEFAULT_STORED if self.space is None else MAX_STORED
+
+
+def _check_passed(found):
+    """Raise ``UnsupportedError`` where edges would pass what polarizes: joins know the intensity alone."""
+    for one in bsdf.polarizing(found):
+        raise UnsupportedError(
+            f"{named(one)} of class {one.class_name()} polarizes what it lets pass, which is not supported "
+            "in scenes with participating media; take out the media or the surface, or use volpath"
+        )
 
 
 def _prepare_bitmaps(found):

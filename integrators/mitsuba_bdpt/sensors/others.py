@@ -239,4 +239,4 @@ class RayOnlySensor(Sensor):
 def _sampled(view, uv, u_lens, shared):
     """Ray and weight of a sensor of which only these are known."""
     ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
-    return mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.Spectrum(weight)
+    return mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.unpolarized_spectrum(weight)

@@ -25,7 +25,7 @@ class CameraStart:
     ray: mi.Ray3f
     p: mi.Point3f
     pdf_w: mi.Float
-    weight: mi.Float | mi.Spectrum
+    weight: mi.Float | mi.UnpolarizedSpectrum
     arrival: mi.Float
     position: mi.Point2f | None = None
     counted: mi.Point2f | None = None

@@ -15,7 +15,9 @@ from functools import partial
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..geometry import polarization
 from ..host.introspection import children
 
 # Plugins whose sample() returns the density of the lobe that was picked, not that of pdf().
@@ -74,11 +76,11 @@ class Traits:
         """Of the same BSDFs where no subpath starts from the other side."""
         return replace(self, round_trip=False, reverse=False)
 
-    def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """What the surface ``si`` lets pass straight on."""
+    def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """What the surface ``si`` lets pass straight on, of every polarization."""
 
         def ask(self, si, active):
-            return mi.Spectrum(self.eval_null_transmission(si, active))
+            return mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(self.eval_null_transmission(si, active)))
 
         return self.asked(si.bsdf(), ask, si, active)
 
@@ -97,6 +99,9 @@ class Traits:
 # of 10 and of 27 materials take the same time either way. What diverging lanes cost in a decision is another
 # matter, see `costs.MANY_BSDFS`.)
 MANY = 10
+
+# Points at which surfaces are asked what they let pass.
+_ASKED = 4096
 
 
 class Asked:
@@ -180,6 +185,7 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
         value, pdf = self.eval_pdf(ctx, si, wo, active)
+        value = polarization.in_world(si, value, -wo, si.wi)
         return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
 
     return traits.asked(bsdf, ask, si, wo, active)
@@ -230,7 +236,7 @@ def sample(
     """
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
-        drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
+        drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=False)
         return drawn, _evaluated(bsdf, si, *joined, traits) if target else None
 
     drawn, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
@@ -249,7 +255,7 @@ def sample_adjoint(
     """
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
-        drawn = _drawn(bsdf, si, u1, u2, sampled, traits)
+        drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=True)
         weight = _adjoint_weight(bsdf, si, drawn, sampled, traits)
         return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits) if target else None
 
@@ -276,7 +282,7 @@ def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
     f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits))
     # The radiance that a camera subpath carries, without its factor eta^-2.
     eta2 = dr.square(bs.eta)
-    delta_weight = drawn.back / eta2 if traits.round_trip else drawn.weight * eta2
+    delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
     weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.pdf_fwd_w)
     # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
     return dr.select((drawn.pdf_fwd_w == 0) | is_zero(drawn.weight), 0, weight)
@@ -287,7 +293,7 @@ class _Drawn:
     """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode.
 
     Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is
-    no ``pdf_rev_w``) and, if `Traits.round_trip`, the weight ``back`` of a delta event made from its other
+    no ``pdf_rev_w``) and, if `_asks_back`, the weight ``back`` of a delta event made from its other
     end, 0 if it does not lead back.
     """
 
@@ -298,12 +304,13 @@ class _Drawn:
     back: mi.Spectrum
 
 
-def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
+def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
     """A direction that Mitsuba's ``sample`` draws, with its densities both ways, in one virtual call."""
 
     def ask(self, si, u1, u2, active):
         ctx = mi.BSDFContext()
         bs, weight = self.sample(ctx, si, u1, u2, active)
+        weight = polarization.in_world(si, weight, -bs.wo, si.wi)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         smooth = active & ~delta
         pdf_fwd_w = bs.pdf
@@ -311,7 +318,8 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits) -> _Drawn:
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
-        back = _back(self, si, bs, u1, u2, active & delta) if traits.round_trip else mi.Spectrum(0)
+        asks = _asks_back(traits, adjoint)
+        back = _back(self, si, bs, u1, u2, active & delta) if asks else mi.Spectrum(0)
         return bs, weight, pdf_fwd_w, pdf_rev_w, back
 
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
@@ -328,13 +336,30 @@ def is_zero(value: mi.Spectrum):
 
 
 def is_finite(value: mi.Spectrum):
-    """Mask: no entry of a spectrum is NaN or infinite."""
-    return dr.all(dr.isfinite(mi.unpolarized_spectrum(value)))
+    """Mask: no entry of a spectrum (of a Mueller matrix's first column) is NaN or infinite."""
+    finite = dr.isfinite(mi.unpolarized_spectrum(value))
+    if mi.is_polarized:
+        for i in range(1, 4):
+            finite &= dr.isfinite(value[i, 0])
+    return dr.all(finite)
+
+
+def _asks_back(traits: Traits, adjoint: bool) -> bool:
+    """Whether delta events are also made from their other end.
+
+    On light subpaths of polarized variants for their matrices: that of light which travels the other way does
+    not follow from it. (Mitsuba's importance mode is another answer, but turns retarders the wrong way.)
+    """
+    return traits.round_trip or (adjoint and bool(mi.is_polarized))
 
 
 def _back(bsdf, si, bs, u1, u2, active):
-    """The weight of a delta event sampled from its other end, 0 if it does not lead back."""
+    """The weight of a delta event sampled from its other end, 0 if it does not lead back.
+
+    The event is taken to have the same probability from either end, as those of Mitsuba's BSDFs.
+    """
     back, weight = bsdf.sample(mi.BSDFContext(), with_wi(si, bs.wo), u1, u2, active)
+    weight = polarization.in_world(si, weight, -si.wi, bs.wo)
     return dr.select(dr.squared_norm(back.wo - si.wi) < 1e-4, weight, 0)
 
 
@@ -368,6 +393,27 @@ def _step(si, drawn: _Drawn, weight) -> Step:
         null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
         eta=bs.eta,
     )
+
+
+def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
+    """Those of ``bsdfs``, and of what is in them, that polarize what they let pass straight on.
+
+    They are asked at points all over their textures, from both sides.
+    """
+    rng = np.random.default_rng(0)
+    si = dr.zeros(mi.SurfaceInteraction3f, _ASKED)
+    si.uv = mi.Point2f(rng.random((2, _ASKED)).astype(np.float32))
+    directions = rng.standard_normal((3, _ASKED)).astype(np.float32)
+    si.wi = dr.normalize(mi.Vector3f(directions))
+    found = [b for b in nested(bsdfs) if mi.is_polarized and mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
+    return [b for b in found if not _is_scalar(mi.Spectrum(b.eval_null_transmission(si)))]
+
+
+def _is_scalar(matrix: mi.Spectrum) -> bool:
+    """Whether Mueller matrices are numbers for each wavelength times the identity."""
+    rows = [[np.array(matrix[i, j]) for j in range(4)] for i in range(4)]
+    first = rows[0][0]
+    return all(np.abs(rows[i][j] - (i == j) * first).max() < 1e-6 for i in range(4) for j in range(4))
 
 
 def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:

@@ -26,7 +26,8 @@ class Contribution:
     ``position`` on the film in pixels, None where it adds to the lane's own pixel (t >= 2); ``counted`` what
     was done for it. In scenes with media ``value`` and ``weight`` are those of an edge without any until
     `visibility.seen` has looked; it needs the ``sides``: what `mis.Heuristic.weigh` takes. ``emission``: what
-    `Emitters.cell` says of the path, where a pilot asks for it.
+    `Emitters.cell` says of the path, where a pilot asks for it. ``towards``: the direction in which the light
+    reaches the sensor, None for t >= 2, which know it by their `CameraStart`.
     """
 
     value: mi.Spectrum
@@ -40,6 +41,7 @@ class Contribution:
     counted: Counters = field(default_factory=Counters)
     sides: Any = None
     emission: Cell | None = None
+    towards: mi.Vector3f | None = None
 
     def weighted(self) -> mi.Spectrum:
         """What the strategy adds to the image."""

@@ -46,7 +46,7 @@ class Shared:
     """
 
     time: mi.Float
-    wavelengths: mi.Color0f | mi.Spectrum
+    wavelengths: mi.Color0f | mi.UnpolarizedSpectrum
     weight: mi.Spectrum
     u_wavelength: mi.Float
     wavelength_set: mi.UInt32 | None = None

@@ -246,7 +246,7 @@ def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
         u = points.draw_1d("light", stream, Purpose.TIME)
         time += u * sensor.shutter_open_time()
     if not mi.is_spectral:
-        return Shared(time, mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+        return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
     number = None
     if kernel.merging is None:
         u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
@@ -254,7 +254,7 @@ def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
         number = kernel.merging.wavelengths.number(index)
         u = kernel.merging.wavelengths.u(number)
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
-    return Shared(time, wavelengths, weight, u, number)
+    return Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u, number)
 
 
 # -- the light subpath ------------------------------------------------------------------------

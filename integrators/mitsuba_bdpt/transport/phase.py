@@ -48,7 +48,8 @@ def asymmetry(medium: mi.Medium) -> float:
     for mei, wo in ((there, back.wi), (back, there.wi)):
         value, _ = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, wo, mi.Bool(True))
         _, _, sigma_t = medium.get_scattering_coefficients(mei, mi.Bool(True))
-        found.append(np.array(mi.Spectrum(sigma_t) * mi.Spectrum(value) + dr.zeros(mi.Spectrum, count)))
+        scattered = mi.UnpolarizedSpectrum(sigma_t) * mi.unpolarized_spectrum(mi.Spectrum(value))
+        found.append(np.array(scattered + dr.zeros(mi.UnpolarizedSpectrum, count)))
     return float(np.abs(found[0] - found[1]).mean() / max(found[0].mean(), np.finfo(float).tiny))
 
 

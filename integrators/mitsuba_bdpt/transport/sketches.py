@@ -147,11 +147,11 @@ def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lob
     """From an evaluation towards the normal, and of glossy BSDFs one in the mirror direction."""
     wi = vertex.si.wi
     up = mi.Vector3f(0, 0, dr.sign(wi.z))
-    throughput = vertex.throughput
+    throughput = mi.unpolarized_spectrum(vertex.throughput)
     lobes = Lobes.plain()
     if alone:
         lobes.diffuse = (
-            bsdf.brightest(throughput * scattering.evaluate(kernel, vertex, up, active).value) * dr.pi
+            bsdf.brightest(throughput * _intensity(scattering.evaluate(kernel, vertex, up, active))) * dr.pi
         )
     if not kernel.traits.glossy:
         return lobes
@@ -162,16 +162,21 @@ def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lob
         pdf_w = dr.maximum(mirror.pdf_fwd_w, _LEAST_PDF)
         width2 = dr.clip(1 / (4 * dr.pi * pdf_w * dr.maximum(dr.abs(wi.z), _LEAST_Z)), _NARROW, 1)
         shape = _shape(dr.square(1 + dr.abs(wi.z)) / dr.squared_norm(wi + up), width2)
-        diffuse = dr.maximum(f.value - mirror.value * shape, 0)
+        diffuse = dr.maximum(_intensity(f) - _intensity(mirror) * shape, 0)
         return Lobes(
             bsdf.brightest(throughput * diffuse) * dr.pi,
             dr.maximum(f.pdf_fwd_w - mirror.pdf_fwd_w * shape, 0) * dr.pi,
-            bsdf.brightest(throughput * mirror.value),
+            bsdf.brightest(throughput * _intensity(mirror)),
             mi.Float(mirror.pdf_fwd_w),
             width2,
         )
 
     return dr.if_stmt((lobes,), glossy, fit, lambda lobes: lobes)
+
+
+def _intensity(f: bsdf.Evaluation) -> mi.UnpolarizedSpectrum:
+    """The value for light that is not polarized."""
+    return mi.unpolarized_spectrum(f.value)
 
 
 @dataclass

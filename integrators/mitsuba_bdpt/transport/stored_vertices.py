@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from ..geometry import rays
+from ..geometry import polarization, rays
 from . import mis
 from .inputs import KEPT, Kernel
 from .sketches import Sketch, Sketches
@@ -98,13 +98,13 @@ class Thinning:
 class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory, ``count`` of them.
 
-    ``d_vcm`` and ``d_vc`` are their ``partial``; ``rounding`` offset and curvature of their anchors, the rest
-    of which is in ``si``; ``s`` the number of light vertices up to and including each; ``medium`` None in
-    scenes without media.
+    Of ``throughput_over_cos`` what `polarization.stokes` says; ``d_vcm`` and ``d_vc`` are their ``partial``;
+    ``rounding`` offset and curvature of their anchors, the rest of which is in ``si``; ``s`` the number of
+    light vertices up to and including each; ``medium`` None in scenes without media.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
-    throughput_over_cos: dr.Local[mi.Spectrum]
+    throughput_over_cos: list[dr.Local]
     d_vcm: dr.Local[mi.Float]
     d_vc: dr.Local[mi.Float] | dr.Local[mi.Vector4f]
     rounding: dr.Local[mi.Vector2f]
@@ -120,7 +120,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     size = kernel.store_size
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
-        throughput_over_cos=dr.alloc_local(mi.Spectrum, size),
+        throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
         d_vcm=dr.alloc_local(mi.Float, size),
         d_vc=dr.alloc_local(type(kernel.heuristic.zero()), size),
         rounding=dr.alloc_local(mi.Vector2f, size),
@@ -139,7 +139,10 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     if path.thinning is not None:
         y, slot, keep = _thinned(path, y, keep)
     path.si.write(y.si, slot, keep)
-    path.throughput_over_cos.write(y.throughput_over_cos, slot, keep)
+    for local, entry in zip(
+        path.throughput_over_cos, polarization.stokes(y.throughput_over_cos), strict=True
+    ):
+        local.write(entry, slot, keep)
     path.d_vcm.write(y.partial.d_vcm, slot, keep)
     path.d_vc.write(y.partial.d_vc, slot, keep)
     path.rounding.write(mi.Vector2f(y.anchor.offset, y.anchor.curvature), slot, keep)
@@ -172,7 +175,9 @@ def read_light_vertex(
         si=si,
         bsdf=si.bsdf(),
         anchor=rays.Anchor(si.p, si.n, rounding.x, curvature),
-        throughput_over_cos=path.throughput_over_cos.read(slot, active),
+        throughput_over_cos=polarization.of_stokes(
+            [local.read(slot, active) for local in path.throughput_over_cos]
+        ),
         partial=mis.Partial(path.d_vcm.read(slot, active), path.d_vc.read(slot, active)),
         edges=s - 1,
         medium=None if path.medium is None else path.medium.read(slot, active),

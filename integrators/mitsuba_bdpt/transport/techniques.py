@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.records import Direct, Emission
-from ..geometry import rays
+from ..geometry import polarization, rays
 from ..media import flight, transmittance
 from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
@@ -182,6 +182,7 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
     counted = Counters(shadow_t1=one(active))
     ends = mi.UInt32(1), mi.UInt32(1)
     c = Contribution(value, weight, *ends, active, shares, "light", join.position, counted, sides)
+    c = replace(c, towards=join.d)
     return seen(kernel, c, Sight(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
 
 
@@ -204,7 +205,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47)."""
     h, join, f = kernel.heuristic, y.endpoint, y.f
     to_area = y.cosine(join.d) / join.dist2
-    estimate = y.throughput * f.value * (join.importance / join.dist2)
+    estimate = polarization.extended(y.throughput, f.value, adjoint=True) * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~bsdf.is_zero(value)
 
@@ -224,7 +225,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
     sight = Sight(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
-    c = replace(c, value=value / survival, active=active, counted=counted, sides=sides)
+    c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=join.d)
     return seen(kernel, c, sight.numbered(kernel, stream, y.event))
 
 
@@ -270,7 +271,8 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & _hidden(kernel, z.surroundings, asked))
-    return Contribution(value, weight, walk.edges + 1, mi.UInt32(0), active, shares, "light", z.position)
+    ends = walk.edges + 1, mi.UInt32(0)
+    return Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
 
 
 def _reaching(walk: Walk, y: Vertex):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..geometry import rays
+from ..geometry import polarization, rays
 from ..media import transmittance
 from ..sampling.points import Purpose, Stream
 from .contribution import Contribution
@@ -50,7 +50,7 @@ def seen(kernel: Kernel, c: Contribution, sight: Sight) -> Contribution:
     weight, shares = kernel.heuristic.weigh(*c.sides, crossing.tr)
     return replace(
         c,
-        value=c.value * crossing.transmittance,
+        value=polarization.scaled(c.value, crossing.transmittance),
         weight=weight,
         shares=shares,
         active=c.active & crossing.visible,

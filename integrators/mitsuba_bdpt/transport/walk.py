@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.records import Direct
-from ..geometry import rays
+from ..geometry import polarization, rays
 from ..host import renamed
 from ..media import flight
 from ..sampling.points import Purpose
@@ -379,7 +379,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     merge = _merge(kernel, walk, vertex, isolated)
     partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
 
-    throughput = vertex.throughput * step.weight
+    throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
     eta = walk.eta * step.eta if kernel.refracts else 1
     brightest = bsdf.brightest(throughput)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.

@@ -1,0 +1,38 @@
+"""Layers of the Stokes vector, as Mitsuba's integrator ``stokes`` writes them."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry.polarization import basis
+
+NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")
+"""Of the layers."""
+
+POLARIZED = 9
+"""Numbers of a sample besides its colours, which are the intensity S0: S1, S2 and S3 in linear sRGB."""
+
+
+class Stokes:
+    """The Stokes vectors of samples, in the frame of a ``sensor`` whose x axis is horizontal.
+
+    S1 > 0: more horizontal than vertical light; S2 > 0: more of it at +45 than at -45 degrees; S3 > 0: more
+    right than left circular.
+    """
+
+    def __init__(self, sensor: mi.Sensor, rgb):
+        self._vertical = sensor.world_transform() @ mi.Vector3f(0, 1, 0)
+        dr.make_opaque(self._vertical)
+        self._rgb = rgb
+
+    def __call__(self, value: mi.Spectrum, wavelengths, towards: mi.Vector3f) -> list[mi.Float]:
+        """S1, S2 and S3 of light that travels along ``towards`` to the sensor.
+
+        The first column of the matrix ``value`` is its Stokes vector in the frame that follows from that
+        direction.
+        """
+        target = dr.cross(-towards, self._vertical)
+        turned = mi.mueller.rotate_stokes_basis(towards, basis(towards), target)
+        vector = [sum(turned[i, j] * value[j, 0] for j in range(1, 4)) for i in range(1, 4)]
+        return [number for entry in vector for number in self._rgb(entry, wavelengths)]

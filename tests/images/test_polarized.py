@@ -1,0 +1,536 @@
+"""Polarized light: optics that is known, Mitsuba's ``stokes`` around ``path``, each strategy by itself.
+
+Statistics and scenes as in ``test_strategies.py``; scenes are made inside of tests, since objects of one
+variant are of no use in another.
+"""
+
+from dataclasses import replace
+
+import media_parts as parts
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+import views
+import welch as st
+from mitsuba_bdpt.geometry import polarization
+from mitsuba_bdpt.image import sink, stokes
+from mitsuba_bdpt.image.layers import strategies
+from mitsuba_bdpt.run import rendering
+from snapshots import ROUNDING, stopped
+
+RUNS, TILES = 16, 4
+METAL = {"eta": 0.5, "k": 2.0}
+ROUGH = {"type": "roughconductor", "alpha": 0.3, **METAL}
+PLASTIC = {"type": "pplastic", "alpha": 0.3, "diffuse_reflectance": 0.5}
+FIRST = slice(0, None, 3)  # of the layers of a monochromatic variant, where R, G and B are the same
+
+
+@pytest.fixture(autouse=True)
+def _polarized():
+    mi.set_variant(variants.of("mono_polarized"))
+
+
+def at(*steps):
+    """A transform by names of its steps and their values."""
+    transform = mi.ScalarTransform4f()
+    for name, *values in steps:
+        transform = getattr(transform, name)(*values)
+    return transform
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "stokes": True, **parameters})
+
+
+def layers(scene, integrator, spp, seed=0):
+    """S0 to S3 of each pixel, (height, width, 4)."""
+    image = np.array(integrator.render(scene, spp=spp, seed=seed), dtype=np.float64)
+    return image[..., 1:][..., FIRST] if image.shape[2] == 13 else image[..., -12:][..., FIRST]
+
+
+# -- optics that is known ---------------------------------------------------------------------
+
+
+def filters(*bsdfs):
+    """Rectangles across the z axis, the first one first met by light that travels along it towards +z."""
+    return {
+        f"filter {i}": {"type": "rectangle", "to_world": at(("translate", [0, 0, 0.1 * i])), "bsdf": bsdf}
+        for i, bsdf in enumerate(bsdfs)
+    }
+
+
+def polarizer(theta):
+    return {"type": "polarizer", "theta": float(theta)}
+
+
+def retarder(theta, delta):
+    return {"type": "retarder", "theta": float(theta), "delta": float(delta)}
+
+
+def seen_through(*bsdfs):
+    """S0 to S3 of a lamp of radiance 1 that a camera sees through filters: the camera's subpaths."""
+    lamp = {
+        "type": "rectangle",
+        "to_world": at(("translate", [0, 0, -1])),
+        "emitter": {"type": "area", "radiance": 1.0},
+    }
+    camera = views.camera(origin=(0, 0, 3), target=(0, 0, 0), fov=2, size=4)
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": lamp, **filters(*bsdfs)})
+    return layers(scene, bdpt(max_depth=8, skip="none"), 4).mean((0, 1))
+
+
+def thrown_through(*bsdfs):
+    """The share of a spot's light that filters let pass to a matte wall: the light's subpaths."""
+
+    def radiance(objects):
+        spot = {
+            "type": "spot",
+            "to_world": at(("look_at", [0, 0, -1], [0, 0, 1], [0, 1, 0])),
+            "cutoff_angle": 4.0,
+            "intensity": 1.0,
+        }
+        wall = {
+            "type": "rectangle",
+            "to_world": at(("translate", [0, 0, 1]), ("rotate", [0, 1, 0], 180)),
+            "bsdf": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.5}},
+        }
+        camera = views.camera(origin=(1.5, 0, 0.4), target=(0, 0, 1), fov=2, size=4)
+        scene = mi.load_dict({"type": "scene", "sensor": camera, "spot": spot, "wall": wall, **objects})
+        return layers(scene, bdpt(max_depth=8, skip="none"), 4096)[..., 0].mean()
+
+    return radiance(filters(*bsdfs)) / radiance({})
+
+
+@pytest.mark.parametrize("angle", [0, 30, 90])
+def test_two_polarizers(angle):
+    """Malus' law. Expected: of unpolarized light half of cos^2 of the angle between them passes, from either
+    side, and what passes is polarized (S1^2 + S2^2 = S0^2). To 2e-3 on the camera's side, where directions
+    are within a degree of the axis; the light's side has noise of 1 % and directions within four.
+    """
+    expected = 0.5 * np.cos(np.radians(angle)) ** 2
+    seen = seen_through(polarizer(20), polarizer(20 + angle))
+    assert seen[0] == pytest.approx(expected, abs=2e-3)
+    assert np.hypot(seen[1], seen[2]) == pytest.approx(expected, abs=2e-3) and abs(seen[3]) < 1e-4
+    assert thrown_through(polarizer(20), polarizer(20 + angle)) == pytest.approx(expected, abs=0.012)
+
+
+def test_angles_of_polarization_are_the_polarizers():
+    """Expected: turning the polarizer by 30 degrees turns (S1, S2) by 60."""
+    one, other = seen_through(polarizer(10)), seen_through(polarizer(40))
+    turned = np.degrees(np.arctan2(other[2], other[1]) - np.arctan2(one[2], one[1]))
+    assert abs((turned + 180) % 360 - 180) == pytest.approx(60, abs=0.3)
+
+
+@pytest.mark.parametrize("delta", [90, 180, 250])
+def test_retarder_between_crossed_polarizers(delta):
+    """Expected: at 45 degrees sin^2(delta / 2) of the light that the first polarizer passes, from either
+    side."""
+    between = polarizer(0), retarder(45, delta), polarizer(90)
+    expected = 0.5 * np.sin(np.radians(delta) / 2) ** 2
+    assert seen_through(*between)[0] == pytest.approx(expected, abs=2e-3)
+    assert thrown_through(*between) == pytest.approx(expected, abs=0.012)
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_circular_polarizer(left):
+    """Expected: half of the light passes, circular: S3 = S0 of the right-handed one, -S0 of the other."""
+    s0, s1, s2, s3 = seen_through({"type": "circular", "left_handed": left})
+    assert s0 == pytest.approx(0.5, abs=1e-4) and max(abs(s1), abs(s2)) < 1e-3
+    assert s3 == pytest.approx(-0.5 if left else 0.5, abs=1e-3)
+
+
+def mirrored(bsdf, degrees, *more):
+    """S0 to S3 of a lamp of radiance 1 seen mirrored in a horizontal surface, ``degrees`` from its normal."""
+    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    up = -1 if more else 1  # from the inside
+    lamp = {
+        "type": "rectangle",
+        "to_world": at(("look_at", [-5 * sine, up * 5 * cosine, 0], [0, 0, 0], [0, 0, 1]), ("scale", 2.0)),
+        "emitter": {"type": "area", "radiance": 1.0},
+    }
+    across = at(("look_at", [-2 * sine, up * 2 * cosine, 0], [0, 0, 0], [0, 1, 0]))
+    objects = {
+        f"filter {i}": {"type": "rectangle", "to_world": across, "bsdf": one} for i, one in enumerate(more)
+    }
+    surface = {"type": "rectangle", "to_world": at(("rotate", [1, 0, 0], -90)), "bsdf": bsdf}
+    camera = views.camera(origin=(3 * sine, up * 3 * cosine, 0), target=(0, 0, 0), fov=0.2, size=4)
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": lamp, "surface": surface, **objects})
+    return layers(scene, bdpt(max_depth=8, skip="none"), 256).mean((0, 1))
+
+
+def test_brewster():
+    """Expected: at Brewster's angle glass reflects light that is polarized along the surface alone, S1 = S0,
+    and of the unpolarized half ((n^2 - 1) / (n^2 + 1))^2. (Noise of choosing reflection: 3 %.)
+    """
+    index = 1.5
+    s0, s1, s2, s3 = mirrored(
+        {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}, np.degrees(np.arctan(index))
+    )
+    assert s1 == pytest.approx(s0, rel=1e-4) and max(abs(s2), abs(s3)) < 1e-3 * s0
+    assert s0 == pytest.approx(0.5 * ((index**2 - 1) / (index**2 + 1)) ** 2, rel=0.05)
+
+
+def test_total_internal_reflection():
+    """Expected: light polarized at 45 degrees to the plane of incidence leaves elliptic, by the phase delta
+    with tan(delta / 2) = cos t sqrt(sin^2 t - 1 / n^2) / sin^2 t.
+    """
+    index, angle = 1.5, 54.0
+    sine, cosine = np.sin(np.radians(angle)), np.cos(np.radians(angle))
+    delta = 2 * np.arctan(cosine * np.sqrt(sine**2 - index**-2) / sine**2)
+    glass = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
+    s0, s1, s2, s3 = mirrored(glass, angle, polarizer(45))
+    assert s0 == pytest.approx(0.5, rel=1e-3)
+    assert abs(s3) == pytest.approx(0.5 * np.sin(delta), rel=5e-3)
+    assert abs(s2) == pytest.approx(0.5 * abs(np.cos(delta)), rel=5e-3) and abs(s1) < 2e-3
+
+
+# -- Mitsuba's `stokes` as the judge ----------------------------------------------------------
+
+
+def room(*objects, **more):
+    """A matte sphere from within with a floor, a lamp behind a polarizer, and objects."""
+    wall = {
+        "type": "sphere",
+        "radius": 3.0,
+        "flip_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": 0.6},
+    }
+    lamp = {
+        "type": "rectangle",
+        "to_world": at(("translate", [0.3, 1.4, 0.3]), ("rotate", [1, 0, 0], 80), ("scale", 0.8)),
+        "emitter": {"type": "area", "radiance": 3.0},
+    }
+    sheet = {
+        "type": "rectangle",
+        "to_world": at(("translate", [0.28, 1.33, 0.3]), ("rotate", [1, 0, 0], 80), ("scale", 0.9)),
+        "bsdf": polarizer(40),
+    }
+    camera = views.camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0))
+    camera["to_world"] = at(("look_at", [0, -0.2, 2.6], [0, 0.1, 0], [0.2, 1, 0]))
+    parts = {"sensor": camera, "wall": wall, "lamp": lamp, "sheet": sheet}
+    parts |= {f"object {i}": one for i, one in enumerate(objects)}
+    return mi.load_dict({"type": "scene", **parts, **more})
+
+
+def floor(bsdf):
+    to_world = at(("translate", [0, -0.8, 0]), ("rotate", [1, 0, 0], -80), ("scale", 1.5))
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+def ball(bsdf):
+    return {"type": "sphere", "center": [-0.5, -0.3, 0.3], "radius": 0.45, "bsdf": bsdf}
+
+
+def sheet(bsdf, z):
+    to_world = at(("translate", [0.1, 0, z]), ("rotate", [0, 1, 0], 15), ("scale", 0.5))
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+SCENES = {
+    "rough metal and plastic": lambda: (floor(ROUGH), ball(PLASTIC)),
+    "glass": lambda: (floor(PLASTIC), ball({"type": "dielectric"})),
+    "mirror and filters": lambda: (
+        floor(ROUGH),
+        ball({"type": "conductor", **METAL}),
+        sheet(retarder(20, 70), 1.2),
+        sheet(polarizer(30), 0.9),
+    ),
+    "two sides, mask": lambda: (
+        floor({"type": "twosided", "nested": ROUGH}),
+        ball({"type": "mask", "opacity": 0.6, "nested": PLASTIC}),
+    ),
+}
+
+
+def tiles(render, first_seed):
+    """Tile means of S0 to S3 of renders, (runs, tiles x 4)."""
+    means = [st.tile_means(render(first_seed + i), TILES) for i in range(RUNS)]
+    return np.stack(means).reshape(RUNS, -1)
+
+
+def judged(scene, kind="path", **parameters):
+    """Tile means by Mitsuba's ``stokes``, with many samples: `path` seldom hits a lamp behind a sheet."""
+    method = mi.load_dict({"type": "stokes", "nested": {"type": kind, "rr_depth": 100, **parameters}})
+
+    def render(seed):
+        image = np.array(mi.render(scene, integrator=method, spp=2048, seed=seed), dtype=np.float64)
+        return image[..., -12:][..., FIRST]
+
+    return tiles(render, 5000)
+
+
+def ours(scene, first_seed, **parameters):
+    method = bdpt(rr_depth=100, **parameters)
+    return tiles(lambda seed: layers(scene, method, 64, seed), first_seed)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_stokes_vectors_are_mitsubas(name):
+    """Rationale: frames, orders of matrices and their adjoints. Expected: with all strategies, with the drawn
+    connection and by default S0 to S3 of every tile are those of ``stokes`` around ``path``. Statistic:
+    Welch.
+    """
+    scene = room(*SCENES[name]())
+    theirs = judged(scene, max_depth=5)
+    ways = {"skip": "none"}, {"light_paths": 1, "connections": "one"}, {}
+    family = [
+        st.compare_images(ours(scene, 100 * i, max_depth=5, **way), theirs, f"{name} {way}")
+        for i, way in enumerate(ways)
+    ]
+    assert np.abs(theirs.reshape(RUNS, -1, 4)[..., 1:].mean(0)).max() > 0.05  # there is something to see
+    st.assert_agree(st.Comparisons.join(family), at_least=100)
+
+
+def test_spectra_of_stokes_vectors_are_mitsubas():
+    """As above, in four wavelengths per sample, with a metal of coloured reflection."""
+    mi.set_variant(variants.of("spectral_polarized"))
+    gold = {"type": "roughconductor", "alpha": 0.3, "material": "Au"}
+    scene = room(floor(gold), ball({"type": "dielectric"}))
+    method = mi.load_dict({"type": "stokes", "nested": {"type": "path", "rr_depth": 100, "max_depth": 4}})
+
+    def render(integrator, spp):
+        def of(seed):
+            return np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float64)[
+                ..., -12:
+            ]
+
+        return of
+
+    theirs = tiles(render(method, 2048), 5000)
+    mine = tiles(render(bdpt(max_depth=4, rr_depth=100, skip="none"), 64), 0)
+    st.assert_agree(st.compare_images(mine, theirs), at_least=100)
+
+
+class StokesOfStrategies(sink.Image):
+    """Keeps S1, S2 and S3 in the three numbers of a strategy's layers."""
+
+    def add(self, kernel, c, total, start, shared):
+        return super().add(kernel, replace(c, towards=-start.ray.d), total, start, shared)
+
+    def _put_strategy(self, c, position, shared):
+        weighted, unweighted = (
+            self._polarized(polarization.scaled(value, shared.weight), shared, c.towards)[FIRST]
+            for value in (c.weighted(), c.value)
+        )
+        self._film.put_strategy(position, weighted, unweighted, c, c.active)
+
+
+def test_strategies_agree_in_every_component(monkeypatch):
+    """Each strategy alone makes the same S1, S2 and S3 of the paths of one length.
+
+    Rationale: a strategy of small weight could be wrong and not be seen in the sum. Expected: for k = 1 ... 4
+    the unweighted image of (s, t) has the mean of the next one's. Statistic: Welch per tile, seeds apart.
+    """
+    depth = 4
+    monkeypatch.setattr(rendering, "Image", StokesOfStrategies)
+    wall = {"type": "sphere", "flip_normals": True, "bsdf": {"type": "twosided", "nested": PLASTIC}}
+    lamp = {
+        "type": "sphere",
+        "center": [0.25, 0.3, -0.2],
+        "radius": 0.2,
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": 5.0},
+    }
+    other = {"type": "sphere", "center": [-0.3, -0.3, -0.3], "radius": 0.25, "bsdf": ROUGH | {"alpha": 0.5}}
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": views.camera(), "wall": wall, "lamp": lamp, "other": other}
+    )
+    method = bdpt(skip="none", rr_depth=100, max_depth=depth, strategy_images=True)
+
+    def unweighted(first_seed):
+        images = [
+            st.tile_means(
+                np.array(method.render(scene, spp=64, seed=first_seed + i), dtype=np.float64), TILES
+            )
+            for i in range(32)
+        ]
+        found = np.stack(images)[..., -6 * len(strategies(depth)) :]
+        found = found.reshape(32, TILES**2, -1, 2, 3)[:, :, :, 1]
+        return {(s, t): found[:, :, i].reshape(32, -1) for i, (_, s, t) in enumerate(strategies(depth))}
+
+    a, b = unweighted(0), unweighted(1000)
+    pairs = [(s, k + 1 - s) for k in range(2, depth + 1) for s in range(k)]
+    family = [st.compare_images(a[s, t], b[s + 1, t - 1], f"s={s} t={t}") for s, t in pairs]
+    assert max(np.abs(a[pair].mean(0)).max() for pair in pairs) > 0.01
+    st.assert_agree(st.Comparisons.join(family), at_least=200)
+
+
+# -- with everything else ---------------------------------------------------------------------
+
+
+def test_what_polarizes_nothing_is_as_in_other_variants():
+    """Expected: the same image of the same seed in ``mono`` and ``mono_polarized``, to rounding in all but a
+    hundredth of the pixels (a drawn connection may be another one), and no polarization.
+    """
+    found = []
+    for variant in ("mono", "mono_polarized"):
+        mi.set_variant(variants.of(variant))
+        scene = mi.cornell_box()
+        scene["sensor"]["film"].update(width=24, height=24, rfilter={"type": "box"})
+        method = {"type": "bdpt", "light_paths": 1, "connections": "one", "stokes": mi.is_polarized}
+        found.append(np.array(mi.load_dict(method).render(mi.load_dict(scene), spp=16, seed=3)))
+    plain, polarized = found
+    shown = polarized[..., : plain.shape[2]]
+    assert np.isclose(shown, plain, rtol=1e-3, atol=1e-3 * plain.mean()).mean() > 0.99
+    assert np.abs(polarized[..., -9:]).max() == 0
+
+
+@pytest.mark.parametrize("rfilter", ["box", "gaussian"])
+def test_the_first_layer_is_the_image(rfilter):
+    """Expected: S0 is the image to rounding with any filter, splats included; the layers have the names of
+    Mitsuba's, and come first.
+    """
+    camera = views.camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0))
+    camera["film"]["rfilter"] = {"type": rfilter}
+    method = bdpt(max_depth=4, skip="none", aovs="dd:depth", variance=True)
+    scene = room(floor(ROUGH), ball({"type": "dielectric"}), sensor=camera)
+    image = np.array(method.render(scene, spp=8, seed=0))
+    assert method.aov_names()[:13] == [*stokes.NAMES, "dd.T"]
+    assert mi.load_dict({"type": "stokes", "nested": {"type": "path"}}).aov_names() == list(stokes.NAMES)
+    colours = image.shape[2] - len(method.aov_names())
+    np.testing.assert_allclose(image[..., colours], image[..., 0], rtol=1e-5)
+    # Physical: no vector is longer than its intensity.
+    vector = image[..., colours : colours + 12][..., FIRST]
+    assert (np.linalg.norm(vector[..., 1:], axis=-1) <= vector[..., 0] * (1 + 1e-4) + 1e-6).all()
+
+
+def test_a_stopped_render_goes_on():
+    """Expected: the layers of a whole render, from a snapshot in the middle."""
+    scene = room(floor(ROUGH))
+    whole = np.array(bdpt(max_depth=4, spp_per_pass=8).render(scene, spp=32, seed=1))
+    other = bdpt(max_depth=4, spp_per_pass=8)
+    snapshot = stopped(other, scene, 2, seed=1, spp=32)
+    rest = np.array(other.render(scene, spp=32, seed=1, start=snapshot))
+    np.testing.assert_allclose(rest, whole, **ROUNDING | {"atol": 1e-5})
+
+
+def test_fog_is_as_in_volpath():
+    """Rationale: Mitsuba's phase functions leave Stokes vectors as they are. Expected: as ``stokes`` around
+    ``volpath`` in a room with fog in a ball. Statistic: Welch.
+    """
+    fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.7, "phase": {"type": "hg", "g": 0.3}}
+    no_sheet = {"type": "sphere", "center": [0, 5, 0], "radius": 0.01}
+    scene = room(floor(ROUGH), ball({"type": "null"}) | {"interior": fog}, sheet=no_sheet)
+    theirs = judged(scene, "volpath", max_depth=5)
+    st.assert_agree(st.compare_images(ours(scene, 0, max_depth=5, skip="none"), theirs), at_least=30)
+
+
+def seen_through_glass(radius):
+    """Rough metal under a foil that polarizes, lit by a lamp in glass and seen through a pane: isolated paths."""
+    lamp = {
+        "type": "sphere",
+        "center": [-0.5, -0.3, 0.3],
+        "radius": radius,
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": 0.6 / radius**2},
+    }
+    to_world = at(("translate", [0, -0.2, 2]), ("scale", [0.8, 0.8, 0.03]))
+    pane = {"type": "cube", "to_world": to_world, "bsdf": {"type": "dielectric"}}
+    glass = ball({"type": "dielectric"})
+    black = {
+        "type": "sphere",
+        "radius": 3.0,
+        "flip_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+    }
+    ground = floor(ROUGH | {"alpha": 0.5})
+    foil = floor(polarizer(40)) | {"to_world": at(("translate", [0, 0.03, 0])) @ ground["to_world"]}
+    return mi.load_dict(
+        {"type": "scene", "sensor": views.camera(origin=(0, -0.2, 2.6), target=(0, -0.3, 0)), "wall": black}
+        | {"floor": ground, "foil": foil, "glass": glass, "lamp": lamp, "pane": pane}
+    )
+
+
+def test_isolated_paths_are_polarized():
+    """Rationale: photons that are merged carry Stokes vectors, and s = 0 may be guided. Expected: guided, S0
+    to S3 of every tile are those of ``stokes`` around ``path``, which finds the lamp if it is large; merged,
+    which blurs, those of guided s = 0 in the mean of the image, within 4 standard errors. A twelfth of
+    that image, most of which is the lamp itself, is merged, and it is polarized.
+    """
+    large = seen_through_glass(0.25)
+    guided = ours(large, 0, max_depth=8, photon_guiding="always")
+    st.assert_agree(st.compare_images(guided, judged(large, max_depth=8)), at_least=30)
+    small = seen_through_glass(0.1)
+    method = bdpt(max_depth=8, rr_depth=100, photon_guiding="always")
+    theirs = np.stack([layers(small, method, 1024, 100 + i).mean((0, 1)) for i in range(RUNS)])
+    method = bdpt(max_depth=8, rr_depth=100, merging=True, skip="none", strategy_images=True)
+    images = [np.array(method.render(small, spp=64, seed=i), dtype=np.float64) for i in range(32)]
+    first = images[0].shape[2] - len(method.aov_names())
+    mine = np.stack([image[..., first : first + 12][..., FIRST].mean((0, 1)) for image in images])
+    merged = np.mean([image[..., -6] for image in images])
+    assert merged > 0.05 * mine[:, 0].mean() and np.abs(mine[:, 1:].mean(0)).max() > 0.01 * mine[:, 0].mean()
+    error = np.sqrt(mine.var(0, ddof=1) / len(mine) + theirs.var(0, ddof=1) / RUNS)
+    assert (np.abs(mine.mean(0) - theirs.mean(0)) < 4 * error + 1e-7).all()
+
+
+def test_frames_do_not_flip():
+    """Rationale: Mitsuba's frames flip where the world's z of a direction changes its sign, by rounding where
+    a camera looks across that axis; S1 and S2 of such images are too small. Expected: hardly another image
+    from a camera that looks down by a little.
+    """
+
+    def seen(height):
+        camera = views.camera("orthographic", size=8)
+        camera["to_world"] = at(("look_at", [2, 1.3, height], [0, 0, 0], [0, 0, 1]), ("scale", 0.8))
+        del camera["fov"]
+        sphere = {"type": "sphere", "radius": 0.9, "bsdf": ROUGH | {"alpha": 0.5}}
+        sun = {"type": "directional", "direction": [-0.2, -1, -0.6], "irradiance": 3.0}
+        scene = mi.load_dict({"type": "scene", "sensor": camera, "ball": sphere, "sun": sun})
+        return layers(scene, bdpt(max_depth=2), 256).mean((0, 1))
+
+    level, down = seen(0.0), seen(0.005)
+    assert np.abs(down[1:3]).min() > 0.008 * down[0]
+    np.testing.assert_allclose(level, down, rtol=0.03, atol=1e-3 * down[0])
+
+
+def test_spectra_of_sensors_and_fog():
+    """Rationale: spectra that polarize nothing are no matrices. Expected: in ``spectral_polarized`` a
+    radiance meter measures its sky, and a camera in fog has the image of ``spectral``, of the same seed.
+    """
+    mi.set_variant(variants.of("spectral_polarized"))
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    meter = {"type": "radiancemeter", "origin": [0, 0, 0], "direction": [0, 0, 1], "film": film}
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1, 0.6, 0.3]}}
+    scene = mi.load_dict({"type": "scene", "sensor": meter, "sky": sky})
+    found = np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=4096)).ravel()[:3]
+    np.testing.assert_allclose(found, [1, 0.6, 0.3], rtol=0.02)
+
+    def foggy(variant):
+        mi.set_variant(variants.of(variant))
+        scene = parts.foggy(parts.coloured())
+        return np.array(
+            mi.load_dict({"type": "bdpt", "max_depth": 4}).render(mi.load_dict(scene), spp=16, seed=1)
+        )
+
+    plain, polarized = foggy("spectral"), foggy("spectral_polarized")
+    assert np.isclose(polarized, plain, rtol=1e-3, atol=1e-3 * plain.mean()).mean() > 0.98
+
+
+def test_what_cannot_be_done_is_said():
+    """Expected: words for layers that a variant or film has not, and for filters that edges would pass."""
+    fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.7}
+    scene = room(ball({"type": "null"}) | {"interior": fog})
+    with pytest.raises(NotImplementedError, match="class LinearPolarizer polarizes what it lets pass"):
+        bdpt().render(scene, spp=1)
+    dots = {"type": "checkerboard", "color0": 0.0, "color1": 1.0}
+    hidden = {"type": "rectangle", "bsdf": {"type": "mask", "opacity": dots, "nested": retarder(20, 70)}}
+    scene = room(ball({"type": "null"}) | {"interior": fog}, sheet=hidden)
+    with pytest.raises(
+        NotImplementedError, match="class (MaskBSDF|LinearRetarder) polarizes what it lets pass"
+    ):
+        bdpt().render(scene, spp=1)
+    mi.set_variant(variants.of("mono"))
+    with pytest.raises((ValueError, RuntimeError), match="stokes=True needs a polarized variant"):
+        bdpt()
+    mi.set_variant(variants.of("spectral_polarized"))
+    film = {
+        "type": "specfilm",
+        "width": 8,
+        "height": 8,
+        "band": {"type": "spectrum", "value": [(400.0, 1.0), (700.0, 1.0)]},
+    }
+    scene = room(floor(ROUGH), sensor=views.camera() | {"film": film})
+    with pytest.raises(NotImplementedError, match="stokes=True is not possible with film"):
+        bdpt().render(scene, spp=1)
+    assert np.isfinite(np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=1))).all()

@@ -1,0 +1,150 @@
+"""Mueller matrices of Mitsuba's BSDFs from either side, in polarized variants."""
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+from mitsuba_bdpt.transport import bsdf
+
+COUNT = 4096
+
+METAL = {"eta": 0.5, "k": 2.0}
+GLASS = {"type": "dielectric", "int_ior": 1.5}
+MIRROR = {"type": "conductor", **METAL}
+ROUGH = {"type": "roughconductor", "alpha": 0.3, **METAL}
+PLASTIC = {"type": "pplastic", "alpha": 0.3, "diffuse_reflectance": 0.5}
+
+
+def bumps():
+    heights = 0.3 * np.random.default_rng(0).random((8, 8, 1))
+    return {"type": "bitmap", "raw": True, "data": mi.TensorXf(heights.astype(np.float32))}
+
+
+def normals():
+    tilted = np.array([0.5, 0.5, 1]) + 0.1 * np.random.default_rng(1).standard_normal((8, 8, 3))
+    return {"type": "bitmap", "raw": True, "data": mi.TensorXf(tilted.astype(np.float32))}
+
+
+# What scatters by evaluations, and what by delta events; by name.
+SMOOTH = {
+    "roughconductor": lambda: ROUGH,
+    "pplastic": lambda: PLASTIC,
+    "mask": lambda: {"type": "mask", "opacity": 0.4, "nested": PLASTIC},
+    "twosided": lambda: {"type": "twosided", "nested": ROUGH},
+    "blend": lambda: {"type": "blendbsdf", "weight": 0.3, "a": ROUGH, "b": PLASTIC},
+    "bumpmap": lambda: {"type": "bumpmap", "bumps": bumps(), "nested": ROUGH},
+}
+DELTA = {
+    "dielectric": lambda: GLASS,
+    "thindielectric": lambda: {"type": "thindielectric"},
+    "conductor": lambda: MIRROR,
+    "polarizer": lambda: {"type": "polarizer", "theta": 33.0},
+    "retarder": lambda: {"type": "retarder", "theta": 20.0, "delta": 70.0},
+    "circular": lambda: {"type": "circular"},
+    "mask": SMOOTH["mask"],
+    "twosided mirror": lambda: {"type": "twosided", "nested": MIRROR},
+    "bumpy mirror": lambda: {"type": "bumpmap", "bumps": bumps(), "nested": MIRROR},
+    "bumpy glass": lambda: {"type": "normalmap", "normalmap": normals(), "nested": GLASS},
+}
+
+
+@pytest.fixture(autouse=True)
+def _polarized():
+    mi.set_variant(variants.of("mono_polarized"))
+
+
+def surface(make):
+    """A BSDF's traits, and points of a rectangle that has it, seen from directions all around."""
+    shape = mi.load_dict(
+        {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().look_at([0.3, 0.2, 0.1], [1, 2, 0.5], [0, 0, 1]),
+            "bsdf": make(),
+        }
+    )
+    rng = np.random.default_rng(3)
+    uv = mi.Point2f(rng.random((2, COUNT)).astype(np.float32))
+    found = shape.eval_parameterization(uv, mi.RayFlags.All)
+    found.initialize_sh_frame()
+    found.wi = directions(rng)
+    return bsdf.Traits.of([shape.bsdf()]), shape, found
+
+
+def directions(rng):
+    d = rng.standard_normal((3, COUNT))
+    return mi.Vector3f((d / np.linalg.norm(d, axis=0)).astype(np.float32))
+
+
+def matrices(value):
+    """(lanes, 4, 4) of a spectrum of one entry."""
+    entries = [[np.broadcast_to(np.array(value[i, j]).ravel(), COUNT) for j in range(4)] for i in range(4)]
+    return np.moveaxis(np.array(entries, dtype=np.float64), -1, 0)
+
+
+def difference(a, b):
+    """Largest difference of the entries of two stacks of matrices, each over its intensity."""
+    a, b = (m / m[:, :1, :1] for m in (a, b))
+    return np.abs(a - b).max((1, 2))
+
+
+def drawn(make, sample):
+    """What ``sample`` draws at a surface, and the surface, its points, and the numbers that drew it."""
+    traits, shape, si = surface(make)
+    rng = np.random.default_rng(5)
+    u1 = mi.Float(rng.random(COUNT).astype(np.float32))
+    u2 = mi.Point2f(rng.random((2, COUNT)).astype(np.float32))
+    step, _ = sample(shape.bsdf(), si, u1, u2, mi.Bool(True), traits)
+    return step, shape, si, (u1, u2)
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_evaluations_are_of_light_from_either_side(name):
+    """Rationale: light subpaths see a BSDF from the light's side. Expected: the matrix that they evaluate is
+    that of a camera vertex with the two directions swapped, times the adjoint factor, to rounding.
+    """
+    traits, shape, si = surface(SMOOTH[name])
+    other = directions(np.random.default_rng(4))
+    ours = bsdf.evaluate_adjoint(shape.bsdf(), si, other, mi.Bool(True), traits)
+    theirs = shape.bsdf().eval(mi.BSDFContext(), bsdf.with_wi(si, other), si.wi)
+    theirs = si.to_world_mueller(theirs, -si.wi, other)
+    ratio = np.array(bsdf.geometric_cos(si, other) / bsdf.geometric_cos(si, si.wi))
+    ours, theirs = matrices(ours.value), matrices(theirs)
+    lit = theirs[:, 0, 0] > 0
+    assert lit.sum() > COUNT / 20
+    assert difference(ours[lit], theirs[lit]).max() < 1e-3
+    np.testing.assert_allclose(ours[lit, 0, 0], (theirs[:, 0, 0] * ratio)[lit], rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", DELTA)
+def test_delta_events_are_of_light_from_either_side(name):
+    """Rationale: a matrix is no number, that of the way back is another one, and Mitsuba samples events from
+    one end. Expected: the matrix of a light subpath's event, made at l towards c, is in proportion to that
+    which Mitsuba's ``sample`` gives a camera subpath for the event from c to l, to rounding. (Events that the
+    latter does not make, of other lobes or under maps from one end alone, are left out.) The
+    intensity is that of the variant that is not polarized, of the same numbers.
+    """
+    step, shape, si, numbers = drawn(DELTA[name], bsdf.sample_adjoint)
+    back = bsdf.with_wi(si, step.wo)
+    bs, weight = shape.bsdf().sample(mi.BSDFContext(), back, *numbers)
+    theirs = matrices(si.to_world_mueller(weight, -bs.wo, back.wi))
+    ours = matrices(step.weight)
+    same = np.abs(np.array(bs.wo) - np.array(si.wi)).max(0) < 1e-3
+    used = np.array(step.delta) & same & (ours[:, 0, 0] > 0) & (theirs[:, 0, 0] > 0)
+    assert used.sum() > COUNT / 20
+    assert difference(ours[used], theirs[used]).max() < 2e-3
+    mi.set_variant(variants.of("mono"))
+    plain, *_ = drawn(DELTA[name], bsdf.sample_adjoint)
+    weight = np.broadcast_to(np.array(plain.weight).ravel(), COUNT)
+    np.testing.assert_allclose(ours[used, 0, 0], weight[used], rtol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["retarder", "dielectric"])
+def test_light_of_the_way_back_has_another_matrix(name):
+    """Rationale: the tests above are worth nothing where the matrices of both ways are the same. Expected:
+    they differ by more than a twentieth of the intensity for most directions.
+    """
+    light, *_ = drawn(DELTA[name], bsdf.sample_adjoint)
+    camera, *_ = drawn(DELTA[name], bsdf.sample)
+    ours, theirs = matrices(light.weight), matrices(camera.weight)
+    lit = ours[:, 0, 0] > 1e-3
+    assert np.median(difference(ours[lit], theirs[lit])) > 0.05
