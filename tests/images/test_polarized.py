@@ -417,7 +417,7 @@ def test_fog_is_as_in_volpath():
 
 
 def seen_through_glass(radius):
-    """Rough metal under a foil that polarizes, lit by a lamp in glass and seen through a pane: isolated paths."""
+    """Rough metal under a polarizing foil, lit by a lamp in glass, seen through a pane: isolated paths."""
     lamp = {
         "type": "sphere",
         "center": [-0.5, -0.3, 0.3],
