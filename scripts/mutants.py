@@ -560,7 +560,10 @@ MUTANTS = (
         "geometry/polarization.py",
         "return event * throughput if adjoint and mi.is_polarized else throughput * event",
         "return throughput * event",
-        ("tests/images/test_polarized.py::test_strategies_agree_in_every_component",),
+        (
+            "tests/images/test_polarized.py::test_strategies_agree_in_every_component",
+            "tests/transport/test_oracle.py::test_kernel_multiplies_matrices_in_their_order[pinhole]",
+        ),
     ),
     Mutant(
         "polarized: evaluations in the frames of the way back",

@@ -20,12 +20,14 @@ Statistics of whole images are in ``test_strategies.py``.
 from __future__ import annotations
 
 import sys
+from functools import cache
 from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import variants
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.emitters import emitters
 from mitsuba_bdpt.geometry import rays, rounding
@@ -208,6 +210,11 @@ class World:
         paths.dist2[paths.infinite, 0] = 1
         # Mixed vertices: a delta event on a BSDF that could also be joined.
         self.mixed = rng.random((n, k + 1)) < 0.5
+        # In polarized variants the matrices of light towards the camera, and of light the other way.
+        others = 0.2 * np.random.default_rng(9).normal(size=(2, k + 1, n, 4, 4))
+        others[..., 0, 0] = 1
+        self.matrices, self.backwards = others
+        self.values = {}  # of each s
         self.demands = []  # masks that must hold
         self.scene, self.merged = Scene(self), {}
 
@@ -241,7 +248,7 @@ class World:
 
     def interaction(self, i, from_light):
         """The surface interaction at x_i, seen from the light's or the camera's side."""
-        si = Interaction()
+        si = interaction_kind(mi.variant())()
         si.script = self, i
         si.p, si.n = self.point(i), self.v(mi.Normal3f, self.normal[:, i])
         # A shading frame that has nothing to do with the geometric normal.
@@ -255,15 +262,19 @@ class World:
         return si
 
 
-class Interaction(mi.SurfaceInteraction3f):
-    """A surface interaction whose BSDF is scripted."""
+@cache
+def interaction_kind(variant):
+    """A surface interaction of this, the current variant, whose BSDF is scripted."""
 
-    def bsdf(self, *_):
-        return Scattering(*self.script)
+    class Interaction(mi.SurfaceInteraction3f):
+        def bsdf(self, *_):
+            return Scattering(*self.script)
+
+    return Interaction
 
 
 class Scattering:
-    """The BSDF at x_i: value 1, densities from the script, by the direction asked for."""
+    """The BSDF at x_i: value 1, or matrices, and densities from the script, by the direction asked for."""
 
     def __init__(self, world, i):
         self.world, self.i = world, i
@@ -283,6 +294,23 @@ class Scattering:
             si, wo, self.world.f(paths.to_camera[:, self.i]), self.world.f(paths.to_light[:, self.i])
         )
 
+    def _value(self, si, wo):
+        """1, or the matrix of light that arrives from ``wo`` and leaves to ``si.wi``, in local
+        coordinates."""
+        if not mi.is_polarized:
+            return mi.Spectrum(1)
+        to_camera = self._choose(si, si.wi, mi.Float(1), mi.Float(0)) > 0
+        value = mi.Spectrum(0)
+        for row, column in np.ndindex(4, 4):
+            there, back = (m[self.i, :, row, column] for m in (self.world.matrices, self.world.backwards))
+            value[row, column] = dr.select(to_camera, self.world.f(there), self.world.f(back))
+        ends = []
+        for local in (-wo, si.wi):
+            d = si.to_world(local)
+            basis = mi.mueller.stokes_basis
+            ends += [d, basis(d), si.to_world(basis(local))]
+        return mi.mueller.rotate_mueller_basis(value, *ends)
+
     def flags(self):
         joinable = ~self.world.paths.delta[:, self.i] | self.world.mixed[:, self.i]
         return dr.select(
@@ -296,7 +324,7 @@ class Scattering:
 
     def eval_pdf(self, ctx, si, wo, active=True):
         assert ctx.mode == mi.TransportMode.Radiance
-        return mi.Spectrum(1), self._pdf(si, wo)
+        return self._value(si, wo), self._pdf(si, wo)
 
     def sample(self, ctx, si, u1, u2, active=True):
         bs = dr.zeros(mi.BSDFSample3f)
@@ -313,7 +341,7 @@ class Scattering:
             mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
             mi.UInt32(int(mi.BSDFFlags.GlossyReflection)),
         )
-        return bs, mi.Spectrum(1)
+        return bs, self._value(si, bs.wo)
 
 
 class Hit:
@@ -505,7 +533,7 @@ class Nothing:
     features = stokes = None
 
     def colour(self, value, _):
-        return mi.Color3f(value)
+        return mi.Color3f(value) if not mi.is_polarized else mi.Color3f(value[0, 0].x)
 
     def put_camera(self, *_):
         pass
@@ -610,6 +638,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
             s, edges = edges_of(*arguments)
             if edges == k:
                 result[s] = out.weight
+                world.values[s] = out.value
                 world.demands.append((out.s == s) & (out.t == k + 1 - s))
             return out
 
@@ -731,6 +760,34 @@ def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch)
         with monkeypatch.context() as patch:
             weights = kernel_weights(world, kappa, name, patch)
         check(world.paths, kappa, name, weights, relative=1e-3)
+
+
+@pytest.mark.parametrize("lens", [False, True], ids=["pinhole", "lens"])
+def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
+    """Rationale: in polarized variants throughputs are products of matrices, which each strategy makes of two
+    halves of a path in its own order, and of a surface it may ask for light the wrong way. 200 random paths
+    as above whose surfaces have one random matrix for light towards the camera and another for light the
+    other way. Expected: the Stokes vector of every strategy is that of the product of the former from the
+    camera to the lamp, to 1e-3 of its intensity (changes of frames in single precision).
+    """
+    mi.set_variant(variants.of("mono_polarized"))
+    rng = np.random.default_rng(3)
+    for k in (1, 2, 3, 4, 6):
+        world = World(rng, 200, k, lens)
+        with monkeypatch.context() as patch:
+            kernel_weights(world, COEFFICIENTS["odd"], "balance", patch)
+        expected = np.broadcast_to([1.0, 0, 0, 0], (200, 4))
+        for i in range(1, k):
+            expected = np.einsum("nij,nj->ni", world.matrices[i], expected)
+        assert set(world.values) == set(range(k + 1 + lens))
+        for s, value in world.values.items():
+            vector = np.stack([np.broadcast_to(np.array(value[i, 0]).ravel(), 200) for i in range(4)], axis=1)
+            used = np.isfinite(vector).all(1) & (vector[:, 0] != 0)
+            assert used.sum() > 20
+            found = vector[used] / vector[used, :1]
+            np.testing.assert_allclose(
+                found, expected[used] / expected[used, :1], atol=2e-3, err_msg=f"s={s}"
+            )
 
 
 @pytest.mark.parametrize(
