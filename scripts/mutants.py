@@ -219,15 +219,15 @@ MUTANTS = (
     Mutant(
         "adjoint: eta squared stays in what light carries through glass",
         "transport/bsdf.py",
-        "drawn.back / eta2 if traits.round_trip else drawn.weight * eta2",
-        "drawn.back if traits.round_trip else drawn.weight",
+        "drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2",
+        "drawn.back if _asks_back(traits, adjoint=True) else drawn.weight",
         ("tests/images/test_known_answers.py::test_a_lamp_in_glass_reaches_the_meter_around_it",),
     ),
     Mutant(
         "film: splats a pixel off",
         "image/accumulator.py",
-        "self.light.put(position, [*colours], active)",
-        "self.light.put(position + 1, [*colours], active)",
+        "self.light.put(position, [*colours, *polarized], active)",
+        "self.light.put(position + 1, [*colours, *polarized], active)",
         (
             "tests/images/test_known_failures.py::test_borders_of_a_uniform_furnace",
             "tests/images/test_known_answers.py::test_borders_of_a_furnace_are_flat[sample_border-gaussian]",
@@ -649,7 +649,7 @@ MUTANTS = (
     Mutant(
         "media: null collisions are alike in all channels",
         "media/tracking.py",
-        "throughput * ((majorant - sigma_t) / null)",
+        "polarization.scaled(throughput, (majorant - sigma_t) / null)",
         "throughput",
         ("tests/images/test_media_identities.py::test_null_collisions_by_channel",),
     ),

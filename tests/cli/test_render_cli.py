@@ -557,7 +557,7 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
                 'type="aov"><string name="aovs" value="a:depth"/><integrator type="bdpt">',
             ),
             ["-P", "aovs=b:depth"],
-            "the command's --integrator bdpt takes layers of aov over",
+            "the command's --integrator bdpt takes those of aov and stokes over",
         ),
     ],
 )
