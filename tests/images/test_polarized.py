@@ -172,6 +172,44 @@ def test_brewster():
     assert s0 == pytest.approx(0.5 * ((index**2 - 1) / (index**2 + 1)) ** 2, rel=0.05)
 
 
+def reflectances(degrees):
+    """Fresnel's reflectances of the metal, across and along the plane of incidence."""
+    index, cos = complex(METAL["eta"], METAL["k"]), np.cos(np.radians(degrees))
+    inside = np.sqrt(1 - (1 - cos**2) / index**2)
+    across = (cos - index * inside) / (cos + index * inside)
+    along = (index * cos - inside) / (index * cos + inside)
+    return abs(across) ** 2, abs(along) ** 2
+
+
+def test_one_mirror_and_two():
+    """Expected: of unpolarized light one mirror reflects (Rs + Rp) / 2, with S1 = (Rs - Rp) / 2; a second one
+    whose plane of incidence is turned by 90 degrees undoes that: S0 = Rs Rp, unpolarized.
+    """
+    across, along = reflectances(45)
+    s0, s1, s2, s3 = mirrored({"type": "conductor", **METAL}, 45)
+    assert s0 == pytest.approx((across + along) / 2, rel=1e-3)
+    assert s1 == pytest.approx((across - along) / 2, rel=5e-3) and max(abs(s2), abs(s3)) < 1e-3
+    lamp = {
+        "type": "rectangle",
+        "to_world": at(("look_at", [-3, 0, 0], [0, 0, 0], [0, 0, 1]), ("scale", 2.0)),
+    }
+    lamp["emitter"] = {"type": "area", "radiance": 1.0}
+    mirrors = {
+        f"mirror {i}": {
+            "type": "rectangle",
+            "to_world": at(
+                ("look_at", place, [p + n for p, n in zip(place, normal, strict=True)], [0.3, 0.5, 0.4])
+            ),
+            "bsdf": {"type": "conductor", **METAL},
+        }
+        for i, (place, normal) in enumerate((([0, 0, 0], [-1, 1, 0]), ([0, 3, 0], [0, -1, 1])))
+    }
+    camera = views.camera(origin=(0, 3, 3), target=(0, 3, 0), fov=0.2, size=4)
+    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": lamp, **mirrors})
+    s0, *others = layers(scene, bdpt(max_depth=4, skip="none"), 16).mean((0, 1))
+    assert s0 == pytest.approx(across * along, rel=1e-3) and np.abs(others).max() < 2e-3 * s0
+
+
 def test_total_internal_reflection():
     """Expected: light polarized at 45 degrees to the plane of incidence leaves elliptic, by the phase delta
     with tan(delta / 2) = cos t sqrt(sin^2 t - 1 / n^2) / sin^2 t.
