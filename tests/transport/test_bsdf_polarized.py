@@ -1,5 +1,10 @@
 """Mueller matrices of Mitsuba's BSDFs from either side, in polarized variants."""
 
+import struct
+import tempfile
+from functools import cache
+from pathlib import Path
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -25,6 +30,35 @@ def normals():
     return {"type": "bitmap", "raw": True, "data": mi.TensorXf(tilted.astype(np.float32))}
 
 
+@cache
+def measured():
+    """A file for ``measured_polarized``: made-up matrices by half and difference angles and wavelengths."""
+    angles = {
+        "phi_d": np.linspace(0, 2 * np.pi, 9),
+        "theta_d": np.linspace(0, np.pi / 2, 5),
+        "theta_h": np.linspace(0, np.pi / 2, 6),
+    }
+    rng = np.random.default_rng(7)
+    matrices = np.zeros((9, 5, 6, 5, 4, 4))
+    matrices[..., 0, 0] = 0.2 + 0.5 * np.cos(angles["theta_h"])[None, None, :, None] ** 8
+    matrices += 0.1 * rng.random((1, 5, 6, 1, 4, 4)) * matrices[..., :1, :1]
+    fields = {name: values[None].astype(np.float32) for name, values in angles.items()}
+    fields |= {"wvls": np.arange(450, 700, 50, dtype=np.uint16), "M": matrices.astype(np.float32)}
+    header = sum(2 + len(name) + 2 + 1 + 8 + 8 * data.ndim for name, data in fields.items())
+    head, body = b"tensor_file\0" + bytes([1, 0]) + struct.pack("<I", len(fields)), b""
+    start = len(head) + header
+    for name, data in fields.items():
+        kind = 3 if data.dtype == np.uint16 else 10
+        head += struct.pack(
+            f"<H{len(name)}sHBQ", len(name), name.encode(), data.ndim, kind, start + len(body)
+        )
+        head += struct.pack(f"<{data.ndim}Q", *data.shape)
+        body += data.tobytes()
+    file = Path(tempfile.mkdtemp()) / "made_up.pbsdf"
+    file.write_bytes(head + body)
+    return str(file)
+
+
 # What scatters by evaluations, and what by delta events; by name.
 SMOOTH = {
     "roughconductor": lambda: ROUGH,
@@ -33,6 +67,12 @@ SMOOTH = {
     "twosided": lambda: {"type": "twosided", "nested": ROUGH},
     "blend": lambda: {"type": "blendbsdf", "weight": 0.3, "a": ROUGH, "b": PLASTIC},
     "bumpmap": lambda: {"type": "bumpmap", "bumps": bumps(), "nested": ROUGH},
+    "measured_polarized": lambda: {
+        "type": "measured_polarized",
+        "filename": measured(),
+        "wavelength": 550.0,
+        "alpha_sample": 0.5,
+    },
 }
 DELTA = {
     "dielectric": lambda: GLASS,
