@@ -26,9 +26,10 @@ import numpy as np
 import repository
 from mitsuba_bdpt.host.versions import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
+from mitsuba_bdpt.measure.efficiency import equal_time_speedup
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
-from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.tables import ratio, table
 from mitsuba_bdpt.measure.timing import timed
 
 SPP, SEEDS = 256, 16
@@ -152,8 +153,8 @@ def page(found: dict) -> str:
                 f"{1e3 * ours['seconds']:.0f}",
                 f"{1e3 * path['seconds']:.0f}",
                 f"{ours['trimmed']:.3g}",
-                *(f"{over(path, ours, which):.3g}x" for which in ("trimmed", "rel_mse")),
-                f"{over(none, ours, 'trimmed'):.3g}x",
+                *(ratio(over(path, ours, which)) for which in ("trimmed", "rel_mse")),
+                ratio(over(none, ours, "trimmed")),
                 f"{ours['first_seconds']:.0f}",
                 bias,
             ]
@@ -167,7 +168,7 @@ def page(found: dict) -> str:
 
 def over(other: dict, ours: dict, which: str) -> float:
     """By how much ours is more efficient than the other."""
-    return other[which] * other["seconds"] / (ours[which] * ours["seconds"])
+    return equal_time_speedup(*((one["seconds"], one[which]) for one in (ours, other)))
 
 
 def main() -> None:

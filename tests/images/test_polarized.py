@@ -47,7 +47,7 @@ def bdpt(**parameters):
 def layers(scene, integrator, spp, seed=0):
     """S0 to S3 of each pixel, (height, width, 4)."""
     image = np.array(integrator.render(scene, spp=spp, seed=seed), dtype=np.float64)
-    return image[..., 1:][..., FIRST] if image.shape[2] == 13 else image[..., -12:][..., FIRST]
+    return image[..., -12:][..., FIRST]
 
 
 # -- optics that is known ---------------------------------------------------------------------

@@ -400,12 +400,14 @@ def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
 
     They are asked at points all over their textures, from both sides.
     """
+    if not mi.is_polarized:
+        return []
     rng = np.random.default_rng(0)
     si = dr.zeros(mi.SurfaceInteraction3f, _ASKED)
     si.uv = mi.Point2f(rng.random((2, _ASKED)).astype(np.float32))
     directions = rng.standard_normal((3, _ASKED)).astype(np.float32)
     si.wi = dr.normalize(mi.Vector3f(directions))
-    found = [b for b in nested(bsdfs) if mi.is_polarized and mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
+    found = [b for b in nested(bsdfs) if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
     return [b for b in found if not _is_scalar(mi.Spectrum(b.eval_null_transmission(si)))]
 
 

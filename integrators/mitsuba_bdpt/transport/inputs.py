@@ -47,7 +47,7 @@ class Shared:
 
     time: mi.Float
     wavelengths: mi.Color0f | mi.UnpolarizedSpectrum
-    weight: mi.Spectrum
+    weight: mi.UnpolarizedSpectrum
     u_wavelength: mi.Float
     wavelength_set: mi.UInt32 | None = None
 
