@@ -948,6 +948,8 @@ MIRRORED = mi.ScalarTransform4f().scale([1, 1, -1])
 # The columns are of length 1.
 SHEARED = mi.ScalarTransform4f([[1, 0.6, 0, 0], [0, 0.8, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 LONG_AXIS = mi.ScalarTransform4f().rotate([1, 1, 1], 40)  # shears, and its inverse is wrong
+GRID = {"type": "sdfgrid", "grid": mi.TensorXf(np.arange(-3, 5).reshape(2, 2, 2, 1))}
+
 REFUSED_PARTS = {
     "curve lamp": (
         lambda folder: {"lamp": curve(folder) | {"emitter": AREA_LIGHT}},
@@ -996,8 +998,23 @@ REFUSED_PARTS = {
             lambda _, kind=kind: {"lamp": {"type": kind, "to_world": LONG_AXIS, "emitter": AREA_LIGHT}},
             f"emitter '.*' is on a {kind} .*'lamp'.* whose to_world .*give rotate an axis of length 1",
         )
-        for kind in ("rectangle", "disk", "sphere", "cylinder")
+        for kind in ("rectangle", "disk", "sphere")
     },
+    "instance turned about a long axis": (
+        lambda _: {
+            "group": {"type": "shapegroup", "box": {"type": "cube"}},
+            "boxes": {"type": "instance", "to_world": LONG_AXIS, "group": {"type": "ref", "id": "group"}},
+        },
+        "to_world of instance 'boxes' has another inverse .* normals lean .*give rotate an axis of length 1",
+    ),
+    "cylinder turned about a long axis": (
+        lambda _: {"post": {"type": "cylinder", "to_world": LONG_AXIS}},
+        "to_world of cylinder 'post' has another inverse .*give rotate an axis of length 1",
+    ),
+    "grid turned about a long axis": (
+        lambda _: {"ball": GRID | {"to_world": LONG_AXIS}},
+        "to_world of sdfgrid 'ball' has another inverse .*give rotate an axis of length 1",
+    ),
     "squashed cylinder": (
         lambda _: {"lamp": {"type": "cylinder", "to_world": STRETCHED, "emitter": AREA_LIGHT}},
         "is on a cylinder .*'lamp'.* squashes or shears it .*1, 2, 1.* or use a mesh",
@@ -1045,9 +1062,7 @@ REFUSED_PARTS = {
         "irradiance meter '.*' has sample_border.*set it to false",
     ),
     "meter on a grid": (
-        lambda _: {
-            "meter": meter_on({"type": "sdfgrid", "grid": mi.TensorXf(np.arange(-3, 5).reshape(2, 2, 2, 1))})
-        },
+        lambda _: {"meter": meter_on(GRID)},
         "irradiance meter '.*' is on a SDFGrid.*put it on another shape",
     ),
 }

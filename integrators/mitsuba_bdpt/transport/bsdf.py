@@ -315,6 +315,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         smooth = active & ~delta
         pdf_fwd_w = bs.pdf
         if traits.full_pdf:
+            weight = dr.select(_none_from_behind(self, si, bs), 0, weight)
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
@@ -323,6 +324,23 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         return bs, weight, pdf_fwd_w, pdf_rev_w, back
 
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
+
+
+def _none_from_behind(bsdf, si, bs: mi.BSDFSample3f):
+    """Mask: no direction was drawn, since the BSDF has no lobe on the side that ``si`` is seen from.
+
+    Mitsuba's rough conductor (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf``
+    multiplies this 0 by the density, which is NaN, though it reflects nothing there.
+    """
+    return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z) & ~_has_back(bsdf)
+
+
+def _has_back(bsdf):
+    """Whether a lobe, the null one apart, is on the back; of a pointer a mask, of all lobes."""
+    if not isinstance(bsdf, mi.BSDF):
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
+    lobes = [bsdf.flags(i) for i in range(bsdf.component_count())]
+    return any(f & int(mi.BSDFFlags.BackSide) and not f & int(mi.BSDFFlags.Null) for f in lobes)
 
 
 def brightest(value: mi.Spectrum):
