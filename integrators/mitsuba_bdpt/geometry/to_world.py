@@ -15,8 +15,8 @@ from ..host.introspection import inverse_of, is_instance, matrix_of, named
 
 # Relative; single precision and its products are far below.
 _TOLERANCE = 1e-3
-# Normals of what only reflects may lean by two degrees: axes are often written with two figures (0.71, 0.71, 0),
-# whose half-turn is off by 0.033. (With 0.47 images were off by 2 %.)
+# Normals of what only reflects may lean by two degrees: axes are often written with two figures (0.71, 0.71,
+# 0), whose half-turn is off by 0.033. (With 0.47 images were off by 2 %.)
 _LEANING = 0.04
 
 
