@@ -1,6 +1,7 @@
 """What a render shows of its progress."""
 
 import io
+import re
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -72,8 +73,12 @@ def test_percentages_are_those_that_farms_read():
         show(report(done, seconds=seconds))
     show.finish()
     show(report(100, seconds=9.5))
-    expected = [f"ALF_PROGRESS {n}% Progress: {n}%" for n in (0, 1, 50, 90, 100)]
-    assert stream.getvalue().splitlines() == expected
+    lines = stream.getvalue().splitlines()
+    assert lines == [f"ALF_PROGRESS {n}% Progress: {n}%" for n in (0, 1, 50, 90, 100)]
+    for expression in (r".*Progress: (\d+)%.*", r"ALF_PROGRESS\s+([0-9]+)%"):
+        found = [re.search(expression, line) for line in lines]
+        assert [match and match.group(1) for match in found] == ["0", "1", "50", "90", "100"]
+    assert all("alf_progress" in line.lower() for line in lines)  # as OpenCue's log view looks for it
 
 
 def test_which_display(monkeypatch):

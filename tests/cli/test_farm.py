@@ -305,7 +305,7 @@ def test_completion(shell, capsys):
 def test_completion_without_shtab(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert main(["completion", "bash"]) == 2
-    assert "pip install shtab" in capsys.readouterr().err
+    assert "pip install 'mitsuba-bdpt[completion]'" in capsys.readouterr().err
 
 
 def test_a_preview_is_rewritten(monkeypatch):
