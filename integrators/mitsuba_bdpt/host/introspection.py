@@ -115,12 +115,15 @@ def _collector(variant: str):
 
     class Collector(mi.TraversalCallback):
         def of(self, owner) -> dict:
-            self.found, self.types = {}, {}
+            self.found, self.types, self.times = {}, {}, {}
             owner.traverse(self)
             found, self.found = self.found, {}
             return found
 
         def put(self, name, value, flags, cpptype=None):
+            # Shapes of a group that have no id are all called "shape": numbered, as by ``mi.traverse``.
+            times = self.times[name] = self.times.get(name, -1) + 1
+            name = f"{name}_{times}" if times else name
             self.found[name], self.types[name] = value, cpptype
 
     return Collector

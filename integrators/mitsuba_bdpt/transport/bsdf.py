@@ -327,20 +327,14 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
 
 
 def _none_from_behind(bsdf, si, bs: mi.BSDFSample3f):
-    """Mask: no direction was drawn, since the BSDF has no lobe on the side that ``si`` is seen from.
+    """Mask: no direction was drawn, since ``si`` is seen from behind a lobe of a rough conductor.
 
-    Mitsuba's rough conductor (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf``
-    multiplies this 0 by the density, which is NaN, though it reflects nothing there.
+    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf`` multiplies this 0 by
+    the density, which is NaN. No other BSDF of Mitsuba's does: NaN of others is counted.
     """
-    return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z) & ~_has_back(bsdf)
-
-
-def _has_back(bsdf):
-    """Whether a lobe, the null one apart, is on the back; of a pointer a mask, of all lobes."""
-    if not isinstance(bsdf, mi.BSDF):
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
-    lobes = [bsdf.flags(i) for i in range(bsdf.component_count())]
-    return any(f & int(mi.BSDFFlags.BackSide) and not f & int(mi.BSDFFlags.Null) for f in lobes)
+    if not isinstance(bsdf, mi.BSDF) or all(b.class_name() != "RoughConductor" for b in nested([bsdf])):
+        return False
+    return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z)
 
 
 def brightest(value: mi.Spectrum):
