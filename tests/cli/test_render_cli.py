@@ -701,12 +701,44 @@ def test_script_is_the_command(scene):
     assert Path("a.exr").exists() and Path("a.png").exists()
 
 
+def test_whose_integrator_renders_is_said(scene, capsys):
+    """Rationale: nearly all scene files ask for `path`, and who has installed bdpt takes the image for its.
+
+    Expected: a note where the file's integrator has rendered, none where one was asked for or it is bdpt.
+    """
+    note = "the scene's file asks for PathIntegrator, which rendered it; --integrator bdpt takes bdpt"
+    for arguments, is_noted in (
+        ([], True),
+        (["--integrator", "path"], False),
+        (["-Dintegrator=bdpt"], False),
+    ):
+        assert main(["render", str(scene), *arguments]) == 0
+        assert (note in capsys.readouterr().err) == is_noted
+
+
+def test_a_pipe_that_closes_ends_explain_quietly(scene, monkeypatch, capsys):
+    """Rationale: ``explain | head -1``. Expected: status 0."""
+
+    class Closed:
+        def write(self, text):
+            raise BrokenPipeError(32, "Broken pipe")
+
+        flush = write
+
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", Closed())
+        assert main(["explain", str(scene)]) == 0
+
+
 def test_explain(scene, capsys):
     """Expected: the command says what a render would do, by bdpt whatever integrator the scene has, with the
     scene's samples, definitions and properties; no image is written. What is wrong is said as by render."""
     assert main(["explain", str(scene), "-P", "max_depth=1", "-Dlight=3"]) == 0
     said = capsys.readouterr().out
     assert "used: s=0" in said and "max_depth=1 allows no such path" in said and "no pilot" in said
+    assert said.endswith(
+        "the scene's file asks for path: render needs --integrator bdpt to do as said here\n"
+    )
     assert main(["explain", str(scene), "-P", "max_depth=oops"]) == 1
     assert "max_depth" in capsys.readouterr().err
     assert list(scene.parent.iterdir()) == [scene]

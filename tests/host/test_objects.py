@@ -44,8 +44,8 @@ NAMELESS_GROUP = """<scene version="3.0.0">
 
 def test_shapes_of_a_group_need_no_ids():
     """Rationale: all shapes without id are called "shape" in what a group holds; one that is not found is not
-    asked for its BSDF, and rays that meet it asked another one, or crashed. Expected: all are found, under the
-    names that ``mi.traverse`` gives them.
+    asked for its BSDF, and rays that meet it asked another one, or crashed. Expected: all are found, under
+    the names that ``mi.traverse`` gives them.
     """
     scene = mi.load_string(NAMELESS_GROUP)
     found = [s.bsdf().class_name() for s in all_shapes(scene) if s.class_name() != "Instance"]

@@ -41,7 +41,7 @@ def test_a_blend_seen_from_behind_is_black(held):
     takes it back by a weight of 0; `blendbsdf` multiplies this 0 by a density that is NaN. Expected: nothing
     is counted or warned of, neither where light subpaths arrive from behind (a sky below the plate) nor where
     the camera is there. From the front the image is `path`'s; from behind, under a sky of 1, what a mask lets
-    pass, and half of what a two-sided matte of 0.5 reflects. Statistic: t-tests of means over 8 seeds at 1e-4.
+    pass, and half of what a two-sided matte of 0.5 reflects. Statistic: t-tests of means over 8 seeds, 1e-4.
     """
     matte = {"type": "diffuse"}
     if held == "beside a two-sided one":

@@ -15,6 +15,7 @@ from ..errors import CommandError
 from ..files.named import named_files
 from ..files.whole import check_writable, replacing
 from ..run.snapshot import Snapshot, read
+from .mistakes import in_words
 
 
 def path_of(output: Path) -> Path:
@@ -90,7 +91,8 @@ class Checkpoints:
                 # Before the name, which would stand for half a file after a power cut.
                 os.fsync(file.fileno())
         except OSError as error:
-            print(f"warning: no checkpoint {str(self.path)!r}: {error}", file=sys.stderr)
+            error.filename = str(self.path)
+            print(f"warning: no checkpoint {in_words(error)}", file=sys.stderr)
         self._last = time.monotonic()
 
     def remove(self) -> None:

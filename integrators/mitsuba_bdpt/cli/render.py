@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.images import check_channels, check_png, prepare_output, write_images
-from ..files.loading import check_file, choose_sensor, load
+from ..files.loading import check_file, choose_sensor, load, own_integrator
 from ..host.versions import versions
 from ..progress import display, readable
 from ..run.rendering import PassReport
@@ -77,6 +77,16 @@ def run(options: Namespace) -> int:
     return 0
 
 
+def note_integrator(options: Namespace, integrator: mi.Integrator) -> None:
+    """Say on standard error that it was not ``bdpt`` that rendered, where nobody has asked for another."""
+    if options.integrator is None and not hasattr(integrator, "assemble"):
+        own = integrator.class_name()
+        print(
+            f"note: the scene's file asks for {own}, which rendered it; --integrator bdpt takes bdpt",
+            file=sys.stderr,
+        )
+
+
 def jobs_of(options: Namespace) -> list[Namespace]:
     """The options of each image, with its ``sensor`` and ``output``: of one, or of each of the ``frames``."""
     output = options.output or Path("renders") / f"{options.scene.stem}.exr"
@@ -125,6 +135,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
         attributes = {"bdptSettings": settings(job, spp), "bdptStatistics": report(outcome)}
         write(sensor.film(), job, attributes)
         outcome.written()
+        note_integrator(job, integrator)
         say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
     finally:
         ending.patient = False
@@ -147,6 +158,7 @@ def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
     try:
         write_images(film, job.output, attributes, job.exposure)
     except OSError as error:
+        error.filename = error.filename or str(job.output)
         rescued = Path(tempfile.mkdtemp(prefix="mitsuba-bdpt-")) / job.output.name
         try:
             write_images(film, rescued, attributes, job.exposure)
@@ -170,7 +182,9 @@ def explain(options: Namespace) -> int:
         scene, integrator = loaded(options)
         sensor = choose_sensor(scene, options.sensor)
         spp = options.spp or sensor.sampler().sample_count()
-        print(integrator.explain(scene, sensor, spp))
+        say(integrator.explain(scene, sensor, spp))
+        if (own := own_integrator(options.scene, dict(options.defines))) not in (None, "bdpt"):
+            say(f"the scene's file asks for {own}: render needs --integrator bdpt to do as said here")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

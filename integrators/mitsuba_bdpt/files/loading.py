@@ -62,6 +62,18 @@ def elements(file: Path) -> list[ElementTree.Element]:
         raise CommandError(f"{str(file)!r} is not well-formed XML: {error}") from error
 
 
+def own_integrator(scene: Path, definitions: Mapping[str, str]) -> str | None:
+    """The plugin of the first integrator in a scene file, without files that it includes, or None."""
+    try:
+        found = [element.get("type") for element in elements(scene) if element.tag == "integrator"]
+    except ValueError:  # Mitsuba takes more for XML
+        return None
+    named = next(iter(found), None)
+    if named and named.startswith("$"):
+        return (parameters(scene) | definitions).get(named[1:])
+    return named
+
+
 def _decoded(data: bytes) -> str:
     """The text of a scene file, whose encoding Mitsuba tells by its first bytes."""
     if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)[\"']", data, re.IGNORECASE):

@@ -111,9 +111,10 @@ def warn_of_non_finite(statistics: dict, scene):
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return
-    parts = [f"{lost} values were not finite and count as zero"]
+    parts = [f"{lost} values were not finite and count as zero"] if lost else []
     if in_pilot:
-        parts.append(f"so did {in_pilot} of the pilot, which decided from the rest")
+        which = "so did" if lost else "not finite were"
+        parts.append(f"{which} {in_pilot} of the pilot, which decided from the rest")
     named = not_finite(scene)
     parts.append(
         f"NaN or infinity is in {_some(named)}"

@@ -329,8 +329,8 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
 def _none_from_behind(bsdf, si, bs: mi.BSDFSample3f):
     """Mask: no direction was drawn, since ``si`` is seen from behind a lobe of a rough conductor.
 
-    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf`` multiplies this 0 by
-    the density, which is NaN. No other BSDF of Mitsuba's does: NaN of others is counted.
+    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf`` multiplies this 0
+    by the density, which is NaN. No other BSDF of Mitsuba's does: NaN of others is counted.
     """
     if not isinstance(bsdf, mi.BSDF) or all(b.class_name() != "RoughConductor" for b in nested([bsdf])):
         return False
