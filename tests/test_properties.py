@@ -967,18 +967,6 @@ REFUSED_PARTS = {
         },
         "emitter '.*' is on a shape that Mitsuba does not tell .*use shape type ellipsoids, or a mesh",
     ),
-    "texture beside curve": (
-        lambda folder: {"lamp": {"type": "cylinder", "emitter": CHECKS}, "curve": curve(folder)},
-        "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
-    ),
-    "texture beside a group of curves": (
-        lambda folder: {
-            "lamp": {"type": "cylinder", "emitter": CHECKS},
-            "group": {"type": "shapegroup", "curve": curve(folder)},
-            "instance": {"type": "instance", "group": {"type": "ref", "id": "group"}},
-        },
-        "textured radiance on such a shape, which is not supported beside curves .*remove one of them",
-    ),
     "mirrored cylinder": (
         lambda _: {"lamp": {"type": "cylinder", "to_world": MIRRORED, "emitter": AREA_LIGHT}},
         "emitter '.*' is on a cylinder .*'lamp'.* mirrors it.*leave out the negative scale",

@@ -359,6 +359,30 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
     assert group.by_texture.all
 
 
+@pytest.mark.parametrize("sky", [None, "timed_sunsky"])
+def test_textured_lamps_beside_shapes_without_points(sky, tmp_path):
+    """Rationale: points of these lamps are asked of shapes, and Mitsuba's call on shapes visits instances,
+    curves and grids, which sample none ("Shape::sample_position(): not implemented!"). A `timed_sunsky` has kernels
+    run step by step. Expected, tolerance, statistic: those of `check_sums`."""
+    curve = tmp_path / "curve.txt"
+    curve.write_text("\n".join(f"{x} 1 0 0.1" for x in (-1.5, -0.5, 0.5, 1.5)))
+    area = {"type": "area", "radiance": peaked(20)}
+    lamps = {
+        "first": {"type": "cylinder", "to_world": T().translate([-1, 1.5, 0]).scale(0.4)},
+        "second": {"type": "cube", "to_world": T().translate([1, 1.5, 0]).scale(0.4)},
+    }
+    others = {
+        "group": {"type": "shapegroup", "a": {"type": "cube", "bsdf": grey(0.5)}, "b": {"type": "sphere"}},
+        "one": {"type": "instance", "to_world": T().scale(0.3), "group": {"type": "ref", "id": "group"}},
+        "curve": {"type": "bsplinecurve", "filename": str(curve), "bsdf": grey(0.5)},
+        "grid": {"type": "sdfgrid", "grid": mi.TensorXf(np.arange(-3, 5).reshape(2, 2, 2, 1))},
+    }
+    if sky:
+        others["sky"] = {"type": sky, "sun_scale": 0.0, "sky_scale": 0.01}
+    lamps = {name: lamp | {"emitter": area, "bsdf": grey(0.3)} for name, lamp in lamps.items()}
+    check_sums(gap(**lamps, **others))
+
+
 def test_a_textured_cube_that_was_met_as_an_emitters_shape():
     """Rationale: Python keeps the type under which it first met an object, and an emitter tells its shape as
     a plain one, without the methods of meshes. Expected: the image is made all the same."""

@@ -23,7 +23,7 @@ from .emission_tables import PLAIN, EmissionGuide, Factor, Place
 from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
-from .surfaces import CURVES, Surfaces, refuse_curves, spheres_of
+from .surfaces import CURVES, Surfaces, spheres_of
 from .tables import Mask, look_up, rows, table
 
 _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
@@ -109,9 +109,6 @@ class AreaEmitters(Group):
         by_texture = [e and not context.ask_shapes and is_sampled_by_texture(e, s) for e, s in pairs]
         by_shape = [e and is_textured(e) and not b for (e, _), b in zip(pairs, by_texture, strict=True)]
         self.by_texture, self._by_shape = Mask(by_texture), Mask(by_shape)
-        if self._by_shape.any:
-            emitter = emitters[by_shape.index(True)]
-            refuse_curves(context.scene, emitter, "has a textured radiance on such a shape")
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         self._surfaces = Surfaces(emitters, context, spheres, self._by_shape)
         extent = 2 * context.scene.bbox().bounding_sphere().radius

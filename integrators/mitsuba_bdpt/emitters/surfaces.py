@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from itertools import accumulate
 
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UnsupportedError, UsageError
+from ..errors import UsageError
 from ..geometry import rays
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..geometry.smooth_meshes import SmoothMeshes
 from ..geometry.to_world import check_to_world
-from ..host.introspection import all_shapes, named
+from ..host.introspection import named
 from .group import Context
 from .tables import Mask, look_up, rows, table
 
@@ -44,8 +45,6 @@ class Surfaces:
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
         for emitter in filter(None, emitters):
             context.facts.about("to_world", emitter.get_shape(), partial(_check_to_world, emitter))
-            if context.ask_shapes:
-                refuse_curves(context.scene, emitter, "lives with a class that has no sample_position")
         # Before areas are asked for: of a mesh whose faces have vertices that do not exist it is any number.
         self._smooth_meshes = SmoothMeshes.of(emitters)
         self.smooth = self._smooth_meshes is not None
@@ -58,7 +57,7 @@ class Surfaces:
             )
         self.inv_area = dr.rcp(mi.Float(areas))
         dr.make_opaque(self.inv_area)
-        self._by_shape, self._context = by_shape, context
+        self._by_shape, self._context, self._emitters = by_shape, context, emitters
         turned = [s is not None and s.turned for s in spheres]
         self._turned = None
         if any(turned):
@@ -72,20 +71,31 @@ class Surfaces:
         """
         emitter, index = chosen.emitter, chosen.index
         if self._context.ask_shapes:
-            ps = emitter.get_shape().sample_position(shared.time, u, active)
+            ps = self._point(index, shared.time, u, active)
         else:
-            # Asked of the emitter: a call on shapes would visit curves too, which cannot be sampled.
             ps, _ = emitter.sample_position(shared.time, u, active)
             if self._by_shape is not None and self._by_shape.any:
                 mask = self._by_shape.at(index, active)
-                ps = dr.select(mask, emitter.get_shape().sample_position(shared.time, u, mask), ps)
+                ps = dr.select(mask, self._point(index, shared.time, u, mask), ps)
         ps = self.upright(ps, index, active)
         return ps, self.geometric_normal(ps, index, u, active)
 
     def sample_shape(self, chosen, u, time, active):
         """A point that the shape of each emitter samples, whatever the emitter would."""
-        ps = chosen.emitter.get_shape().sample_position(time, u, active)
-        return self.upright(ps, chosen.index, active)
+        return self.upright(self._point(chosen.index, time, u, active), chosen.index, active)
+
+    def _point(self, index, time, u, active):
+        """A point that the shape of the emitter ``index`` samples uniformly.
+
+        Of these shapes alone: Mitsuba's call on shapes visits all of the process, and instances, curves and
+        grids have no ``sample_position``.
+        """
+        shapes = [emitter.get_shape() for emitter in filter(None, self._emitters)]
+        if len(shapes) == 1:
+            return shapes[0].sample_position(time, u, active)
+        numbers = accumulate((emitter is not None for emitter in self._emitters), initial=0)
+        number = dr.gather(mi.UInt32, mi.UInt32(list(numbers)), index, active)
+        return dr.switch(number, [shape.sample_position for shape in shapes], time, u, active)
 
     def upright(self, ps, index, active):
         """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
@@ -122,16 +132,3 @@ def spheres_of(emitters, context: Context) -> list[Sphere | None]:
 
 def _check_to_world(emitter: mi.Emitter) -> None:
     check_to_world(emitter.get_shape(), f"emitter {named(emitter)}")
-
-
-def refuse_curves(scene, emitter, why: str):
-    """Raise ``UnsupportedError`` if a call on shapes, which ``emitter`` needs, would meet curves.
-
-    Curves have no ``sample_position``.
-    """
-    for shape in all_shapes(scene):
-        if shape.shape_type() in CURVES:
-            raise UnsupportedError(
-                f"emitter {named(emitter)} {why}, which is not supported beside curves "
-                f"({named(shape)}); remove one of them, or use integrator type 'path'"
-            )
