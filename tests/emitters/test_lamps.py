@@ -362,8 +362,8 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
 @pytest.mark.parametrize("sky", [None, "timed_sunsky"])
 def test_textured_lamps_beside_shapes_without_points(sky, tmp_path):
     """Rationale: points of these lamps are asked of shapes, and Mitsuba's call on shapes visits instances,
-    curves and grids, which sample none ("Shape::sample_position(): not implemented!"). A `timed_sunsky` has kernels
-    run step by step. Expected, tolerance, statistic: those of `check_sums`."""
+    curves and grids, which sample none ("Shape::sample_position(): not implemented!"). Kernels beside a
+    `timed_sunsky` run step by step. Expected, tolerance, statistic: those of `check_sums`."""
     curve = tmp_path / "curve.txt"
     curve.write_text("\n".join(f"{x} 1 0 0.1" for x in (-1.5, -0.5, 0.5, 1.5)))
     area = {"type": "area", "radiance": peaked(20)}

@@ -28,6 +28,11 @@ _SAMPLED_PDF_IS_PDF = frozenset(
     "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
 )
 
+_MAPS = "BumpMap", "NormalMap"
+
+# Two points of one plane see each other under a cosine that is rounding; its square leaves single precision.
+_LEAST_COS = 1e-18
+
 
 @dataclass
 class Evaluation:
@@ -61,8 +66,8 @@ class Traits:
     """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`.
 
     ``glossy``: whether one has a glossy lobe; ``transmits``: whether one has a lobe, not delta, that scatters
-    to the other side; ``reverse``: whether some strategy in use starts from the other side, so that weights
-    ask for the densities of the reverse directions.
+    to the other side; ``mapped``: whether one has a bump or normal map; ``reverse``: whether some strategy in
+    use starts from the other side, so that weights ask for the densities of the reverse directions.
     """
 
     full_pdf: bool
@@ -70,6 +75,7 @@ class Traits:
     asked: Asked
     glossy: bool = False
     transmits: bool = False
+    mapped: bool = False
     reverse: bool = True
 
     def from_one_side(self) -> Traits:
@@ -90,7 +96,8 @@ class Traits:
         through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
         glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
         transmits = any(bsdf.flags() & through for bsdf in bsdfs)
-        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits)
+        mapped = any(b.class_name() in _MAPS for b in nested(bsdfs))
+        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits, mapped)
 
 
 # From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands
@@ -184,6 +191,8 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
 
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
+        if traits.mapped:  # Mitsuba's shadowing of bumps squares the cosine: 0 by infinity on one plane
+            active &= dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS
         value, pdf = self.eval_pdf(ctx, si, wo, active)
         value = polarization.in_world(si, value, -wo, si.wi)
         return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
@@ -445,10 +454,7 @@ def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
     Mitsuba's maps drop sampled directions (not incident ones) on different sides of the surface and
     of the perturbed normal, and turn the normal towards the incident direction.
     """
-    return any(
-        b.class_name() in ("BumpMap", "NormalMap") and mi.has_flag(b.flags(), mi.BSDFFlags.Delta)
-        for b in nested(bsdfs)
-    )
+    return any(b.class_name() in _MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in nested(bsdfs))
 
 
 def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
