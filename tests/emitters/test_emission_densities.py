@@ -411,6 +411,31 @@ def test_a_vertex_that_is_not_finite():
     assert float(sphere.radius[0]) == pytest.approx(np.sqrt(2), rel=1e-3)
 
 
+CORNER = """<scene version="3.0.0">
+    <bsdf type="diffuse" id="grey"/>
+    <shape type="rectangle"><ref id="grey"/></shape>
+    <shape type="rectangle">
+        <transform name="to_world"><rotate x="1" angle="-90"/></transform><ref id="grey"/>
+    </shape>
+    <shape type="sphere">
+        <point name="center" x="0" y="0.3" z="0.3"/><float name="radius" value="0.1"/>
+    </shape>
+    <emitter type="constant"/>
+</scene>"""
+
+
+def test_rectangles_that_mitsuba_merges():
+    """Rationale: Mitsuba makes one mesh of rectangles of one BSDF, and the box of it is not valid: the
+    scene's is that of the ball. Expected: the disk covers what it covers where nothing is merged.
+    """
+    merged, apart = (mi.load_string(CORNER, optimize=on) for on in (True, False))
+    assert len(merged.shapes()) == 2 and len(apart.shapes()) == 3
+    assert merged.bbox().bounding_sphere().radius < 0.2
+    found, expected = (emitter_disks.Disks(scene).scene for scene in (merged, apart))
+    np.testing.assert_allclose(np.array(found.center), np.array(expected.center), atol=1e-6)
+    assert float(found.radius[0]) == pytest.approx(float(expected.radius[0]), rel=1e-6)
+
+
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_light_subpaths(name):
     """Rationale: the density of aimed emission enters the weights of all strategies, at the points where

@@ -189,8 +189,8 @@ def _frame(d) -> mi.Frame3f:
 def boxes(scene) -> list:
     """Valid bounding boxes of the shapes; of meshes those of their finite vertices.
 
-    Of meshes that Mitsuba merges when it loads a scene, ``bbox`` is that of one part; with a vertex that is
-    not finite it is invalid, though rays meet other triangles.
+    Of rectangles that Mitsuba merges into a mesh when it loads a scene's file ``bbox`` is invalid, and not
+    part of the scene's; with a vertex that is not finite it is invalid, though rays meet other triangles.
     """
     found = []
     for shape in scene.shapes():
