@@ -1063,6 +1063,41 @@ MUTANTS = (
         "size,",
         ("tests/images/test_joined_light_paths.py::test_guesses_are_about_right[roughconductor-1.25]",),
     ),
+    Mutant(
+        "scene files: of the shapes of a group that have no id the last one is found alone",
+        "host/introspection.py",
+        'name = f"{name}_{times}" if times else name',
+        "name = name if times else name",
+        ("tests/host/test_objects.py::test_shapes_of_a_group_need_no_ids",),
+    ),
+    Mutant(
+        "scene files: points of lamps are asked of all shapes",
+        "emitters/surfaces.py",
+        "return dr.switch(number, [shape.sample_position for shape in shapes], time, u, active)",
+        "return dr.gather(mi.ShapePtr, mi.ShapePtr(shapes), number, active).sample_position(time, u, active)",
+        ("tests/emitters/test_lamps.py::test_textured_lamps_beside_shapes_without_points[None]",),
+    ),
+    Mutant(
+        "scene files: normals that lean are taken for right",
+        "geometry/shape_facts.py",
+        "            check_normals(shape)",
+        "            pass",
+        ("tests/test_properties.py::test_endpoints_that_are_refused[instance turned about a long axis]",),
+    ),
+    Mutant(
+        "scene files: rough conductors in a blend are seen from behind",
+        "transport/bsdf.py",
+        "return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z)",
+        "return False",
+        ("tests/images/test_non_finite.py::test_a_blend_seen_from_behind_is_black[bare]",),
+    ),
+    Mutant(
+        "scene files: points of one plane see each other under a bump map",
+        "transport/bsdf.py",
+        "active &= dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS",
+        "pass",
+        ("tests/transport/test_bsdf.py::test_directions_within_the_surface",),
+    ),
 )
 
 
