@@ -23,9 +23,10 @@ from .emission_tables import PLAIN, EmissionGuide, Factor, Place
 from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
-from .surfaces import CURVES, Surfaces, spheres_of
+from .surfaces import Surfaces, spheres_of
 from .tables import Mask, look_up, rows, table
 
+_CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
 
 
@@ -369,7 +370,7 @@ def _tells_its_points(emitter) -> bool:
             f"emitter {named(emitter)} is on a shape that Mitsuba does not tell (an ellipsoidsmesh); "
             "use shape type ellipsoids, or a mesh"
         )
-    if shape.shape_type() in CURVES:
+    if shape.shape_type() in _CURVES:
         raise UnsupportedError(
             f"emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "
             "sample; use a cylinder or a mesh"

@@ -18,8 +18,6 @@ from ..host.introspection import named
 from .group import Context
 from .tables import Mask, look_up, rows, table
 
-CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
-
 
 @dataclass
 class _Turned:
@@ -38,8 +36,8 @@ class Surfaces:
     Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
     are (`Sphere` or None), and ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
     their shape here. ``inv_area`` of each shape, by its emitter's index; ``smooth``: whether one has
-    interpolated normals. Raises ``UsageError`` and ``UnsupportedError`` for shapes that Mitsuba samples
-    wrongly or not at all.
+    interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples
+    wrongly.
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
