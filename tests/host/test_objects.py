@@ -35,6 +35,7 @@ NAMELESS_GROUP = """<scene version="3.0.0">
     <shape type="shapegroup" id="group">
         <shape type="cube"><bsdf type="plastic"/></shape>
         <shape type="cube"><bsdf type="diffuse"/></shape>
+        <shape type="cube" id="shape_2"><bsdf type="roughplastic"/></shape>
         <shape type="sphere"><point name="center" x="0" y="1.5" z="0"/><bsdf type="dielectric"/></shape>
     </shape>
     <shape type="instance"><ref id="group"/></shape>
@@ -49,10 +50,16 @@ def test_shapes_of_a_group_need_no_ids():
     """
     scene = mi.load_string(NAMELESS_GROUP)
     found = [s.bsdf().class_name() for s in all_shapes(scene) if s.class_name() != "Instance"]
-    assert sorted(found) == ["SmoothConductor", "SmoothDielectric", "SmoothDiffuse", "SmoothPlastic"]
+    assert sorted(found) == [
+        "RoughPlastic",
+        "SmoothConductor",
+        "SmoothDielectric",
+        "SmoothDiffuse",
+        "SmoothPlastic",
+    ]
     group = children(scene)["group"]
     names = {name.split(".")[1] for name in mi.traverse(scene).keys() if name.startswith("group.")}
-    assert set(children(group)) == names == {"shape", "shape_1", "shape_2"}
+    assert set(children(group)) == names == {"shape", "shape_1", "shape_2", "shape_3"}
 
 
 FREED_MEANWHILE = """

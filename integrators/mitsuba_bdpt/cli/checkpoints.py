@@ -15,7 +15,6 @@ from ..errors import CommandError
 from ..files.named import named_files
 from ..files.whole import check_writable, replacing
 from ..run.snapshot import Snapshot, read
-from .mistakes import in_words
 
 
 def path_of(output: Path) -> Path:
@@ -52,7 +51,10 @@ def start(options: Namespace, output: Path) -> Snapshot:
     path = path_of(output)
     if not path.exists():
         raise CommandError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
-    kept = read(path)
+    try:
+        kept = read(path)
+    except ValueError as error:
+        raise CommandError(f"resume: {error}; delete it and leave out --resume to begin anew.") from error
     if kept.progress.scene != digest(options):
         raise CommandError(
             f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
@@ -91,8 +93,8 @@ class Checkpoints:
                 # Before the name, which would stand for half a file after a power cut.
                 os.fsync(file.fileno())
         except OSError as error:
-            error.filename = str(self.path)
-            print(f"warning: no checkpoint {in_words(error)}", file=sys.stderr)
+            why = f"{error.strerror or error}; the render goes on"
+            print(f"warning: no checkpoint {str(self.path)!r}: {why}", file=sys.stderr)
         self._last = time.monotonic()
 
     def remove(self) -> None:

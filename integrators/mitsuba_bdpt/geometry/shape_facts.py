@@ -12,7 +12,7 @@ from ..host.edits import State
 from ..host.introspection import all_shapes
 from ..host.notices import remembered
 from .rounding import ShapeErrors
-from .to_world import check_normals
+from .to_world import check_inverse
 
 Found = TypeVar("Found")
 
@@ -21,12 +21,12 @@ class ShapeFacts:
     """The `ShapeErrors` of a scene (``errors``), and what else is asked of single shapes.
 
     It holds numbers and no object of Mitsuba's: it may outlive the scene. Raises ``UsageError`` for shapes
-    whose normals lean (`check_normals`).
+    of which Mitsuba's answers contradict each other (`check_inverse`).
     """
 
     def __init__(self, scene: mi.Scene):
         for shape in all_shapes(scene):
-            check_normals(shape)
+            check_inverse(shape)
         self.errors = ShapeErrors(scene)
         self._found: dict[tuple[str, int], object] = {}
 

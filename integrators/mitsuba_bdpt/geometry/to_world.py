@@ -15,9 +15,12 @@ from ..host.introspection import inverse_of, is_instance, matrix_of, named
 
 # Relative; single precision and its products are far below.
 _TOLERANCE = 1e-3
-# Normals of what only reflects may lean by two degrees: axes are often written with two figures (0.71, 0.71,
-# 0), whose half-turn is off by 0.033. (With 0.47 images were off by 2 %.)
-_LEANING = 0.04
+# Of what only reflects: axes are often written with two figures, and a half-turn about (0.71, 0.71, 0) is off
+# by 0.023, as much as vertex normals. (With 0.47 images were off by 2 %.)
+_OF_REFLECTORS = 0.04
+
+# From this condition number on NumPy's inverse of a matrix in single precision is no judge of Mitsuba's.
+_FLAT = 1e5
 
 
 def check_to_world(shape, owner: str):
@@ -90,24 +93,25 @@ def _cylinder(matrix, inverse):
     )
 
 
-def check_normals(shape: mi.Shape):
-    """Raise ``UsageError`` if Mitsuba's normals of ``shape`` lean from its surface, which rays find right.
+def check_inverse(shape: mi.Shape):
+    """Raise ``UsageError`` if points, normals and rays of ``shape`` are of different surfaces.
 
-    Those of cylinders, ``sdfgrid`` and instances do after ``rotate`` about an axis that is not of length 1,
-    whose inverse Mitsuba takes to be that of a rotation. Path tracing shades by such normals and asks for no
-    densities per area; strategies that do would weigh by, and spread light over, another surface.
+    Those of cylinders, ``sdfgrid`` and instances are after ``rotate`` about an axis that is not of length 1,
+    whose inverse Mitsuba takes to be that of a rotation: one is by the matrix, another by this inverse. Path
+    tracing shades by what it is given and asks for no densities per area; strategies that do would weigh by,
+    and spread light over, another surface.
     """
-    if not is_instance(shape) and shape.shape_type() not in _BY_THE_INVERSE:
+    if not is_instance(shape) and shape.shape_type() not in _USES_BOTH:
         return
     matrix, inverse = matrix_of(shape)[:3, :3], inverse_of(shape)[:3, :3]
-    if not np.isfinite([matrix, inverse]).all() or np.linalg.det(matrix) == 0:
-        return  # counted, or without area
-    if _differs(inverse, np.linalg.inv(matrix), _LEANING):
+    if not np.isfinite([matrix, inverse]).all() or np.linalg.cond(matrix) > _FLAT:
+        return  # counted, or with hardly any area
+    if _differs(inverse, np.linalg.inv(matrix), _OF_REFLECTORS):
         kind = shape.class_name().lower()
         raise UsageError(
             f"to_world of {kind} {named(shape)} has another inverse than Mitsuba takes it to have, so that "
-            "its normals lean from its surface: rotate about an axis that is not of length 1 makes such a "
-            "matrix; give rotate an axis of length 1"
+            "its points, normals and rays are of different surfaces: rotate about an axis that is not of "
+            "length 1 makes such a matrix; give rotate an axis of length 1"
         )
 
 
@@ -163,9 +167,9 @@ def _lengths(matrix) -> str:
     return ", ".join(f"{x:.4g}" for x in np.linalg.norm(matrix, axis=0))
 
 
-# Their normals follow from the inverse. (Rays find disks and spheres by it as well, the normal of a rectangle
-# is the same in all strategies, and meshes keep no matrix.)
-_BY_THE_INVERSE = {mi.ShapeType.Cylinder.value, mi.ShapeType.SDFGrid.value}
+# Points, normals and rays of these are by the matrix and its inverse. (Disks and spheres are by the inverse
+# alone, as far as they only reflect, rectangles by their corners, and meshes keep no matrix.)
+_USES_BOTH = {mi.ShapeType.Cylinder.value, mi.ShapeType.SDFGrid.value}
 
 
 _CHECKS = {

@@ -122,8 +122,11 @@ def _collector(variant: str):
 
         def put(self, name, value, flags, cpptype=None):
             # Shapes of a group that have no id are all called "shape": numbered, as by ``mi.traverse``.
-            times = self.times[name] = self.times.get(name, -1) + 1
-            name = f"{name}_{times}" if times else name
+            first, count = name, self.times.get(name, 0)
+            while name in self.found:
+                count += 1
+                name = f"{first}_{count}"
+            self.times[first] = count
             self.found[name], self.types[name] = value, cpptype
 
     return Collector

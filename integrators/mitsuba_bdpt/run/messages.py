@@ -113,7 +113,7 @@ def warn_of_non_finite(statistics: dict, scene):
         return
     parts = [f"{lost} values were not finite and count as zero"] if lost else []
     if in_pilot:
-        which = "so did" if lost else "not finite were"
+        which = "so did" if lost else "values that were not finite count as zero:"
         parts.append(f"{which} {in_pilot} of the pilot, which decided from the rest")
     named = not_finite(scene)
     parts.append(

@@ -124,9 +124,7 @@ class Snapshot:
                 progress = Progress.restored(values["progress"], arrays)
                 return Snapshot(identity, passes, progress, arrays)
         except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise CommandError(
-                f"not a snapshot, or a damaged one ({error}); delete it and begin the render anew"
-            ) from error
+            raise CommandError(f"not a snapshot, or a damaged one ({error})") from error
         raise CommandError(
             f"a snapshot of another version of mitsuba-bdpt: its format is {identity['format']!r}, here it "
             f"is {FORMAT}; go on with the version that it was begun with, or begin anew"

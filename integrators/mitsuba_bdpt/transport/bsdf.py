@@ -112,7 +112,7 @@ _ASKED = 4096
 
 
 class Asked:
-    """Virtual calls of these BSDFs alone, which are `MANY` or not.
+    """Virtual calls of these ``bsdfs`` alone, which are `MANY` or not.
 
     Mitsuba's visit all of the process, and a kernel holds a function for each of them: those inside of
     others, which no ray meets, and those of other scenes.
@@ -120,7 +120,7 @@ class Asked:
 
     def __init__(self, bsdfs: Iterable[mi.BSDF]):
         by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
-        self._bsdfs = list(by_id.values())
+        self.bsdfs = list(by_id.values())
         self.many = len(by_id) >= MANY
         numbers = [0] * (max(by_id, default=0) + 1)
         for number, index in enumerate(by_id):
@@ -130,7 +130,7 @@ class Asked:
     @property
     def count(self) -> int:
         """How many there are."""
-        return len(self._bsdfs)
+        return len(self.bsdfs)
 
     def __call__(self, bsdf, question, *args):
         """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask.
@@ -141,7 +141,7 @@ class Asked:
         if isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
             return question(bsdf, *args)
         number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
-        return dr.switch(number, [partial(question, b) for b in self._bsdfs], *args)
+        return dr.switch(number, [partial(question, b) for b in self.bsdfs], *args)
 
     def together(self, bsdf, questions, *args):
         """Answers of ``questions(bsdf, *args)``, which asks through this object.
@@ -192,7 +192,7 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
         if traits.mapped:  # Mitsuba's shadowing of bumps squares the cosine: 0 by infinity on one plane
-            active &= dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS
+            active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)
         value, pdf = self.eval_pdf(ctx, si, wo, active)
         value = polarization.in_world(si, value, -wo, si.wi)
         return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
@@ -324,7 +324,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         smooth = active & ~delta
         pdf_fwd_w = bs.pdf
         if traits.full_pdf:
-            weight = dr.select(_none_from_behind(self, si, bs), 0, weight)
+            weight = dr.select(_none_from_behind(self, si, bs, traits), 0, weight)
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
@@ -335,13 +335,15 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
 
 
-def _none_from_behind(bsdf, si, bs: mi.BSDFSample3f):
+def _none_from_behind(bsdf, si, bs: mi.BSDFSample3f, traits: Traits):
     """Mask: no direction was drawn, since ``si`` is seen from behind a lobe of a rough conductor.
 
     Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf`` multiplies this 0
-    by the density, which is NaN. No other BSDF of Mitsuba's does: NaN of others is counted.
+    by the density, which is NaN. No other BSDF of Mitsuba's does: NaN of others is counted. (Of a pointer
+    any of the scene's may be meant.)
     """
-    if not isinstance(bsdf, mi.BSDF) or all(b.class_name() != "RoughConductor" for b in nested([bsdf])):
+    meant = [bsdf] if isinstance(bsdf, mi.BSDF) else traits.asked.bsdfs
+    if not any(b.class_name() == "RoughConductor" for b in nested(meant)):
         return False
     return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z)
 
