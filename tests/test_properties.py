@@ -941,7 +941,6 @@ def meter_on(shape, **film):
 
 
 AREA_LIGHT = {"type": "area", "radiance": 1.0}
-CHECKS = {"type": "area", "radiance": {"type": "checkerboard"}}
 GAUSSIAN = {"rfilter": {"type": "gaussian"}, "sample_border": True}
 STRETCHED = mi.ScalarTransform4f().scale([1, 2, 1])
 MIRRORED = mi.ScalarTransform4f().scale([1, 1, -1])

@@ -382,10 +382,13 @@ def test_textured_lamps_beside_shapes_without_points(emitter, tmp_path):
         "first": {"type": "cylinder", "to_world": T().translate([-1, 1.5, 0]).scale(0.4)},
         "second": {"type": "cube", "to_world": T().translate([1, 1.5, 0]).scale(0.4)},
     }
+    curve = {"type": "bsplinecurve", "filename": str(curve), "bsdf": grey(0.5)}
     others = {
         "group": {"type": "shapegroup", "a": {"type": "cube", "bsdf": grey(0.5)}, "b": {"type": "sphere"}},
         "one": {"type": "instance", "to_world": T().scale(0.3), "group": {"type": "ref", "id": "group"}},
-        "curve": {"type": "bsplinecurve", "filename": str(curve), "bsdf": grey(0.5)},
+        "curves": {"type": "shapegroup", "a": curve},
+        "two": {"type": "instance", "to_world": T().scale(0.5), "group": {"type": "ref", "id": "curves"}},
+        "curve": curve,
         "grid": {"type": "sdfgrid", "grid": mi.TensorXf(np.arange(-3, 5).reshape(2, 2, 2, 1))},
     }
     if emitter == "timed_sunsky":

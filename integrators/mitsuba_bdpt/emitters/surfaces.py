@@ -36,8 +36,7 @@ class Surfaces:
     Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
     are (`Sphere` or None), and ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
     their shape here. ``inv_area`` of each shape, by its emitter's index; ``smooth``: whether one has
-    interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples
-    wrongly.
+    interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
@@ -91,6 +90,7 @@ class Surfaces:
         shapes = [emitter.get_shape() for emitter in filter(None, self._emitters)]
         if len(shapes) == 1:
             return shapes[0].sample_position(time, u, active)
+        # How many are before each; the last, of all, belongs to no emitter.
         numbers = accumulate((emitter is not None for emitter in self._emitters), initial=0)
         number = dr.gather(mi.UInt32, mi.UInt32(list(numbers)), index, active)
         return dr.switch(number, [shape.sample_position for shape in shapes], time, u, active)
