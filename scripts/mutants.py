@@ -1086,10 +1086,10 @@ MUTANTS = (
     ),
     Mutant(
         "scene files: rough conductors in a blend are seen from behind",
-        "transport/bsdf.py",
+        "transport/draws.py",
         "return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z)",
         "return False",
-        ("tests/images/test_non_finite.py::test_a_blend_seen_from_behind_is_black[bare]",),
+        ("tests/images/test_non_finite.py::test_a_blend_seen_from_behind_is_black[step by step]",),
     ),
     Mutant(
         "scene files: points of one plane see each other under a bump map",
@@ -1097,6 +1097,37 @@ MUTANTS = (
         "active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)",
         "pass",
         ("tests/transport/test_bsdf.py::test_directions_within_the_surface",),
+    ),
+    Mutant(
+        "blends: drawn by Mitsuba",
+        "transport/draws.py",
+        'return kind == "BlendBSDF"',
+        "return False",
+        (
+            "tests/images/test_blends.py::test_a_mirror_in_a_blend[False]",
+            "tests/transport/test_bsdf.py::test_delta_events_of_a_blend",
+        ),
+    ),
+    Mutant(
+        "blends: a part's directions on the wrong side are kept",
+        "transport/draws.py",
+        "* dr.select(through, 1, -1) > 0",
+        "* dr.select(through, 1, -1) > 2",
+        ("tests/transport/test_bsdf.py::test_both_sides_carry_the_same[blendbsdf frosted-0.4]",),
+    ),
+    Mutant(
+        "blends: what a part draws by another density is kept",
+        "transport/draws.py",
+        "(bs.pdf == 0) | (bs.pdf > _SAME * pdf) | (pdf > _SAME * bs.pdf)",
+        "bs.pdf == 0",
+        ("tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf all normals]",),
+    ),
+    Mutant(
+        "blends: black parts draw nothing",
+        "transport/draws.py",
+        "dr.select(smooth, rejected, found.rejected)",
+        "found.rejected",
+        ("tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf black]",),
     ),
 )
 

@@ -14,7 +14,7 @@ from ..host.introspection import all_shapes, children, is_instance, named
 from ..media.media import Media, Space
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
-from ..transport import bsdf
+from ..transport import bsdf, draws
 from .light_media import LightMedia, medium_at_far_plane
 
 
@@ -70,7 +70,7 @@ def _prepare_bitmaps(found):
     the first pass would be two kernels, and the second one a third.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
-    held = (v for owner in bsdf.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
+    held = (v for owner in draws.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
     for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
         for ask in (texture.eval, texture.eval_1, texture.eval_3):
             try:

@@ -18,15 +18,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import polarization
-from ..host.introspection import children
-
-# Plugins whose sample() returns the density of the lobe that was picked, not that of pdf().
-# Plugins that are not Mitsuba's own are treated like them.
-_SAMPLED_PDF_IS_PDF = frozenset(
-    "SmoothDiffuse SmoothConductor RoughConductor SmoothDielectric RoughDielectric ThinDielectric "
-    "SmoothPlastic RoughPlastic PolarizedPlastic Principled PrincipledThin Hair "
-    "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
-)
+from . import draws
+from .draws import is_zero, needs_full_pdf, nested
 
 _MAPS = "BumpMap", "NormalMap"
 
@@ -66,8 +59,9 @@ class Traits:
     """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`.
 
     ``glossy``: whether one has a glossy lobe; ``transmits``: whether one has a lobe, not delta, that scatters
-    to the other side; ``mapped``: whether one has a bump or normal map; ``reverse``: whether some strategy in
-    use starts from the other side, so that weights ask for the densities of the reverse directions.
+    to the other side; ``mapped``: whether one has a bump or normal map; ``parts``: whether one is drawn by
+    its parts, see `draws`; ``reverse``: whether some strategy in use starts from the other side, so that
+    weights ask for the densities of the reverse directions.
     """
 
     full_pdf: bool
@@ -76,6 +70,7 @@ class Traits:
     glossy: bool = False
     transmits: bool = False
     mapped: bool = False
+    parts: bool = False
     reverse: bool = True
 
     def from_one_side(self) -> Traits:
@@ -97,7 +92,10 @@ class Traits:
         glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
         transmits = any(bsdf.flags() & through for bsdf in bsdfs)
         mapped = any(b.class_name() in _MAPS for b in nested(bsdfs))
-        return Traits(needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits, mapped)
+        parts = any(draws.by_parts(b) for b in bsdfs)
+        return Traits(
+            needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits, mapped, parts
+        )
 
 
 # From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands
@@ -293,8 +291,8 @@ def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
     eta2 = dr.square(bs.eta)
     delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
     weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.pdf_fwd_w)
-    # A direction that Mitsuba rejects has weight 0, whatever its pdf says. NaN is kept, to be counted.
-    return dr.select((drawn.pdf_fwd_w == 0) | is_zero(drawn.weight), 0, weight)
+    # Whatever the density says of a direction that Mitsuba rejects. NaN is kept, to be counted.
+    return dr.select((drawn.pdf_fwd_w == 0) | drawn.rejected, 0, weight)
 
 
 @dataclass
@@ -302,8 +300,8 @@ class _Drawn:
     """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode.
 
     Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is
-    no ``pdf_rev_w``) and, if `_asks_back`, the weight ``back`` of a delta event made from its other
-    end, 0 if it does not lead back.
+    no ``pdf_rev_w``), if `_asks_back` the weight ``back`` of a delta event made from its other end, 0 if it
+    does not lead back; where it was ``rejected``, which BSDFs that are drawn ``of_parts`` say themselves.
     """
 
     bs: mi.BSDFSample3f
@@ -311,51 +309,41 @@ class _Drawn:
     pdf_fwd_w: mi.Float
     pdf_rev_w: mi.Float
     back: mi.Spectrum
+    of_parts: mi.Bool | None = None
+
+    @property
+    def rejected(self):
+        return is_zero(self.weight) if self.of_parts is None else self.of_parts
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
     """A direction that Mitsuba's ``sample`` draws, with its densities both ways, in one virtual call."""
 
     def ask(self, si, u1, u2, active):
-        ctx = mi.BSDFContext()
-        bs, weight = self.sample(ctx, si, u1, u2, active)
-        weight = polarization.in_world(si, weight, -bs.wo, si.wi)
+        ctx, found = mi.BSDFContext(), draws.draw(self, si, u1, u2, active)
+        bs = found.bs
+        weight = polarization.in_world(si, found.weight, -bs.wo, si.wi)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         smooth = active & ~delta
         pdf_fwd_w = bs.pdf
         if traits.full_pdf:
-            weight = dr.select(_none_from_behind(self, si, bs, traits), 0, weight)
+            meant = [self] if isinstance(self, mi.BSDF) else traits.asked.bsdfs  # a pointer may be any
+            behind = draws.is_drawn_from_behind(meant, si, bs)
+            weight, found.rejected = dr.select(behind, 0, weight), found.rejected | behind
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
         asks = _asks_back(traits, adjoint)
         back = _back(self, si, bs, u1, u2, active & delta) if asks else mi.Spectrum(0)
-        return bs, weight, pdf_fwd_w, pdf_rev_w, back
+        answers = bs, weight, pdf_fwd_w, pdf_rev_w, back
+        return (*answers, found.rejected) if traits.parts else answers
 
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
-
-
-def _none_from_behind(bsdf, si, bs: mi.BSDFSample3f, traits: Traits):
-    """Mask: no direction was drawn, since ``si`` is seen from behind a lobe of a rough conductor.
-
-    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0; a ``blendbsdf`` multiplies this 0
-    by the density, which is NaN. No other BSDF of Mitsuba's does: NaN of others is counted. (Of a pointer
-    any of the scene's may be meant.)
-    """
-    meant = [bsdf] if isinstance(bsdf, mi.BSDF) else traits.asked.bsdfs
-    if not any(b.class_name() == "RoughConductor" for b in nested(meant)):
-        return False
-    return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z)
 
 
 def brightest(value: mi.Spectrum):
     """The largest entry of a spectrum, in size; one that is NaN counts only where all others do."""
     return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
-
-
-def is_zero(value: mi.Spectrum):
-    """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
-    return dr.all(mi.unpolarized_spectrum(value) == 0)
 
 
 def is_finite(value: mi.Spectrum):
@@ -381,9 +369,9 @@ def _back(bsdf, si, bs, u1, u2, active):
 
     The event is taken to have the same probability from either end, as those of Mitsuba's BSDFs.
     """
-    back, weight = bsdf.sample(mi.BSDFContext(), with_wi(si, bs.wo), u1, u2, active)
-    weight = polarization.in_world(si, weight, -si.wi, bs.wo)
-    return dr.select(dr.squared_norm(back.wo - si.wi) < 1e-4, weight, 0)
+    back = draws.draw(bsdf, with_wi(si, bs.wo), u1, u2, active)
+    weight = polarization.in_world(si, back.weight, -si.wi, bs.wo)
+    return dr.select(dr.squared_norm(back.bs.wo - si.wi) < 1e-4, weight, 0)
 
 
 def _event_cos_ratio(si, bs):
@@ -408,7 +396,7 @@ def _step(si, drawn: _Drawn, weight) -> Step:
     finite &= is_finite(drawn.weight) & dr.isfinite(bs.eta)  # roulette asks for eta
     return Step(
         wo=bs.wo,
-        weight=dr.select(finite | is_zero(drawn.weight), weight, dr.nan),
+        weight=dr.select(finite | drawn.rejected, weight, dr.nan),
         pdf_fwd_w=drawn.pdf_fwd_w,
         pdf_rev_w=drawn.pdf_rev_w,
         cos_out=cos_out,
@@ -441,15 +429,6 @@ def _is_scalar(matrix: mi.Spectrum) -> bool:
     return all(np.abs(rows[i][j] - (i == j) * first).max() < 1e-6 for i in range(4) for j in range(4))
 
 
-def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether some BSDF's sample() may report another density than its pdf().
-
-    A mixture that reports the picked lobe's density gives an unbiased ``weight`` but cannot serve
-    in the weights of multiple importance sampling, nor as divisor of a full evaluation.
-    """
-    return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in nested(bsdfs))
-
-
 def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
     """Whether a delta event may exist from one end only: under a bump or normal map.
 
@@ -457,11 +436,3 @@ def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
     of the perturbed normal, and turn the normal towards the incident direction.
     """
     return any(b.class_name() in _MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in nested(bsdfs))
-
-
-def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
-    """``bsdfs`` and every BSDF inside them (two-sided, mask, blend, bump and normal maps)."""
-    found = list(bsdfs)
-    for bsdf in found:  # grows on the way
-        found += [value for value in children(bsdf).values() if isinstance(value, mi.BSDF)]
-    return found

@@ -97,7 +97,17 @@ from ..geometry import rays
 from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
-from . import bsdf, contribution, guided_hits, isolated_light, merging, mis, stored_vertices, techniques
+from . import (
+    bsdf,
+    contribution,
+    draws,
+    guided_hits,
+    isolated_light,
+    merging,
+    mis,
+    stored_vertices,
+    techniques,
+)
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Shared
@@ -321,7 +331,7 @@ def emission(kernel: Kernel, stream, shared):
 def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
     """A light subpath on its first edge; ``merges``: whether it asks for those of its vertices."""
     h = kernel.heuristic
-    active = ~bsdf.is_zero(e.weight) & (kernel.last_light >= 1)
+    active = ~draws.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
     active &= ~broken
     inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
