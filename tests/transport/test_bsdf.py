@@ -103,6 +103,7 @@ PLUGINS = {
     "blendbsdf mirror": lambda: blend(0.4, ROUGHER, MIRROR),
     "blendbsdf black": lambda: blend(0.4, BLACK, FROSTED),
     "blendbsdf all normals": lambda: blend(0.5, {**ROUGH, "sample_visible": False}, FROSTED),
+    "blendbsdf masked thin": lambda: blend(0.4, {"type": "mask", "nested": THIN}, PLASTIC),
     "blendbsdf thin": lambda: blend(0.4, THIN, ROUGHER),
     "mask of a blend": lambda: {"type": "mask", "opacity": 0.6, "nested": blend(0.4, GREY, FROSTED)},
     "twosided blend": lambda: {"type": "twosided", "nested": blend(0.4, ROUGHER, MIRROR)},

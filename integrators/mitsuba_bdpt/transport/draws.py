@@ -100,8 +100,8 @@ def _part(bsdf, si, u1, u2, active) -> Draw:
     It is rejected on the side to which its lobe does not lead, and where the density that it states is not
     its ``pdf()``; not by its weight: where a black part draws, the other one may be seen.
     """
-    found = draw(bsdf, si, u1, u2, active)
-    if by_parts(bsdf) or needs_full_pdf([bsdf]) or bsdf.class_name() in _REJECT_BY_WEIGHT:
+    found, kinds = draw(bsdf, si, u1, u2, active), {b.class_name() for b in nested([bsdf])}
+    if by_parts(bsdf) or needs_full_pdf([bsdf]) or not kinds.isdisjoint(_REJECT_BY_WEIGHT):
         return found
     bs, cos_theta = found.bs, mi.Frame3f.cos_theta
     smooth = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
