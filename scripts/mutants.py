@@ -1101,7 +1101,7 @@ MUTANTS = (
     Mutant(
         "blends: drawn by Mitsuba",
         "transport/draws.py",
-        'return kind == "BlendBSDF"',
+        'return any(b.class_name() == "BlendBSDF" for b in nested([bsdf]))',
         "return False",
         (
             "tests/images/test_blends.py::test_a_mirror_in_a_blend[False]",
@@ -1111,23 +1111,46 @@ MUTANTS = (
     Mutant(
         "blends: a part's directions on the wrong side are kept",
         "transport/draws.py",
-        "* dr.select(through, 1, -1) > 0",
-        "* dr.select(through, 1, -1) > 2",
-        ("tests/transport/test_bsdf.py::test_both_sides_carry_the_same[blendbsdf frosted-0.4]",),
+        "(~is_zero(f) | (pdf == 0) | (bs.sampled_type == 0))",
+        "False",
+        (
+            "tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf masked thin]",
+            "tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf all normals]",
+        ),
     ),
     Mutant(
-        "blends: what a part draws by another density is kept",
+        "blends: hair reflects to one side",
         "transport/draws.py",
-        "(bs.pdf == 0) | (bs.pdf > _SAME * pdf) | (pdf > _SAME * bs.pdf)",
-        "bs.pdf == 0",
-        ("tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf all normals]",),
+        "~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Reflection)",
+        "mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)",
+        ("tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf hair]",),
+    ),
+    Mutant(
+        "blends: a principled part draws from behind",
+        "transport/draws.py",
+        "return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, pdf, 0)",
+        "return pdf",
+        ("tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf blind from behind]",),
+    ),
+    Mutant(
+        "blends: a share that is not a number picks a part",
+        "transport/draws.py",
+        "bad = dr.isnan(share)",
+        "bad = mi.Bool(False)",
+        (
+            "tests/transport/test_bsdf.py::test_what_is_not_a_number_in_a_blend_is_counted[mirrors]",
+            "tests/transport/test_bsdf.py::test_what_is_not_a_number_in_a_blend_is_counted[opacity]",
+        ),
     ),
     Mutant(
         "blends: black parts draw nothing",
         "transport/draws.py",
         "dr.select(smooth, rejected, found.rejected)",
         "found.rejected",
-        ("tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf black]",),
+        (
+            "tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf black]",
+            "tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf black bumps]",
+        ),
     ),
 )
 

@@ -28,7 +28,7 @@ from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport import draws
+from ..transport import spectra
 from ..transport.inputs import Shared
 from ..transport.plan import Plan
 from .possible import unreachable_paths
@@ -252,7 +252,7 @@ def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi
     generator = mi.PCG32(SUBPATHS, SEED, 1)
     shared = _shared(prepared, generator)
     e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
-    active = e.delta & ~draws.is_zero(e.weight)  # what is not finite is kept, to be said
+    active = e.delta & ~spectra.is_zero(e.weight)  # what is not finite is kept, to be said
     ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
     weight, index = mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(e.weight)), e.index
     ray.maxt = dr.full(mi.Float, dr.inf, SUBPATHS)  # as wide as those of the sensor, for the same kernel
@@ -325,7 +325,7 @@ def _follow(
         factor = mi.unpolarized_spectrum(factor)
         factor *= dr.select(is_adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
         weight = dr.select(active, weight * factor, weight)
-        active &= ~draws.is_zero(weight)
+        active &= ~spectra.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)
         edges = walk.edges + dr.select(active, mi.UInt32(1), 0)
         ray = rays.spawn(anchor, si.to_world(bs.wo), ray)
@@ -401,4 +401,4 @@ def _meetings(photons: _Ends, points: _Ends, max_depth: int):
     state = mi.UInt32(0), dr.zeros(mi.UnpolarizedSpectrum, dr.width(photons.p))
     _, total = dr.while_loop(state, lambda i, total: i < count, body, label="meetings")
     # One that meets nothing adds nothing, even if its weight is not finite.
-    return dr.select(draws.is_zero(total), 0, total * photons.weight)
+    return dr.select(spectra.is_zero(total), 0, total * photons.weight)

@@ -111,7 +111,12 @@ def warn_of_non_finite(statistics: dict, scene):
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return
-    parts = [f"{lost} values were not finite and count as zero"] if lost else []
+    some = (
+        "1 value was not finite and counts as zero"
+        if lost == 1
+        else f"{lost} values were not finite and count as zero"
+    )
+    parts = [some] if lost else []
     if in_pilot:
         which = "so did" if lost else "values that were not finite count as zero:"
         parts.append(f"{which} {in_pilot} of the pilot, which decided from the rest")

@@ -19,9 +19,8 @@ import numpy as np
 
 from ..geometry import polarization
 from . import draws
-from .draws import is_zero, needs_full_pdf, nested
-
-_MAPS = "BumpMap", "NormalMap"
+from .draws import needs_full_pdf, nested
+from .spectra import brightest, is_finite, is_zero
 
 # Two points of one plane see each other under a cosine that is rounding; its square leaves single precision.
 _LEAST_COS = 1e-18
@@ -91,7 +90,7 @@ class Traits:
         through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
         glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
         transmits = any(bsdf.flags() & through for bsdf in bsdfs)
-        mapped = any(b.class_name() in _MAPS for b in nested(bsdfs))
+        mapped = any(b.class_name() in draws.MAPS for b in nested(bsdfs))
         parts = any(draws.by_parts(b) for b in bsdfs)
         return Traits(
             needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits, mapped, parts
@@ -290,7 +289,7 @@ def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
     # The radiance that a camera subpath carries, without its factor eta^-2.
     eta2 = dr.square(bs.eta)
     delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
-    weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.pdf_fwd_w)
+    weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.density)
     # Whatever the density says of a direction that Mitsuba rejects. NaN is kept, to be counted.
     return dr.select((drawn.pdf_fwd_w == 0) | drawn.rejected, 0, weight)
 
@@ -301,7 +300,8 @@ class _Drawn:
 
     Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is
     no ``pdf_rev_w``), if `_asks_back` the weight ``back`` of a delta event made from its other end, 0 if it
-    does not lead back; where it was ``rejected``, which BSDFs that are drawn ``of_parts`` say themselves.
+    does not lead back; ``of_parts``, in scenes with BSDFs that are drawn so: density and rejection, as in
+    `draws.Draw`, which are ``pdf_fwd_w`` and a weight of 0 elsewhere.
     """
 
     bs: mi.BSDFSample3f
@@ -309,11 +309,15 @@ class _Drawn:
     pdf_fwd_w: mi.Float
     pdf_rev_w: mi.Float
     back: mi.Spectrum
-    of_parts: mi.Bool | None = None
+    of_parts: tuple[mi.Float, mi.Bool] | None = None
+
+    @property
+    def density(self):
+        return self.pdf_fwd_w if self.of_parts is None else self.of_parts[0]
 
     @property
     def rejected(self):
-        return is_zero(self.weight) if self.of_parts is None else self.of_parts
+        return is_zero(self.weight) if self.of_parts is None else self.of_parts[1]
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
@@ -332,27 +336,14 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
             weight, found.rejected = dr.select(behind, 0, weight), found.rejected | behind
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
+        density = found.density if draws.by_parts(self) else pdf_fwd_w
         pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
         asks = _asks_back(traits, adjoint)
         back = _back(self, si, bs, u1, u2, active & delta) if asks else mi.Spectrum(0)
         answers = bs, weight, pdf_fwd_w, pdf_rev_w, back
-        return (*answers, found.rejected) if traits.parts else answers
+        return (*answers, (density, found.rejected)) if traits.parts else answers
 
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
-
-
-def brightest(value: mi.Spectrum):
-    """The largest entry of a spectrum, in size; one that is NaN counts only where all others do."""
-    return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
-
-
-def is_finite(value: mi.Spectrum):
-    """Mask: no entry of a spectrum (of a Mueller matrix's first column) is NaN or infinite."""
-    finite = dr.isfinite(mi.unpolarized_spectrum(value))
-    if mi.is_polarized:
-        for i in range(1, 4):
-            finite &= dr.isfinite(value[i, 0])
-    return dr.all(finite)
 
 
 def _asks_back(traits: Traits, adjoint: bool) -> bool:
@@ -435,4 +426,6 @@ def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
     Mitsuba's maps drop sampled directions (not incident ones) on different sides of the surface and
     of the perturbed normal, and turn the normal towards the incident direction.
     """
-    return any(b.class_name() in _MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in nested(bsdfs))
+    return any(
+        b.class_name() in draws.MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in nested(bsdfs)
+    )

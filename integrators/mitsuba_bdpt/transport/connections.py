@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
-from . import draws, mis, scattering
+from . import mis, scattering, spectra
 from .contribution import Contribution, drop_non_finite, foreseen, roulette, size_of, worth_a_ray
 from .counters import MEDIA, Counters, counted_in_media, one
 from .inputs import Kernel
@@ -38,7 +38,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     f_z = scattering.evaluate(kernel, z, wo_z, active)
     f_y = scattering.evaluate_adjoint(kernel, y, wo_y, active, cos_y)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
-    active &= ~draws.is_zero(value)
+    active &= ~spectra.is_zero(value)
 
     direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
     light_side = mis.alternatives(

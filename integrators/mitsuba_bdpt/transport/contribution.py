@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.emission_tables import Cell
-from . import bsdf
+from . import spectra
 from .counters import Counters, one
 from .inputs import Kernel
 
@@ -54,7 +54,7 @@ def drop_non_finite(c: Contribution) -> Contribution:
     All contributions pass here on their way to the sink; whatever finds a density from which no weight
     follows makes the value NaN.
     """
-    lost = c.active & ~bsdf.is_finite(c.value * c.weight)
+    lost = c.active & ~spectra.is_finite(c.value * c.weight)
     return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))
 
 
@@ -82,7 +82,7 @@ def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool
     """
     if kernel.strategy_images or kernel.space is not None:
         return mi.Bool(True)
-    return ~(weight == 0) | ~bsdf.is_finite(value)
+    return ~(weight == 0) | ~spectra.is_finite(value)
 
 
 def foreseen(kernel: Kernel, c: Contribution) -> mi.Spectrum:
@@ -98,4 +98,4 @@ def foreseen(kernel: Kernel, c: Contribution) -> mi.Spectrum:
 
 def size_of(value: mi.Spectrum):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
-    return bsdf.brightest(value)
+    return spectra.brightest(value)

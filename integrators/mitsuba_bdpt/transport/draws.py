@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..host.introspection import children
+from .spectra import is_zero
 
 # Plugins whose sample() returns the density of the lobe that was picked, not that of pdf().
 # Plugins that are not Mitsuba's own are treated like them.
@@ -25,35 +26,29 @@ _SAMPLED_PDF_IS_PDF = frozenset(
     "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
 )
 
-# What is drawn by its parts if a blend is among them. Under bump and normal maps Mitsuba's draws are kept.
-_WRAPPERS = "TwoSidedBRDF", "MaskBSDF"
-
-# Plugins that say by a weight of 0 alone that they reject a direction: their density may be that of other
-# lobes, or sides are those of another frame. (Of other plugins a weight of 0 may mean that they are black.)
-_REJECT_BY_WEIGHT = "Principled", "PrincipledThin", "BumpMap", "NormalMap"
-
-# Ratio of two densities of one direction above which it was drawn by another one. (Rounding of half vectors
-# gives up to 1.1 with a roughness of 1e-3; a part that rejects has a density of 0, mostly.)
-_SAME = 2.0
+# Plugins inside of which there are other frames.
+MAPS = "BumpMap", "NormalMap"
 
 
 @dataclass
 class Draw:
     """A direction ``bs`` and its ``weight``, f |cos| over its density (or probability, if it is delta).
 
-    Where it was ``rejected`` there is none, whatever density is stated.
+    ``density``: that by which it was drawn (solid angle), `bs.pdf` but for what `_density` says. Where it was
+    ``rejected`` there is none, whatever is stated.
     """
 
     bs: mi.BSDFSample3f
     weight: mi.Spectrum
+    density: mi.Float
     rejected: mi.Bool
 
 
 def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active: mi.Bool) -> Draw:
     """What a BSDF draws in radiance mode where ``active``; ``u1`` picks the lobe, ``u2`` the direction.
 
-    ``bs.pdf`` is the density of ``bsdf.pdf()`` (solid angle), unless `needs_full_pdf`, or the probability of
-    a delta event.
+    ``bs.pdf`` is what Mitsuba's ``sample`` states, of a blend its ``pdf()`` (solid angle); or the probability
+    of a delta event.
     """
     if not by_parts(bsdf):
         return _by_mitsuba(bsdf, si, u1, u2, active)
@@ -61,56 +56,95 @@ def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active
 
 
 def by_parts(bsdf) -> bool:
-    """Whether `draw` asks the parts of a BSDF. (A pointer, of which any may be meant, has none.)"""
-    if not isinstance(bsdf, mi.BSDF):
+    """Whether `draw` asks the parts of a BSDF: a blend is among them.
+
+    Not under bump and normal maps, nor of a pointer, of which any may be meant: there draws are Mitsuba's.
+    """
+    if not isinstance(bsdf, mi.BSDF) or bsdf.class_name() not in _BY_PARTS:
         return False
-    kind = bsdf.class_name()
-    if kind in _WRAPPERS:
-        return any(by_parts(part) for part in children(bsdf).values())
-    return kind == "BlendBSDF"
+    return any(b.class_name() == "BlendBSDF" for b in nested([bsdf]))
 
 
 def _by_mitsuba(bsdf, si, u1, u2, active) -> Draw:
     bs, weight = bsdf.sample(mi.BSDFContext(), si, u1, u2, active)
-    return Draw(bs, weight, is_zero(weight))
+    return Draw(bs, weight, bs.pdf, is_zero(weight))
 
 
 def _blend(bsdf, si, u1, u2, active) -> Draw:
     """Of a ``blendbsdf``: one part draws, and where it does not reject, both are evaluated."""
-    parts, ctx = children(bsdf), mi.BSDFContext()
-    share = dr.clip(parts["weight"].eval_1(si, active), 0, 1)
-    second = u1 <= share
+    parts, share = children(bsdf), _share(bsdf, si, active)
+    second = u1 < share
     found = [
         _part(parts["bsdf_0"], si, (u1 - share) / (1 - share), u2, active & ~second),
         _part(parts["bsdf_1"], si, u1 / share, u2, active & second),
     ]
     mine = dr.select(second, found[1], found[0])
-    bs = mine.bs
-    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    value, pdf = bsdf.eval_pdf(ctx, si, bs.wo, active & ~mine.rejected & ~delta)
+    bs, delta = mine.bs, mi.has_flag(mine.bs.sampled_type, mi.BSDFFlags.Delta)
+    smooth = active & ~mine.rejected & ~delta
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo, smooth)
     bs.pdf = dr.select(delta, bs.pdf * dr.select(second, share, 1 - share), pdf)
-    rejected = mine.rejected | (bs.pdf == 0)
-    weight = dr.select(rejected, 0, dr.select(delta, mine.weight, value / pdf))
-    return Draw(bs, weight, rejected)
+    density = dr.select(delta, bs.pdf, _density(bsdf, si, bs.wo, pdf, smooth))
+    # A direction that is NaN has a density of 0; it is not rejected, but counted, as is a share that is NaN.
+    rejected = mine.rejected | ((density == 0) & ~dr.isnan(bs.wo.z))
+    weight = dr.select(rejected, 0, dr.select(delta, mine.weight, value / density))
+    return _unless_nan(share, Draw(bs, weight, density, rejected))
+
+
+def _share(bsdf, si, active) -> mi.Float:
+    """The share of a blend's second part, or that of what is masked."""
+    texture = children(bsdf)["weight" if bsdf.class_name() == "BlendBSDF" else "opacity"]
+    return dr.clip(texture.eval_1(si, active), 0, 1)
+
+
+def _unless_nan(share, found: Draw) -> Draw:
+    bad = dr.isnan(share)
+    return Draw(found.bs, dr.select(bad, dr.nan, found.weight), found.density, found.rejected & ~bad)
 
 
 def _part(bsdf, si, u1, u2, active) -> Draw:
     """What a part of a blend draws.
 
-    It is rejected on the side to which its lobe does not lead, and where the density that it states is not
-    its ``pdf()``; not by its weight: where a black part draws, the other one may be seen.
+    It is rejected on a side to which its lobe does not lead, and where its weight is 0 though it is not
+    black: where a black part draws, the other one may be seen.
     """
-    found, kinds = draw(bsdf, si, u1, u2, active), {b.class_name() for b in nested([bsdf])}
-    if by_parts(bsdf) or needs_full_pdf([bsdf]) or not kinds.isdisjoint(_REJECT_BY_WEIGHT):
+    found, cos_theta = draw(bsdf, si, u1, u2, active), mi.Frame3f.cos_theta
+    if by_parts(bsdf):
         return found
-    bs, cos_theta = found.bs, mi.Frame3f.cos_theta
+    bs = found.bs
     smooth = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    pdf = bsdf.pdf(mi.BSDFContext(), si, bs.wo, smooth)
-    # False for NaN.
-    rejected = (bs.pdf == 0) | (bs.pdf > _SAME * pdf) | (pdf > _SAME * bs.pdf)
-    through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
-    rejected |= cos_theta(si.wi) * cos_theta(bs.wo) * dr.select(through, 1, -1) > 0
-    return Draw(bs, found.weight, dr.select(smooth, rejected, found.rejected))
+    f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo, smooth)
+    rejected = is_zero(found.weight) & (~is_zero(f) | (pdf == 0) | (bs.sampled_type == 0))
+    if not any(b.class_name() in MAPS for b in nested([bsdf])):  # sides are those of another frame
+        side = cos_theta(si.wi) * cos_theta(bs.wo)  # false for NaN
+        rejected |= (side > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Reflection)
+        rejected |= (side < 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
+    return Draw(bs, found.weight, found.density, dr.select(smooth, rejected, found.rejected))
+
+
+def _density(bsdf, si, wo, pdf, active):
+    """The density by which a BSDF that states ``pdf`` draws the direction ``wo`` (solid angle).
+
+    From behind, a ``principled`` without transmission states a density, and draws nothing.
+    """
+    kind = bsdf.class_name()
+    if kind == "TwoSidedBRDF" or not any(_is_blind_behind(b) for b in nested([bsdf])):
+        return pdf
+    if _is_blind_behind(bsdf):
+        return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, pdf, 0)
+    if kind not in _BY_PARTS:  # a map
+        return pdf
+
+    def of(part):
+        return _density(part, si, wo, part.pdf(mi.BSDFContext(), si, wo, active), active)
+
+    parts, share = children(bsdf), _share(bsdf, si, active)
+    if kind == "MaskBSDF":
+        return share * of(parts["nested_bsdf"])
+    return (1 - share) * of(parts["bsdf_0"]) + share * of(parts["bsdf_1"])
+
+
+def _is_blind_behind(bsdf) -> bool:
+    return bsdf.class_name() == "Principled" and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
 
 
 def _two_sided(bsdf, si, u1, u2, active) -> Draw:
@@ -129,14 +163,14 @@ def _two_sided(bsdf, si, u1, u2, active) -> Draw:
 
 def _mask(bsdf, si, u1, u2, active) -> Draw:
     """Of a ``mask``: straight on, or what is masked."""
-    parts, straight_on = children(bsdf), dr.zeros(mi.BSDFSample3f)
-    opacity = dr.clip(parts["opacity"].eval_1(si, active), 0, 1)
+    opacity, straight_on = _share(bsdf, si, active), dr.zeros(mi.BSDFSample3f)
     seen = u1 < opacity
     straight_on.wo, straight_on.eta, straight_on.pdf = -si.wi, mi.Float(1), 1 - opacity
     straight_on.sampled_type = mi.UInt32(int(mi.BSDFFlags.Null))
-    found = draw(parts["nested_bsdf"], si, u1 / opacity, u2, active & seen)
-    found.bs.pdf = found.bs.pdf * opacity
-    return dr.select(seen, found, Draw(straight_on, mi.Spectrum(1), mi.Bool(False)))
+    found = draw(children(bsdf)["nested_bsdf"], si, u1 / opacity, u2, active & seen)
+    found.bs.pdf, found.density = found.bs.pdf * opacity, found.density * opacity
+    passing = Draw(straight_on, mi.Spectrum(1), 1 - opacity, mi.Bool(False))
+    return _unless_nan(opacity, dr.select(seen, found, passing))
 
 
 _BY_PARTS = {"BlendBSDF": _blend, "TwoSidedBRDF": _two_sided, "MaskBSDF": _mask}
@@ -151,11 +185,6 @@ def is_drawn_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
     if not any(b.class_name() == "RoughConductor" for b in nested(bsdfs)):
         return mi.Bool(False)
     return (mi.Frame3f.cos_theta(si.wi) <= 0) & dr.isnan(bs.wo.z)
-
-
-def is_zero(value: mi.Spectrum):
-    """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
-    return dr.all(mi.unpolarized_spectrum(value) == 0)
 
 
 def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:

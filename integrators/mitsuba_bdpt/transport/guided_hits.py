@@ -21,7 +21,7 @@ import mitsuba as mi
 from ..geometry import rays
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream
-from . import bsdf, mis, photon_guide, techniques
+from . import bsdf, mis, photon_guide, spectra, techniques
 from .counters import one
 from .inputs import Kernel
 from .walk import Side, Vertex, Walk, may_merge, newest_coefficient, not_finite, random_walk
@@ -129,7 +129,7 @@ def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
     side = Side(
         "camera",
         shared,
-        bsdf.brightest(walk.throughput),  # what delta events leave of it plays roulette
+        spectra.brightest(walk.throughput),  # what delta events leave of it plays roulette
         False,
         kernel.max_depth,
         kernel.kappa.splat,
@@ -151,7 +151,7 @@ def _begun(kernel: Kernel, z: Vertex, numbers: Stream, shared) -> Walk:
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
     throughput = dr.select(active, z.throughput * f.value / pdf, 0)
     broken = not_finite(active, throughput)
-    active &= (bsdf.brightest(throughput) > 0) & ~broken
+    active &= (spectra.brightest(throughput) > 0) & ~broken
     no, unit = mi.Bool(False), mi.Float(1)
     step = bsdf.Step(local, f.value, pdf, f.pdf_rev_w, z.cosine(d), no, no, unit)
     partial = mis.scatter(h, z.partial, newest_coefficient(kernel, kernel.kappa.splat, z.edges), step)

@@ -98,13 +98,12 @@ from ..media import flight
 from ..sampling.points import Points, Purpose, Stream
 from ..sensors.records import CameraStart
 from . import (
-    bsdf,
     contribution,
-    draws,
     guided_hits,
     isolated_light,
     merging,
     mis,
+    spectra,
     stored_vertices,
     techniques,
 )
@@ -331,7 +330,7 @@ def emission(kernel: Kernel, stream, shared):
 def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
     """A light subpath on its first edge; ``merges``: whether it asks for those of its vertices."""
     h = kernel.heuristic
-    active = ~draws.is_zero(e.weight) & (kernel.last_light >= 1)
+    active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
     active &= ~broken
     inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
@@ -369,7 +368,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
     return Side(
         "light",
         shared,
-        bsdf.brightest(walk.throughput),
+        spectra.brightest(walk.throughput),
         True,
         kernel.last_light,
         kernel.kappa.direct,
@@ -469,7 +468,7 @@ def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Si
     return Side(
         "camera",
         shared,
-        bsdf.brightest(walk.throughput),
+        spectra.brightest(walk.throughput),
         False,
         kernel.max_depth,
         kernel.kappa.splat,

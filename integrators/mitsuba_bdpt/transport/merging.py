@@ -28,7 +28,7 @@ import mitsuba as mi
 
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
-from . import bsdf, draws, mis
+from . import bsdf, mis, spectra
 from .aim import Aim
 from .columns import Columns
 from .contribution import Contribution, size_of
@@ -171,7 +171,7 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
     # Per area of the surface: what the disc receives, f |cos| being per solid angle.
     estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * dr.abs(dr.dot(z.si.n, photon.d))))
     value = z.throughput * f.value * estimate
-    active &= ~draws.is_zero(value)
+    active &= ~spectra.is_zero(value)
     light_side = h.scale(photon.older, f.pdf_fwd_w)
     # Of longer paths t = 0, the oldest alternative of the camera's side, makes none.
     older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)

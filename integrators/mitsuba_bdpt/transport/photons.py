@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points, Purpose
-from . import bsdf, mis
 from . import kernel as kernels
+from . import mis, spectra
 from .aim import Aim
 from .counters import Counters, one
 from .inputs import Kernel
@@ -123,7 +123,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out, photon) -> tuple[Any, int
 
     def visit(y, counters, walk):
         keep, found = photon(y, walk, lanes, aimed)
-        keep &= bsdf.is_finite(
+        keep &= spectra.is_finite(
             y.throughput
         )  # else all that are drawn with it would be NaN; the walk counts it
         place = dr.scatter_inc(kept, mi.UInt32(0), keep)

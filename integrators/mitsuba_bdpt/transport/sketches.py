@@ -19,7 +19,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from . import bsdf, scattering
+from . import bsdf, scattering, spectra
 
 # What is left of a guess on a side to which the BSDF does not scatter: shading normals and bumps may. (Error
 # with 0.0002 over that with 0.002: `cornell_box` 0.96, elsewhere the same.)
@@ -151,7 +151,8 @@ def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lob
     lobes = Lobes.plain()
     if alone:
         lobes.diffuse = (
-            bsdf.brightest(throughput * _intensity(scattering.evaluate(kernel, vertex, up, active))) * dr.pi
+            spectra.brightest(throughput * _intensity(scattering.evaluate(kernel, vertex, up, active)))
+            * dr.pi
         )
     if not kernel.traits.glossy:
         return lobes
@@ -164,9 +165,9 @@ def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lob
         shape = _shape(dr.square(1 + dr.abs(wi.z)) / dr.squared_norm(wi + up), width2)
         diffuse = dr.maximum(_intensity(f) - _intensity(mirror) * shape, 0)
         return Lobes(
-            bsdf.brightest(throughput * diffuse) * dr.pi,
+            spectra.brightest(throughput * diffuse) * dr.pi,
             dr.maximum(f.pdf_fwd_w - mirror.pdf_fwd_w * shape, 0) * dr.pi,
-            bsdf.brightest(throughput * _intensity(mirror)),
+            spectra.brightest(throughput * _intensity(mirror)),
             mi.Float(mirror.pdf_fwd_w),
             width2,
         )

@@ -19,7 +19,7 @@ from ..media import flight, transmittance
 from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraJoin, SensorHit
-from . import bsdf, draws, mis
+from . import bsdf, mis, spectra
 from .contribution import Contribution, foreseen, roulette, worth_a_ray
 from .counters import Counters, one
 from .inputs import Kernel
@@ -45,7 +45,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
     t = z.edges + 1
     active = sees_emitter(kernel, z)
     radiance = emitters.emitted(z.si, active)
-    active &= ~draws.is_zero(radiance)
+    active &= ~spectra.is_zero(radiance)
     # Area measure; of what is in the surroundings solid angle, and disk area: `Emitters.hit_densities`.
     pdf_connect, pdf_first, pdf_second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
@@ -101,7 +101,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
         active &= lit
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
     e = kernel.emitters.sample_direct(z.si, u, active)
-    return e, bsdf.Target(z.si.to_local(e.d), active & ~draws.is_zero(e.weight))
+    return e, bsdf.Target(z.si.to_local(e.d), active & ~spectra.is_zero(e.weight))
 
 
 def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
@@ -111,7 +111,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     value = z.throughput * f.value * e.weight
     if kernel.reverse:
         value = _known(value, e.emission_ratio)
-    active = active & ~draws.is_zero(value)
+    active = active & ~spectra.is_zero(value)
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
     older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
@@ -158,7 +158,7 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
     cos = dr.select(emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d)))
     geometry = cos / join.dist2
     value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
-    active &= ~draws.is_zero(value)
+    active &= ~spectra.is_zero(value)
     # s = 0: the camera hits the same point.
     ratio = join.pdf_w * geometry / emission.pdf_first
     light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
@@ -207,7 +207,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     to_area = y.cosine(join.d) / join.dist2
     estimate = polarization.extended(y.throughput, f.value, adjoint=True) * (join.importance / join.dist2)
     value = estimate * dr.rcp(kernel.count_light)
-    active = y.endpoint_active & ~draws.is_zero(value)
+    active = y.endpoint_active & ~spectra.is_zero(value)
 
     direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
     newest = newest_coefficient(kernel, direct, y.edges)
@@ -252,7 +252,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     if kernel.plan.hide_emitters:
         active &= walk.seen
     value = throughput * (z.importance * dr.rcp(kernel.count_light))
-    active &= ~draws.is_zero(value)
+    active &= ~spectra.is_zero(value)
 
     # (1,1) makes y_0 by emission, not by next-event estimation from z_0, and cannot make that of a beam.
     completing = dr.select(emission.beam, 0, emission.pdf_first)

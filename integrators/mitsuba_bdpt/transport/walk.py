@@ -19,7 +19,7 @@ from ..host import renamed
 from ..media import flight
 from ..sampling.points import Purpose
 from ..sensors.records import CameraJoin
-from . import bsdf, mis, scattering
+from . import bsdf, mis, scattering, spectra
 from .counters import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
@@ -200,7 +200,7 @@ def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3
 
     Whatever finds a density from which no weight follows makes the throughput NaN (`bsdf._step`, `_vertex`).
     """
-    finite = bsdf.is_finite(throughput)
+    finite = spectra.is_finite(throughput)
     for direction in directions:
         finite &= dr.isfinite(dr.sum(direction))
     return active & ~finite
@@ -381,7 +381,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
 
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
     eta = walk.eta * step.eta if kernel.refracts else 1
-    brightest = bsdf.brightest(throughput)
+    brightest = spectra.brightest(throughput)
     # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
