@@ -1,7 +1,7 @@
 """Try to break the renderer, and write what happened into a table.
 
     python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress*
-    python scripts/stress.py NAME ...    # some of them, printed
+    python scripts/stress.py NAME ...    # some of them, printed; with --write in the place of their rows
     python scripts/stress.py --list      # names of all
     python scripts/stress.py --same ../before/docs/reports/stress.json   # the same as that record?
 
@@ -186,6 +186,7 @@ def main(arguments=None) -> int:
     )
     text = "cases at a time; much of one is compiling kernels, on one core (default: %(default)s)"
     parser.add_argument("--jobs", type=number(int, 1), default=JOBS, help=text)
+    parser.add_argument("--write", action="store_true", help="put the rows of some cases into the record")
     parser.add_argument("--list", action="store_true", help="print the names of all cases")
     parser.add_argument(
         "--same", type=Path, metavar="RECORD", help="fail unless figures are those of a record"
@@ -209,6 +210,9 @@ def main(arguments=None) -> int:
         print("\n".join(changed) or f"{len(record)} cases as in {args.same}")
     elif not args.names:
         write(record)
+    elif args.write:
+        anew = {row["name"]: row for row in record}
+        write([anew.get(row["name"], row) for row in json.loads(RECORD.read_text())])
     return 1 if changed or any(row["ok"] is False for row in record) else 0
 
 

@@ -17,6 +17,7 @@ SECTIONS = (
     "non_finite_shapes",
     "bad_input",
     "processes",
+    "by_chance",
 )
 
 

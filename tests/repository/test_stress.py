@@ -90,3 +90,25 @@ def test_other_figures_are_seen(tmp_path, monkeypatch, capsys):
         record.write_text(json.dumps([{"name": name, "happened": before}]))
         assert stress.main([name, "--same", str(record)]) == status
     assert "before: means" in capsys.readouterr().out
+
+
+def test_rows_of_some_cases_are_written(monkeypatch, tmp_path):
+    """``--write`` puts the rows of the named cases in the place of theirs, and leaves all others.
+
+    The page and the tables are of the new record.
+    """
+    for name in ("RECORD", "PAGE", "TABLES"):
+        copy = tmp_path / getattr(stress, name).name
+        copy.write_text(getattr(stress, name).read_text())
+        monkeypatch.setattr(stress, name, copy)
+    monkeypatch.setattr(stress, "apart", lambda name: stress.Outcome(True, "anew"))
+    before = json.loads(stress.RECORD.read_text())
+    chosen = before[3]["name"]
+    assert stress.main([chosen]) == 0
+    assert json.loads(stress.RECORD.read_text()) == before
+    assert stress.main(["--write", chosen]) == 0
+    after = json.loads(stress.RECORD.read_text())
+    assert [row["happened"] for row in after] == [
+        "anew" if row["name"] == chosen else row["happened"] for row in before
+    ]
+    assert stress.TABLES.read_text() == stress.page(after)
