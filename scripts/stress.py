@@ -195,6 +195,8 @@ def main(arguments=None) -> int:
     args = parser.parse_args(arguments)
     if unknown := {*args.names, *filter(None, [args.here])} - set(known):
         parser.error(f"no case is named {sorted(unknown)}; --list shows all")
+    if args.write and (args.same is not None or not args.names):
+        parser.error("--write is for some cases by NAME, and not with --same")
     if args.list:
         print("\n".join(known))
         return 0
@@ -211,8 +213,8 @@ def main(arguments=None) -> int:
     elif not args.names:
         write(record)
     elif args.write:
-        anew = {row["name"]: row for row in record}
-        write([anew.get(row["name"], row) for row in json.loads(RECORD.read_text())])
+        rows = {row["name"]: row for row in [*json.loads(RECORD.read_text()), *record]}
+        write([rows[name] for name in known if name in rows])
     return 1 if changed or any(row["ok"] is False for row in record) else 0
 
 

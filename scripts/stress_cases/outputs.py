@@ -303,4 +303,5 @@ def read_only_disk() -> Outcome:
         ok = status == 1 and text.startswith("error: ") and rendered and same
         left = [path.name for path in folder.rglob("*.tmp")]
         said = re.sub(r"\.\d+\.tmp", ".tmp", text.strip().replace(str(folder), "DISK"))
+        said = re.sub(r"(the image is) '.*?'", r"\1 'COPY'", said)
         return Outcome(ok and not left, f"status {status}, {said[:120]}, former image there: {same}")

@@ -13,7 +13,15 @@ import numpy as np
 import mitsuba as mi  # isort: skip
 
 # BSDFs that transmit, or let pass: none for a two-sided one, and none for lamps.
-_TRANSMIT = ("dielectric", "hair", "principledthin", "mask", "spec_trans", "null")
+_TRANSMIT = (
+    "dielectric",
+    "thindielectric",
+    "roughdielectric",
+    "principledthin",
+    "hair",
+    "mask",
+    "spec_trans",
+)
 _DEPTH = 3  # nested BSDFs
 
 
@@ -110,7 +118,7 @@ class Generator:
     def _opaque(self, depth=0, maps=True) -> str:
         """A BSDF that a ``twosided`` takes."""
         found = self.bsdf(depth, maps)
-        while any(word in found for word in (*_TRANSMIT, "twosided")):
+        while any(f'="{word}' in found for word in (*_TRANSMIT, "twosided")):
             found = self.bsdf(depth, maps)
         return found
 

@@ -112,3 +112,4 @@ def test_rows_of_some_cases_are_written(monkeypatch, tmp_path):
         "anew" if row["name"] == chosen else row["happened"] for row in before
     ]
     assert stress.TABLES.read_text() == stress.page(after)
+    assert stress.summary(after) in stress.PAGE.read_text()

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport import draws
 from . import endpoints, oracle
 from .scenes import has_media
 
@@ -201,7 +202,7 @@ def _scatter(si, d, delta: bool, i: int):
     ctx, bsdf, wo = mi.BSDFContext(), si.bsdf(), si.to_local(_vector(d))
     to_light = to_camera = turned = 1.0
     if delta:
-        wo, value, turned = _lobe(ctx, bsdf, si, wo, i)
+        wo, value, turned = _lobe(bsdf[0], si, wo, i)
     else:
         back = mi.SurfaceInteraction3f(si)
         back.wi = wo
@@ -214,9 +215,10 @@ def _scatter(si, d, delta: bool, i: int):
     return _Event(value, to_light, to_camera, *(float(x[0]) for x in cosines), turned), out
 
 
-def _lobe(ctx, bsdf, si, wo, i: int):
+def _lobe(bsdf, si, wo, i: int):
     """Direction and weight of the delta lobe that leads along ``wo``."""
-    bs, weight = bsdf.sample(ctx, si, mi.Float(LOBES), mi.Point2f(0.5))
+    found = draws.draw(bsdf, si, mi.Float(LOBES), mi.Point2f(0.5), mi.Bool(True))
+    bs, weight = found.bs, found.weight
     leads = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (dr.dot(bs.wo, wo) > SAME_DIRECTION)
     turned = _turned(si, bs)
     dr.eval(bs.wo, weight, leads, turned)

@@ -296,7 +296,7 @@ def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
 
 @dataclass
 class _Drawn:
-    """What Mitsuba's sample ``bs`` of a BSDF is, in radiance mode.
+    """What a BSDF draws (`draws.draw`), ``bs`` in radiance mode.
 
     Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is
     no ``pdf_rev_w``), if `_asks_back` the weight ``back`` of a delta event made from its other end, 0 if it
@@ -321,7 +321,7 @@ class _Drawn:
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
-    """A direction that Mitsuba's ``sample`` draws, with its densities both ways, in one virtual call."""
+    """A direction that a BSDF draws, with its densities both ways, in one virtual call."""
 
     def ask(self, si, u1, u2, active):
         ctx, found = mi.BSDFContext(), draws.draw(self, si, u1, u2, active)
@@ -332,7 +332,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         pdf_fwd_w = bs.pdf
         if traits.full_pdf:
             meant = [self] if isinstance(self, mi.BSDF) else traits.asked.bsdfs  # a pointer may be any
-            behind = draws.is_drawn_from_behind(meant, si, bs)
+            behind = draws.none_from_behind(meant, si, bs)
             weight, found.rejected = dr.select(behind, 0, weight), found.rejected | behind
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)

@@ -93,7 +93,8 @@ def _blend(bsdf, si, u1, u2, active) -> Draw:
 def _share(bsdf, si, active) -> mi.Float:
     """The share of a blend's second part, or that of what is masked."""
     texture = children(bsdf)["weight" if bsdf.class_name() == "BlendBSDF" else "opacity"]
-    return dr.clip(texture.eval_1(si, active), 0, 1)
+    share = texture.eval_1(si, active)
+    return dr.select(dr.isnan(share), share, dr.clip(share, 0, 1))
 
 
 def _unless_nan(share, found: Draw) -> Draw:
@@ -104,8 +105,8 @@ def _unless_nan(share, found: Draw) -> Draw:
 def _part(bsdf, si, u1, u2, active) -> Draw:
     """What a part of a blend draws.
 
-    It is rejected on a side to which its lobe does not lead, and where its weight is 0 though it is not
-    black: where a black part draws, the other one may be seen.
+    It is rejected on a side to which its lobe (if it tells) does not lead, and where its weight is 0 though
+    it is not black: where a black part draws, the other one may be seen.
     """
     found, cos_theta = draw(bsdf, si, u1, u2, active), mi.Frame3f.cos_theta
     if by_parts(bsdf):
@@ -116,8 +117,10 @@ def _part(bsdf, si, u1, u2, active) -> Draw:
     rejected = is_zero(found.weight) & (~is_zero(f) | (pdf == 0) | (bs.sampled_type == 0))
     if not any(b.class_name() in MAPS for b in nested([bsdf])):  # sides are those of another frame
         side = cos_theta(si.wi) * cos_theta(bs.wo)  # false for NaN
-        rejected |= (side > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Reflection)
-        rejected |= (side < 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Transmission)
+        reflects, passes = (
+            mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
+        )
+        rejected |= ((side > 0) & passes & ~reflects) | ((side < 0) & reflects & ~passes)
     return Draw(bs, found.weight, found.density, dr.select(smooth, rejected, found.rejected))
 
 
@@ -176,11 +179,11 @@ def _mask(bsdf, si, u1, u2, active) -> Draw:
 _BY_PARTS = {"BlendBSDF": _blend, "TwoSidedBRDF": _two_sided, "MaskBSDF": _mask}
 
 
-def is_drawn_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
+def none_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
     """Mask: no direction was drawn, since ``si`` is seen from behind a rough conductor of ``bsdfs``.
 
-    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0, which is NaN once multiplied by
-    the density. No other BSDF of Mitsuba's does: NaN of others is counted.
+    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0, which Mitsuba's blend multiplies
+    by the density, NaN. No other BSDF of Mitsuba's does: NaN of others is counted.
     """
     if not any(b.class_name() == "RoughConductor" for b in nested(bsdfs)):
         return mi.Bool(False)
