@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mitsuba_bdpt.measure.agreement import SIGNIFICANCE, TILES, Sample, sidak, tile_means, welch
+from mitsuba_bdpt.measure.agreement import SIGNIFICANCE, TILES, Difference, Sample, sidak, tile_means, welch
 from scipy import stats
 
 import mitsuba as mi  # isort: skip
@@ -58,6 +58,15 @@ class Judged(Outcome):
     seen: float = 0.0
 
 
+def smallest_seen(found: Difference, mean: float) -> float:
+    """The relative error of the image's mean, in the last column, that is found with a chance of one half.
+
+    At `LEVEL` after Sidak's correction for all columns.
+    """
+    level = -np.expm1(np.log1p(-LEVEL) / len(found.p))
+    return float(stats.t.isf(level / 2, found.freedom[-1]) * found.error[-1] / abs(mean))
+
+
 def judged(ours, theirs: Sample, reach: float, what: str) -> Judged:
     """Welch's test of the tiles of ``ours``, Sidak over them.
 
@@ -68,8 +77,7 @@ def judged(ours, theirs: Sample, reach: float, what: str) -> Judged:
     found = welch(ours, theirs)
     p = sidak(found.p)
     mean, expected = ours.mean[-1], theirs.mean[-1]
-    level = -np.expm1(np.log1p(-LEVEL) / len(found.p))  # of each of them
-    seen = stats.t.isf(level / 2, found.freedom[-1]) * found.error[-1] / abs(expected)
+    seen = smallest_seen(found, expected)
     ok = np.isfinite(ours.mean).all() and p >= LEVEL and seen <= reach
     text = f"mean {mean:.5g}, {what} {expected:.5g}; p = {p:.2g} over {len(found.p)} values; "
     return Judged(bool(ok), f"{text}sees errors of {100 * seen:.2g} %", p, seen)

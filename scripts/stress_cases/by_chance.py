@@ -23,7 +23,7 @@ import mitsuba as mi  # isort: skip
 
 from mitsuba_bdpt.transport import bsdf, spectra
 
-from .agreement import LEVEL, tiles
+from .agreement import LEVEL, smallest_seen, tiles
 from .case import Outcome, of_section
 from .random_files import Generator, write_assets
 
@@ -76,9 +76,8 @@ def _differ(ours, theirs) -> Difference:
     beyond = np.maximum(np.abs(found.value) - allowed, 0)
     with np.errstate(all="ignore"):
         p = np.where(found.p < 1, 2 * stats.t.sf(np.nan_to_num(beyond / found.error), found.freedom), 1.0)
-    level = -np.expm1(np.log1p(-LEVEL) / len(p))
-    seen = OF_IMAGE + stats.t.isf(level / 2, found.freedom[-1]) * found.error[-1] / mean
-    return Difference(min(sidak(np.minimum(p, 1)), 1.0), float((beyond / mean).max()), float(seen))
+    seen = OF_IMAGE + smallest_seen(found, mean)
+    return Difference(min(sidak(np.minimum(p, 1)), 1.0), float((beyond / mean).max()), seen)
 
 
 def _compared(scene, plain, spp: int, first_seed: int) -> dict[str, Difference]:

@@ -23,6 +23,22 @@ def blend(a, b, weight=0.5):
     return {"type": "blendbsdf", "weight": weight, "a": a, "b": b}
 
 
+def above_a_floor(origin, size, floor, **more):
+    """A camera at ``origin`` that looks at the middle of a floor, a square of twice this ``size``."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera(origin=origin, target=(0, 0, 0), fov=30, size=16),
+            "floor": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(size),
+                "bsdf": floor,
+            },
+            **more,
+        }
+    )
+
+
 def images(scene, spp, **parameters):
     """Images of all strategies, one per seed, and the layers' names."""
     bdpt = mi.load_dict({"type": "bdpt", "skip": "none", "rr_depth": 100, **parameters})
@@ -40,18 +56,7 @@ def test_a_mirror_in_a_blend(wrapped):
     """
     floor = blend(MATTE, {"type": "conductor", "material": "none"}, 0.4)
     floor = {"type": "twosided", "nested": floor} if wrapped else floor
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": camera(origin=(0, 3, 3), target=(0, 0, 0), fov=30, size=16),
-            "floor": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(100),
-                "bsdf": floor,
-            },
-            "sky": {"type": "constant"},
-        }
-    )
+    scene = above_a_floor((0, 3, 3), 100, floor, sky={"type": "constant"})
     for parameters in ({}, {"skip": "auto"}):
         found, _ = images(scene, 64, max_depth=3, **parameters)
         assert_agree(compare_known(tiles(found[..., :3]), 0.7))
@@ -66,19 +71,9 @@ def test_every_strategy_through_a_blend_from_behind():
     the one of next-event estimation, and the image with `path`. Statistic: Welch's t-test of means over the
     image, 8 seeds.
     """
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": camera(origin=(0, 1.2, 4), target=(0, 0, 0), fov=30, size=16),
-            "floor": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(2),
-                "bsdf": MATTE,
-            },
-            "ball": {"type": "sphere", "center": [0, 1, 0], "radius": 0.5, "bsdf": blend(FROSTED, MATTE)},
-            "light": {"type": "point", "position": [0, 1, 0], "intensity": 5.0},
-        }
-    )
+    ball = {"type": "sphere", "center": [0, 1, 0], "radius": 0.5, "bsdf": blend(FROSTED, MATTE)}
+    light = {"type": "point", "position": [0, 1, 0], "intensity": 5.0}
+    scene = above_a_floor((0, 1.2, 4), 2, MATTE, ball=ball, light=light)
     found, names = images(scene, 256, max_depth=3, strategy_images=True)
     layers = found[..., found.shape[-1] - len(names) :].mean((1, 2))
 
