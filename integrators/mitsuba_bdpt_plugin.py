@@ -4,6 +4,7 @@ Mitsuba does so for everybody who has the package, whichever variant they use. W
 used (no LLVM library, for example) that must not cost them Mitsuba: who loads the plugin is told why.
 """
 
+from importlib import import_module
 from typing import NoReturn
 
 __all__ = ["register"]
@@ -27,6 +28,8 @@ def _register_refusal(error: ImportError) -> None:
         if mi.variant() is not None:
             mi.register_integrator("bdpt", refuse)
 
+    # Mitsuba's parser queries the type of every plugin in this variant.
+    import_module("mitsuba.scalar_rgb").register_integrator("bdpt", refuse)
     mi.detail.add_variant_callback(register_variant)
     register_variant()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import wraps
+from importlib import import_module
 
 import drjit as dr
 import mitsuba as mi
@@ -308,7 +309,10 @@ def _class_of_variant():
 
 
 def register():
-    """Register the plugin ``bdpt`` for the current variant and for all that are set later."""
+    """Register the plugin ``bdpt`` for the current variant, for all that are set later, and for scalar_rgb.
+
+    Mitsuba's parser queries the type of every plugin in scalar_rgb, whatever the current variant.
+    """
 
     def register_variant(old=None, new=None):
         variant = mi.variant()
@@ -317,5 +321,7 @@ def register():
         _classes[variant] = _class_of_variant()
         mi.register_integrator("bdpt", lambda props, v=variant: _classes[v](props))
 
+    scalar = import_module("mitsuba.scalar_rgb")
+    scalar.register_integrator("bdpt", lambda props: check_variant("scalar_rgb"))
     mi.detail.add_variant_callback(register_variant)
     register_variant()

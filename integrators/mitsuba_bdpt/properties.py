@@ -235,9 +235,9 @@ def _check_together(settings: Settings):
         )
 
 
-def check_variant():
-    """Raise ``UnsupportedError`` for variants that the method cannot serve, or is not known to."""
-    variant = mi.variant() or "none"
+def check_variant(variant: str | None = None):
+    """Raise ``UnsupportedError`` for a variant (default: the current one) that is scalar or untested."""
+    variant = variant or mi.variant() or "none"
     if variant.startswith("scalar"):
         raise UnsupportedError(
             f"the variant {variant} is scalar; use a vectorised one, for example "
