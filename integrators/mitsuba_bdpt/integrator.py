@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
 from .errors import UnsupportedError, UsageTypeError
+from .host import tracebacks
 from .host.notices import warn_once
 from .image.features import feature_names
 from .image.layers import layer_names
@@ -254,9 +255,9 @@ class BDPTIntegrator:
     def sample(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""
         raise UnsupportedError(
-            "cannot be nested in another integrator (aov, moment, stokes): light subpaths "
-            "reach pixels other than their own; render with bdpt itself, which has parameters aovs and "
-            "stokes (the command's --integrator bdpt takes those of aov and stokes over)"
+            "cannot be nested in another integrator (aov, moment, stokes): light subpaths contribute to "
+            "pixels other than their own; render with bdpt itself and its parameters aovs, variance (for "
+            "moment) and stokes (the command's --integrator bdpt takes those of aov and stokes over)"
         )
 
     def render_forward(self, *args, **kwargs):
@@ -311,7 +312,8 @@ def _class_of_variant():
 def register():
     """Register the plugin ``bdpt`` for the current variant, for all that are set later, and for scalar_rgb.
 
-    Mitsuba's parser queries the type of every plugin in scalar_rgb, whatever the current variant.
+    Mitsuba's parser queries the type of every plugin in scalar_rgb, whatever the current variant. Tracebacks
+    of ``mi.render`` end with the message of the plugin, see `tracebacks`.
     """
 
     def register_variant(old=None, new=None):
@@ -325,3 +327,4 @@ def register():
     scalar.register_integrator("bdpt", lambda props: check_variant("scalar_rgb"))
     mi.detail.add_variant_callback(register_variant)
     register_variant()
+    tracebacks.install()
