@@ -207,7 +207,7 @@ def _full_image(folder: Path, keywords: dict) -> list[str]:
     former = {kind: (folder / f"a.{kind}").read_bytes() for kind in ("exr", "png")}
     for size in (60, 90, 120, 400):
         done = child.command(*arguments, "-D", f"size={size}", **keywords)
-        if done.returncode != 1 or not done.stderr.startswith("error: "):
+        if done.returncode != 1 or "error: " not in done.stderr:
             wrong.append(f"{size}: status {done.returncode}, {done.stderr[-120:]}")
         for kind, data in former.items():
             if (folder / f"a.{kind}").read_bytes() != data:
@@ -300,7 +300,7 @@ def read_only_disk() -> Outcome:
         with mock.patch.object(render, "write_images", write):
             status, text, rendered = _said([scene, "-o", output, "--spp", 2, "--checkpoint", 0])
         same = _listing(folder).items() >= before.items()
-        ok = status == 1 and text.startswith("error: ") and rendered and same
+        ok = status == 1 and "error: " in text and rendered and same
         left = [path.name for path in folder.rglob("*.tmp")]
         said = re.sub(r"\.\d+\.tmp", ".tmp", text.strip().replace(str(folder), "DISK"))
         said = re.sub(r"(the image is) '.*?'", r"\1 'COPY'", said)

@@ -259,7 +259,7 @@ def test_a_full_disk_is_said_with_the_file_and_a_remedy(capsys, monkeypatch):
     monkeypatch.setattr(render, "write_images", full)
     assert main([*SMALL, "--spp", "4", "-o", "a.exr"]) == 1
     said = capsys.readouterr().err
-    assert said.startswith("error: 'a.exr': No space left on device; free some space")
+    assert "\nerror: 'a.exr': No space left on device; free some space" in said
 
 
 def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_path):
@@ -278,9 +278,7 @@ def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_p
     (rescued,) = tmp_path.glob("mitsuba-bdpt-*/a.exr")
     assert rendered.image(rescued, "RGB")[0].shape == (16, 16, 3)
     said = capsys.readouterr().err
-    assert (
-        said.startswith("error: 'a.exr': No such file") and f"the image is {str(rescued)!r} instead" in said
-    )
+    assert "\nerror: 'a.exr': No such file" in said and f"the image is {str(rescued)!r} instead" in said
 
 
 def test_a_scheduler_that_does_not_answer_is_said_soon(capsys):

@@ -99,7 +99,7 @@ mi.register_integrator("cli_passes", Passes)
 
 def test_writes_exr_and_png_with_one_closing_line(scene, capsys):
     """Environment of radiance 2: every pixel of the EXR is 2, of the PNG white."""
-    assert main(["render", str(scene), "-o", "new/image.exr"]) == 0
+    assert main(["render", str(scene), "--integrator", "scene", "-o", "new/image.exr"]) == 0
     pixels, header = read("new/image.exr")
     assert pixels.shape == (4, 6, 3) and pixels.dtype == np.float32
     np.testing.assert_allclose(pixels, 2.0, rtol=1e-6)
@@ -120,7 +120,7 @@ def test_default_output_and_no_leftovers(scene):
 def test_definitions_seed_spp_and_exposure(scene):
     """-Dlight=0.25 with one stop more is 0.5 linear, 187.5 in 8-bit sRGB; Mitsuba dithers."""
     arguments = ["-Dlight=0.25", "--spp", "2", "--seed", "7", "--exposure", "1", "-o", "a.exr"]
-    assert main(["render", str(scene), *arguments]) == 0
+    assert main(["render", str(scene), "--integrator", "scene", *arguments]) == 0
     pixels, header = read("a.exr")
     np.testing.assert_allclose(pixels, 0.25, rtol=1e-6)
     assert np.all(np.isin(np.array(mi.Bitmap("a.png")), [187, 188]))
@@ -489,7 +489,7 @@ MISTYPED = [
     (["-Dlight=abc"], '-D light=abc: could not parse RGB value "abc", in'),
     (["-Dlight=abc", "-Dformat=abc"], '-D light=abc or -D format=abc: could not parse RGB value "abc", in'),
     (["--integrator", ""], "integrator='' names no integrator"),
-    (["-Dintegrator=pth"], 'Plugin "pth" not found! Did you mean path?'),
+    (["-Dintegrator=pth", "--integrator", "scene"], 'Plugin "pth" not found! Did you mean path?'),
     (["-Dlihgt=1"], "-D lihgt: no parameter of the scene; it has integrator=path, format=float32, light=2"),
     (["-Dlihgt=1"], "; did you mean light?"),
     (["-Dprat=1"], "it has integrator=path, format=float32, light=2, width, part=3; did you mean part?"),
@@ -534,7 +534,11 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
 @pytest.mark.parametrize(
     ("change", "arguments", "words"),
     [
-        ((), ["-P", "foo=1", "-P", "bar=x"], "-P foo, -P bar: no parameter of the integrator path; leave"),
+        (
+            (),
+            ["-P", "foo=1", "-P", "bar=x", "--integrator", "scene"],
+            "-P foo, -P bar: no parameter of the integrator path; leave",
+        ),
         ((), ["-m", "LLVM_AD_RGB"], "; did you mean llvm_ad_rgb?"),
         ((), ["-o", "/proc/none/a.exr"], "output='/proc/none/a.exr' cannot be written (No such file"),
         ((), ["-o", "plain.xml/a.exr"], "name another with -o"),
@@ -556,7 +560,7 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
                 'type="$integrator">',
                 'type="aov"><string name="aovs" value="a:depth"/><integrator type="bdpt">',
             ),
-            ["-P", "aovs=b:depth"],
+            ["-P", "aovs=b:depth", "--integrator", "scene"],
             "the command's --integrator bdpt takes those of aov and stokes over",
         ),
     ],
@@ -573,7 +577,7 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
     assert main(["render", str(scene), *arguments]) == 1
     error = capsys.readouterr().err
     words = re.escape(words.replace("{folder}", str(scene.parent))).replace(r"\.\*", ".*")
-    assert error.startswith("error: ") and re.search(words, error), error
+    assert "error: " in error and re.search(words, error), error
 
 
 @pytest.mark.parametrize(
@@ -701,19 +705,53 @@ def test_script_is_the_command(scene):
     assert Path("a.exr").exists() and Path("a.png").exists()
 
 
-def test_whose_integrator_renders_is_said(scene, capsys):
+@pytest.mark.parametrize(
+    ("arguments", "used", "line"),
+    [
+        (
+            [],
+            "bdpt",
+            "bdpt in place of the scene file's path, with its max_depth=3, hide_emitters=False; --integrator",
+        ),
+        (["-P", "max_depth=2"], "bdpt", "bdpt in place of the scene file's path, with its hide_emitters=F"),
+        (["-Dintegrator=bdpt"], "bdpt", "bdpt, the scene file's own"),
+        (["--integrator", "scene"], "path", "path, the scene file's own"),
+        (["--integrator", "scene", "-Dintegrator=bdpt"], "bdpt", "bdpt, the scene file's own"),
+        (["--integrator", "path"], "path", "path, the scene file's own"),
+        (["--integrator", "volpath"], "volpath", "volpath in place of the scene file's path, with its max"),
+    ],
+)
+def test_bdpt_renders_unless_the_command_line_says_otherwise(scene, capsys, arguments, used, line):
     """Rationale: nearly all scene files ask for `path`, and who has installed bdpt takes the image for its.
 
-    Expected: a note where the file's integrator has rendered, none where one was asked for or it is bdpt.
+    Expected: `bdpt` with the path tracer's parameters, any other only by ``--integrator``; the first line
+    says which one it is, and how the file's own is had.
     """
-    note = "the scene's file asks for PathIntegrator, which rendered it; --integrator bdpt takes bdpt"
-    for arguments, is_noted in (
-        ([], True),
-        (["--integrator", "path"], False),
-        (["-Dintegrator=bdpt"], False),
-    ):
-        assert main(["render", str(scene), *arguments]) == 0
-        assert (note in capsys.readouterr().err) == is_noted
+    assert main(["render", str(scene), "-o", "a.exr", *arguments]) == 0
+    assert capsys.readouterr().err.startswith(f"integrator: {line}")
+    assert ("rays" in json.loads(read("a.exr")[1]["bdptStatistics"])) == (used == "bdpt")
+
+
+def test_parameters_of_bdpt_in_the_scene_file_count(scene):
+    """Expected: by default and by ``--integrator scene``, other parameters than a path tracer's too."""
+    text = SCENE.replace(
+        '<integer name="max_depth"', '<string name="skip" value="none"/><integer name="max_depth"'
+    )
+    scene.write_text(text)
+    for arguments in ([], ["--integrator", "scene"], ["--integrator", "bdpt"]):
+        settings = loaded(scene, "-Dintegrator=bdpt", *arguments).settings
+        assert (settings.skip, settings.max_depth) == ("none", 3)
+
+
+def test_what_bdpt_cannot_replace_is_rendered_by_the_files_own(around, capsys):
+    """Rationale: `moment` around a path tracer rendered before bdpt was the default. Expected: an error that
+    names the option with which it does."""
+    around.write_text(around.read_text().replace('type="aov">', 'type="moment">', 1))
+    assert main(["render", str(around), "-o", "a.exr"]) != 0
+    assert "own by --integrator scene" in capsys.readouterr().err
+    text = around.read_text().replace('<string name="aovs" value="dd:depth, nn:sh_normal"/>', "")
+    around.write_text(text)
+    assert main(["render", str(around), "--integrator", "scene", "-o", "a.exr"]) == 0
 
 
 def test_a_pipe_that_closes_ends_explain_quietly(scene, monkeypatch, capsys):
@@ -736,9 +774,6 @@ def test_explain(scene, capsys):
     assert main(["explain", str(scene), "-P", "max_depth=1", "-Dlight=3"]) == 0
     said = capsys.readouterr().out
     assert "used: s=0" in said and "max_depth=1 allows no such path" in said and "no pilot" in said
-    assert said.endswith(
-        "the scene's file asks for path: render needs --integrator bdpt to do as said here\n"
-    )
     assert main(["explain", str(scene), "-P", "max_depth=oops"]) == 1
     assert "max_depth" in capsys.readouterr().err
     assert list(scene.parent.iterdir()) == [scene]

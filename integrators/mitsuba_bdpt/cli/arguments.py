@@ -184,8 +184,11 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--parts", type=number(int, 1), metavar="N", help=text)
     text = "add a denoised image as a layer, which the PNG then shows (extra [denoise]); the raw one stays"
     add("--denoise", action="store_true", help=text)
-    text = "replace the scene's integrator, keeping depth, hide_emitters, timeout, layers of aov"
-    add("--integrator", metavar="TYPE", help=text)
+    text = (
+        "integrator to render with, or scene for the scene file's own; it takes over the file's max_depth, "
+        "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
+    )
+    add("--integrator", default="bdpt", metavar="TYPE", help=text)
     add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
     text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
     add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)

@@ -169,4 +169,5 @@ def _loaded(job: str):
     """Options, scene and integrator of a `_job`; a worker loads them once."""
     options = Namespace(**json.loads(job))
     options.scene, options.append = Path(options.scene), [Path(folder) for folder in options.append]
-    return options, *load(options)
+    scene, integrator, _ = load(options)
+    return options, scene, integrator

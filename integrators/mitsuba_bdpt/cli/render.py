@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.images import check_channels, check_png, prepare_output, write_images
-from ..files.loading import check_file, choose_sensor, load, own_integrator
+from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..host.versions import versions
 from ..progress import display, readable
 from ..run.rendering import PassReport
@@ -59,12 +59,14 @@ def run(options: Namespace) -> int:
             for job in jobs:
                 prepare_output(job.output)
                 check_options(job)
-            scene, integrator = loaded(options)
+            scene, integrator, used = loaded(options)
             check_integrator(options, integrator)
             for job in jobs:
                 film = choose_sensor(scene, job.sensor).film()
                 check_png(film)
                 check_channels(film, integrator.aov_names())
+                samples_per_pixel(scene, job)
+            print(f"integrator: {used}", file=sys.stderr)
             for job in jobs:
                 if not render_job(scene, integrator, job, ending):
                     return ending.status
@@ -75,16 +77,6 @@ def run(options: Namespace) -> int:
             print(f"error: {in_words(error)}", file=sys.stderr)
             return 1
     return 0
-
-
-def note_integrator(options: Namespace, integrator: mi.Integrator) -> None:
-    """Say on standard error that it was not ``bdpt`` that rendered, where nobody has asked for another."""
-    if options.integrator is None and not hasattr(integrator, "assemble"):
-        own = integrator.class_name()
-        print(
-            f"note: the scene's file asks for {own}, which rendered it; --integrator bdpt takes bdpt",
-            file=sys.stderr,
-        )
 
 
 def jobs_of(options: Namespace) -> list[Namespace]:
@@ -105,7 +97,7 @@ def jobs_of(options: Namespace) -> list[Namespace]:
     ]
 
 
-def loaded(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+def loaded(options: Namespace) -> Loaded:
     """`load`, with what holds for the whole process: how much is logged, and the number of threads."""
     if options.verbose:
         levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
@@ -122,10 +114,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
 
     Once rendered, it is written whatever signals come, and only then a checkpoint is removed.
     """
-    sensor = choose_sensor(scene, job.sensor)
-    spp = UNLIMITED_SPP if is_open_ended(job) else job.spp or sensor.sampler().sample_count()
-    if not spp:
-        raise CommandError("The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N.")
+    sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
     outcome = render(scene, integrator, job, spp)
     ending.patient = True
     try:
@@ -135,13 +124,22 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
         attributes = {"bdptSettings": settings(job, spp), "bdptStatistics": report(outcome)}
         write(sensor.film(), job, attributes)
         outcome.written()
-        note_integrator(job, integrator)
         say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
     finally:
         ending.patient = False
     if outcome.error is not None:
         raise outcome.error
     return not outcome.interrupted and not ending.asked
+
+
+def samples_per_pixel(scene: mi.Scene, job: Namespace) -> int:
+    """Samples per pixel of a job, at most; raises ``CommandError`` if there are none."""
+    if is_open_ended(job):
+        return UNLIMITED_SPP
+    spp = job.spp or choose_sensor(scene, job.sensor).sampler().sample_count()
+    if not spp:
+        raise CommandError("The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N.")
+    return spp
 
 
 def is_open_ended(options: Namespace) -> bool:
@@ -179,12 +177,10 @@ def say(line: str) -> None:
 def explain(options: Namespace) -> int:
     """Print what a render as the command line `options` say would do, and return the exit status."""
     try:
-        scene, integrator = loaded(options)
+        scene, integrator, _ = loaded(options)
         sensor = choose_sensor(scene, options.sensor)
         spp = options.spp or sensor.sampler().sample_count()
         say(integrator.explain(scene, sensor, spp))
-        if (own := own_integrator(options.scene, dict(options.defines))) not in (None, "bdpt"):
-            say(f"the scene's file asks for {own}: render needs --integrator bdpt to do as said here")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

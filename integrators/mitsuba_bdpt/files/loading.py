@@ -8,6 +8,7 @@ import re
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
 import mitsuba as mi
@@ -15,6 +16,9 @@ import mitsuba as mi
 from ..errors import CommandError, did_you_mean
 from ..image import features
 from ..settings import ALIASES, PARAMETERS
+
+SCENES_OWN = "scene"
+"""What ``--integrator`` calls the integrator of the scene file."""
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
@@ -25,7 +29,8 @@ DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
 """``max_depth`` of integrators whose paths end as early where the scene file gives them none."""
 
 NOT_CARRIED = {
-    "moment": "second moments, which bdpt has not: its parameter variance adds the variance of each pixel",
+    "moment": "second moments, which bdpt does not have (its parameter variance adds the variance of each "
+    "pixel)",
 }
 """Integrators around another whose layers `bdpt` cannot have."""
 
@@ -62,18 +67,6 @@ def elements(file: Path) -> list[ElementTree.Element]:
         raise CommandError(f"{str(file)!r} is not well-formed XML: {error}") from error
 
 
-def own_integrator(scene: Path, definitions: Mapping[str, str]) -> str | None:
-    """The plugin of the first integrator in a scene file, without files that it includes, or None."""
-    try:
-        found = [element.get("type") for element in elements(scene) if element.tag == "integrator"]
-    except ValueError:  # Mitsuba takes more for XML
-        return None
-    named = next(iter(found), None)
-    if named and named.startswith("$"):
-        return (parameters(scene) | definitions).get(named[1:])
-    return named
-
-
 def _decoded(data: bytes) -> str:
     """The text of a scene file, whose encoding Mitsuba tells by its first bytes."""
     if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)[\"']", data, re.IGNORECASE):
@@ -103,7 +96,15 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
     return definitions | {"resolution_y": max(round(asked * height / width), 1)}
 
 
-def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+class Loaded(NamedTuple):
+    """A scene and the integrator to render it with; ``used`` says in words which one that is, and why."""
+
+    scene: mi.Scene
+    integrator: mi.Integrator
+    used: str
+
+
+def load(options: Namespace) -> Loaded:
     """Load the scene and the integrator to render it with."""
     if options.integrator == "":
         raise CommandError("integrator='' names no integrator; use for example bdpt, or leave it out.")
@@ -138,13 +139,14 @@ def load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
         raise CommandError(better) from error
 
 
-def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
+def _load(options: Namespace) -> Loaded:
     """`load`, of a scene file that exists and with the variant set."""
     overrides = dict(options.properties)
     if options.time is not None:
         overrides["timeout"] = options.time
-    if options.integrator is not None:
-        _check_kind(options.integrator)
+    asked = None if options.integrator == SCENES_OWN else options.integrator
+    if asked is not None:
+        _check_kind(asked)
     config = mi.parser.ParserConfig(options.variant)
     defines = in_proportion(options.scene, dict(options.defines))
     state = mi.parser.parse_file(config, str(options.scene), **defines)
@@ -153,9 +155,9 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
     for film in _films(state):
         set_film_size(film.props, options.size, options.crop)
     # Nodes are in the order of the file: an integrator comes before those nested in it.
-    kind = mi.ObjectType.Integrator
-    node = next((node for node in state.nodes if node.type == kind), None)
-    used = options.integrator or (node.props.plugin_name() if node is not None else "bdpt")
+    node = next((node for node in state.nodes if node.type == mi.ObjectType.Integrator), None)
+    own = node.props.plugin_name() if node is not None else None
+    used = asked or own or "bdpt"
     for name in ("target_error", "denoise"):
         if getattr(options, name) and used != "bdpt":
             raise CommandError(f"{name} is for the integrator bdpt, not for {used}; use --integrator bdpt.")
@@ -163,24 +165,39 @@ def _load(options: Namespace) -> tuple[mi.Scene, mi.Integrator]:
         overrides |= {"target_error": options.target_error, "variance": True}
     if options.denoise:
         overrides["denoise"] = True
-    around = options.integrator in AROUND and (node is None or node.props.plugin_name() != options.integrator)
-    if around and (options.integrator != "aov" or not overrides.get("aovs")):
+    if asked in AROUND and own != asked and (asked != "aov" or not overrides.get("aovs")):
         raise CommandError(
-            f"integrator={options.integrator} is for one around another, which the command line cannot "
+            f"integrator={asked} is for one around another, which the command line cannot "
             "name: write both into the scene file (-P aovs=NAME:KIND and -P stokes=true add layers to bdpt)."
         )
-    if node is not None:
-        replace_integrator(state.nodes, node, options.integrator, overrides)
+    kept = {} if node is None else replace_integrator(state.nodes, node, asked, overrides)
+    said = _in_place_of(own, used, kept, asked)
     mi.parser.transform_all(config, state)
     # The stub says object; `_check_root` has seen that it is a scene.
     scene: mi.Scene = mi.parser.instantiate(config, state)  # pyright: ignore[reportAssignmentType]
     if node is not None:
-        return scene, scene.integrator()
-    kind = options.integrator or "bdpt"
-    made = mi.load_dict({"type": kind, **overrides})
+        return Loaded(scene, scene.integrator(), said)
+    made = mi.load_dict({"type": used, **overrides})
     if not isinstance(made, mi.Integrator):
-        raise CommandError(_no_integrator(kind, f"of class {made.class_name()}"))
-    return scene, made
+        raise CommandError(_no_integrator(used, f"of class {made.class_name()}"))
+    return Loaded(scene, made, said)
+
+
+def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: str | None) -> str:
+    """Which integrator is ``used``, and what it replaces.
+
+    ``own``: the scene file's; ``kept``: its parameters that the other one takes over; ``asked``: by
+    ``--integrator``, None for the file's own.
+    """
+    if own is None:
+        return f"{used} (the scene file has no integrator)"
+    if asked is None or own == used:
+        return f"{used}, the scene file's own"
+    values = ", ".join(f"{name}={value}" for name, value in kept.items())
+    return (
+        f"{used} in place of the scene file's {own}{values and f', with its {values}'}; "
+        f"--integrator {SCENES_OWN} renders with {own}"
+    )
 
 
 def _check_kind(name: str) -> None:
@@ -380,21 +397,24 @@ def plugins() -> list[str]:
 
 def replace_integrator(
     nodes: Sequence, node, kind: str | None, overrides: Mapping[str, bool | int | float | str]
-) -> None:
+) -> dict[str, object]:
     """Give the integrator ``node``, one of ``nodes``, another ``kind`` if that is set, and ``overrides``.
+
+    Returns the parameters of the replaced one that stay.
 
     Of integrators around another one (`AROUND`), with their layers, `bdpt` takes the place of all of them,
     for it has layers of its own; others take the place of the innermost. Raises ``CommandError`` for layers
     that cannot be kept.
     """
-    given = node.props
+    given, layers = node.props, {}
     if kind == "bdpt" and given.plugin_name() in AROUND:
         given, layers = _layers(nodes, node)
-        overrides = layers | overrides
     while kind not in (None, *AROUND) and given.plugin_name() in AROUND:
         node = _nested(nodes, node)[1]
         given = node.props
-    node.props = integrator_properties(given, kind, overrides)
+    node.props = integrator_properties(given, kind, layers | overrides)
+    kept = [name for name in (*KEPT, *layers) if name in node.props and name not in overrides]
+    return {name: node.props[name] for name in dict.fromkeys(kept)}
 
 
 def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
@@ -407,7 +427,8 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
         if kind in NOT_CARRIED:
             raise CommandError(
                 f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
-                f"adds {NOT_CARRIED[kind]}; in the scene file, write the inner integrator alone."
+                f"adds {NOT_CARRIED[kind]}; render with the scene file's own by --integrator {SCENES_OWN}, "
+                "or write the inner integrator alone into the file."
             )
         if kind == "stokes":
             if not mi.is_polarized:
