@@ -737,6 +737,26 @@ MUTANTS = (
         ("tests/images/test_media_edges.py::test_fog_behind_the_far_plane[sun]",),
     ),
     Mutant(
+        "media: flipped meshes have the sides of others",
+        "geometry/smooth_meshes.py",
+        "return -cross if shape.has_flipped_normals() else cross",
+        "return cross",
+        (
+            "tests/images/test_media_known_answers.py::test_glowing_walls_that_bound_fog[mesh]",
+            "tests/emitters/test_lamps.py::test_normals_have_the_sign_of_hits[mesh, rotated, flipped]",
+        ),
+    ),
+    Mutant(
+        "media: mirrored rectangles have the sides of others",
+        "emitters/surfaces.py",
+        "dr.select(self._reversed.at(index, active), -n, n)",
+        "n",
+        (
+            "tests/images/test_media_known_answers.py::test_glowing_walls_that_bound_fog[rectangles]",
+            "tests/emitters/test_lamps.py::test_normals_have_the_sign_of_hits[rectangle, mirrored]",
+        ),
+    ),
+    Mutant(
         "guided s = 0: s = 0 does not know of it",
         "transport/techniques.py",
         "            camera_side = h.combine(camera_side, other)",

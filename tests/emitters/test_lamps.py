@@ -198,7 +198,7 @@ def test_a_sheared_disk_is_found_where_it_is_sampled():
             Emitters(gap(lamp=lamp | {"to_world": turned}))
 
 
-def ball_of_triangles(center=(0, 0, 0), radius=1.0, rows=128, columns=128, emitter=None):
+def ball_of_triangles(center=(0, 0, 0), radius=1.0, rows=128, columns=128, emitter=None, flip_normals=False):
     """A ball of 2 ``rows`` ``columns`` - 2 ``columns`` triangles in an order without rule, with the vertex
     normals of a sphere."""
     theta, phi = np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1)
@@ -210,6 +210,7 @@ def ball_of_triangles(center=(0, 0, 0), radius=1.0, rows=128, columns=128, emitt
     faces = np.concatenate([upper[:-1].reshape(-1, 3), lower[1:].reshape(-1, 3)])
     faces = np.random.default_rng(5).permutation(faces)
     properties = mi.Properties()
+    properties["flip_normals"] = flip_normals
     properties["bsdf"] = mi.load_dict(grey(0))
     properties["emitter"] = mi.load_dict(emitter or {"type": "area", "radiance": 5.0})
     normals = n.reshape(-1, 3)
@@ -247,6 +248,43 @@ def test_normals_of_fine_meshes(rows):
         away = dr.normalize(anchor.p - mi.Point3f(0, 1.5, 0))
         cos = np.abs(np.array(dr.dot(away, anchor.n)))
         assert np.isfinite(cos).all() and (cos > np.cos(limit)).all(), (cos < np.cos(limit)).mean()
+
+
+def placed_lamps():
+    """Shapes and ``to_world`` of `test_normals_have_the_sign_of_hits`."""
+    for shape, placed, flipped in itertools.product((*FLAT, *CLOSED), PLACED, (False, True)):
+        if (shape, placed) != ("cylinder", "mirrored"):  # refused
+            yield pytest.param(shape, placed, flipped, id=f"{shape}, {placed}" + ", flipped" * flipped)
+
+
+@pytest.mark.parametrize("shape, placed, flipped", list(placed_lamps()))
+def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
+    """Rationale: the side of an emitting surface decides in which medium light starts. Samples of meshes
+    with vertex normals, and of mirrored rectangles and cubes, had the opposite of the geometric normal.
+
+    Expected: for emission and next-event estimation the normal is that of a hit at the same point, to 0.03
+    (interpolated normals of a coarse mesh are off by 0.1 and more); of at least 99 % of 2,000 points, others
+    are on edges.
+    """
+    count = 2000
+    lamp = {"type": shape, "flip_normals": flipped}
+    if shape == "mesh":
+        ball = ball_of_triangles(rows=6, columns=12)
+        ball.write_ply(str(tmp_path / "ball.ply"))
+        lamp = lamp | {"type": "ply", "filename": str(tmp_path / "ball.ply")}
+    lamp |= {"to_world": PLACED[placed], "emitter": {"type": "area", "radiance": 1.0}}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp})
+    emitters = Emitters(scene)
+    u = [mi.Float(v) for v in np.random.default_rng(3).random((4, count), dtype=np.float32)]
+    like = dr.zeros(mi.Interaction3f)
+    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    at = dr.zeros(mi.SurfaceInteraction3f, count)
+    at.p = mi.Point3f(3, 4, -5)
+    direct = emitters.sample_direct(at, mi.Point2f(u[0], u[1]), mi.Bool(True))
+    for anchor in (e.anchor, direct.anchor):
+        si = scene.ray_intersect(mi.Ray3f(anchor.p + 1e-3 * anchor.n, -mi.Vector3f(anchor.n), 2e-3, 0, []))
+        same = np.array(si.is_valid() & (dr.squared_norm(si.n - anchor.n) < 1e-3))
+        assert same.mean() > 0.99
 
 
 def test_a_fine_mesh_shines_like_any():

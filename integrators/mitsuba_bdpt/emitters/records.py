@@ -27,7 +27,7 @@ class Emission:
     """Start of a light subpath; all fields have the width of the lanes.
 
     ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start
-    of the ray, with position and geometric normal of y_0 (zero unless on a surface);
+    of the ray, with position and geometric normal of y_0 as a hit reports it (zero unless on a surface);
     ``cos`` geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the room's head;
     ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``beam`` mask: ``d`` is the only
     direction that leaves y_0, so that nothing can be joined with y_0; ``index`` of the emitter; ``si`` the

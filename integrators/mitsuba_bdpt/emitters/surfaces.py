@@ -13,7 +13,7 @@ from ..errors import UsageError
 from ..geometry import rays
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..geometry.smooth_meshes import SmoothMeshes
-from ..geometry.to_world import check_to_world
+from ..geometry.to_world import check_to_world, is_reversed
 from ..host.introspection import named
 from .group import Context
 from .tables import Mask, look_up, rows, table
@@ -60,9 +60,10 @@ class Surfaces:
         if any(turned):
             pairs = zip(spheres, turned, strict=True)
             self._turned = table([_Turned(s.center, s.outward) if t else _Turned() for s, t in pairs])
+        self._reversed = Mask([e and is_reversed(e.get_shape()) for e in emitters])
 
     def sample(self, chosen, u, shared, active):
-        """A point on the shape of each emitter, and its geometric normal up to the sign.
+        """A point on the shape of each emitter, and its geometric normal, the one that a hit reports.
 
         The point is a ``PositionSample3f``, its density over area.
         """
@@ -104,13 +105,15 @@ class Surfaces:
         return ps
 
     def geometric_normal(self, ps, index, u, active):
-        """Geometric normal, up to its sign, at the point that a shape sampled from ``u``.
+        """Geometric normal, with the sign of ``si.n`` of a hit, at the point that a shape sampled from ``u``.
 
-        Meshes report the interpolated vertex normal there; all other shapes the geometric one.
+        Meshes sample the interpolated vertex normal there, mirrored rectangles the opposite of the geometric
+        normal; all other shapes the geometric normal.
         """
-        if self._smooth_meshes is None:
-            return ps.n
-        return self._smooth_meshes.normal(ps.n, index, u.y, active)
+        n = ps.n
+        if self._reversed.any:
+            n = dr.select(self._reversed.at(index, active), -n, n)
+        return n if self._smooth_meshes is None else self._smooth_meshes.normal(n, index, u.y, active)
 
     def anchor(self, chosen, p, n, reference, active) -> rays.Anchor:
         """Where rays to or from ``reference`` end or start at the point ``p`` with the normal ``n``."""

@@ -1,5 +1,7 @@
 """Meshes that have vertex normals: which face Mitsuba's sampler has chosen, and its geometric normal.
 
+The normal has the sign that hits report (``si.n``): that of the winding of the face, turned by
+``flip_normals``. Vertex normals may point to the other side: a mirroring ``to_world`` turns the winding only.
 The choice is repeated here, and checked against Mitsuba's where a scene is prepared, see `mitsubas_choices`.
 """
 
@@ -18,7 +20,7 @@ from .mitsubas_choices import CHECKED, OFF, spread_points
 
 
 class SmoothMeshes:
-    """Geometric normals of emitting meshes that have vertex normals.
+    """Geometric normals, as hits report them, of emitting meshes that have vertex normals.
 
     Repeats the choice of a face that ``Mesh.sample_position`` makes: by area, from ``sample.y``. Mitsuba's
     table is of sums of areas in single precision, so the choice is repeated on the same sums, made in the
@@ -104,7 +106,7 @@ class _Faces:
 
     @staticmethod
     def of(shape) -> _Faces | None:
-        """Those of a mesh whose vertex normals differ from its faces' normals; None for all other shapes."""
+        """Those of a mesh whose vertex normals differ from hits' geometric normals; None for other shapes."""
         cross = _curved_faces(shape)
         if cross is None:
             return None
@@ -121,9 +123,10 @@ class _Faces:
 
 
 def _curved_faces(shape):
-    """Return the cross products of the edges of each face, shape (faces, 3).
+    """Return the cross products of the edges of each face, shape (faces, 3), on the side of hits' normals.
 
-    For a mesh whose vertex normals differ from its faces' normals; None for all other shapes.
+    For a mesh whose vertex normals differ from its faces' normals, be it by their sign; None for all other
+    shapes.
     """
     if shape is None or not shape.is_mesh():
         return None
@@ -142,5 +145,8 @@ def _curved_faces(shape):
     a, b, c = p[faces].transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1), 1e-300)[:, None]
-    flat = np.abs(np.einsum("fvi,fi->fv", n[faces], unit)) > 1 - 1e-6
-    return None if flat.all() else cross
+    # `flip_normals` turns the normals of hits and of samples alike.
+    flat = np.einsum("fvi,fi->fv", n[faces], unit) > 1 - 1e-6
+    if flat.all():
+        return None
+    return -cross if shape.has_flipped_normals() else cross

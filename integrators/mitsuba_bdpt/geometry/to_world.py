@@ -40,6 +40,17 @@ def check_to_world(shape, owner: str):
         raise UsageError(f"{owner} is on a {kind} ({named(shape)}) whose to_world {reason}")
 
 
+def is_reversed(shape: mi.Shape) -> bool:
+    """Whether the normals that ``shape`` samples are the opposite of those that hits on it report (``si.n``).
+
+    Those of mirrored rectangles are: hits take the cross product of the edges. (Of meshes see
+    `smooth_meshes`; mirrored disks and spheres agree, mirrored cylinders are refused by `check_to_world`.)
+    """
+    if shape.shape_type() != mi.ShapeType.Rectangle.value:
+        return False
+    return bool(np.linalg.det(matrix_of(shape)[:3, :3]) < 0)
+
+
 def _disk(matrix, inverse):
     """Rays find a disk by the inverse of the matrix that samples it; it may shear, and stretch."""
     if np.linalg.det(matrix) == 0:
