@@ -54,8 +54,8 @@ pictures: $(INSTALLED)
 
 # The documentation as a site, in build/site.
 docs: $(INSTALLED)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
-	$(VENV)/bin/python -m mkdocs build --strict
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --group docs
+	$(VENV)/bin/python -m sphinx --quiet --fail-on-warning --fresh-env -c docs . build/site
 
 # Wheel and sdist, checked, and the wheel tried in an environment of its own.
 package: $(INSTALLED)
@@ -111,8 +111,11 @@ lint: $(INSTALLED)
 	$(VENV)/bin/lint-imports --no-cache
 	$(VENV)/bin/pyright --pythonpath $(VENV)/bin/python
 
-# Install again only when the requirements change; the package itself is installed editable.
+# Install again only when the requirements change; the package itself is installed editable. Dependency groups need
+# pip 25.1, and the one that comes with Python 3.11 is older.
 $(INSTALLED): pyproject.toml
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--editable '.[cluster,completion,denoise,measure]' --group dev
 	touch $@

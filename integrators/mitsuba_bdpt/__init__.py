@@ -9,10 +9,28 @@ import sys as _sys
 from pathlib import Path as _Path
 
 from ._version import __version__
+from .errors import CommandError, UnsupportedError, UsageError, UsageTypeError
 from .host import llvm as _llvm
 from .host.llvm import LLVMNotFoundError
+from .progress import Bar, Display, Lines, Percentages
 
-__all__ = ["LLVMNotFoundError", "__version__", "llvm_choice"]
+__all__ = [
+    "BDPTIntegrator",
+    "Bar",
+    "CommandError",
+    "Display",
+    "LLVMNotFoundError",
+    "Lines",
+    "PassReport",
+    "Percentages",
+    "Snapshot",
+    "Statistics",
+    "UnsupportedError",
+    "UsageError",
+    "UsageTypeError",
+    "__version__",
+    "llvm_choice",
+]
 
 llvm_choice: _llvm.Choice | None = None
 """The LLVM library in use and why it was chosen."""
@@ -29,7 +47,11 @@ def _runs_own_command(arguments: list[str]) -> bool:
 
 try:
     llvm_choice = _llvm.prepare()
+    from .integrator import BDPTIntegrator
     from .integrator import register as _register
+    from .run.rendering import PassReport
+    from .run.snapshot import Snapshot
+    from .run.statistics import Statistics
 
     _register()
 except ImportError as _error:

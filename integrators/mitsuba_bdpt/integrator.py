@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABCMeta
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import wraps
 from importlib import import_module
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +25,7 @@ from .run import messages
 from .run.arguments import check_made_for, check_resumable, resolve_sensor, samples_per_pixel
 from .run.rendering import PassReport, Render
 from .run.snapshot import Snapshot
-from .run.statistics import statistics
+from .run.statistics import Statistics, statistics
 from .settings import UNLIMITED, Settings, manual
 
 DOCUMENTATION = f"""Bidirectional path tracer (plugin ``bdpt``).
@@ -94,26 +96,26 @@ def _hint_at_others(error: RuntimeError, arguments):
         )
 
 
-class BDPTIntegrator:
-    """Methods and attributes of the plugin; a class of them is made for each variant, see `register`.
+class BDPTIntegrator(metaclass=ABCMeta):
+    """The integrator that ``mi.load_dict({"type": "bdpt", ...})`` returns, in every variant.
 
-    Attributes:
-        settings: The parameters, a `settings.Settings`.
-        statistics: A dictionary about the last render: seconds, rays by kind, passes, decisions, what was
-            skipped and why, ...; empty before the first.
-        on_pass: ``None``, or a function that is called with a `PassReport` after each pass.
+    Its members besides those of ``mi.SamplingIntegrator``. Mitsuba's base class differs between variants, so
+    each variant has a class of its own; ``isinstance`` accepts the objects of all of them.
     """
 
     settings: Settings
-    statistics: dict
+    """The parameters, a `mitsuba_bdpt.settings.Settings`."""
+    statistics: Statistics
+    """Of the last render; empty before the first."""
     on_pass: Callable[[PassReport], object] | None
+    """``None``, or a function that is called after each pass."""
 
     def __init__(self, props: mi.Properties):
         check_variant()
         settings = read_settings(props)
         mi.SamplingIntegrator.__init__(self, props)
         self.settings = settings
-        self.statistics = {}
+        self.statistics = cast(Statistics, {})
         self.on_pass = None
         self._cancelled = False
 
@@ -139,10 +141,10 @@ class BDPTIntegrator:
         evaluate: bool = True,
         start: Snapshot | None = None,
     ) -> mi.TensorXf:
-        """Render ``scene``; see ``mi.Integrator.render`` for the arguments.
+        """Render an image; the arguments are those of ``mi.Integrator.render``, and ``start``.
 
-        ``start``: a snapshot of ``PassReport.snapshot`` to go on from, of the same scene; the image is that
-        of the uninterrupted render up to rounding. Raises ``UsageError`` and ``UnsupportedError``.
+        ``start``: a snapshot of the same scene from which the render continues. The image is that of the
+        uninterrupted render up to rounding. Raises ``UsageError`` and ``UnsupportedError``.
         """
         check_made_for(self, scene)
         if self.on_pass is not None and not callable(self.on_pass):
@@ -167,14 +169,14 @@ class BDPTIntegrator:
         return _result(sensor.film(), develop, evaluate)
 
     def cancel(self):
-        """End the render that is running after its next pass, from ``on_pass`` or another thread."""
+        """Stop the current render after its next pass; called by ``on_pass`` or from another thread."""
         self._cancelled = True
 
     @_without_gradients
     def explain(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> str:
-        """What will be done for ``scene`` and what is skipped, and why, as text.
+        """Describe which strategies a render of ``scene`` uses and which it skips, and why.
 
-        With ``spp`` also what the pilot of such a render finds.
+        With ``spp`` the pilot of such a render runs too, and the text has its result.
         """
         check_made_for(self, scene)
         sensor = resolve_sensor(scene, sensor)
@@ -194,11 +196,11 @@ class BDPTIntegrator:
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:
-        """What such a render decides before its first pass, as in ``statistics["decisions"]``.
+        """Run the pilot alone and return the decisions of such a render, as in ``statistics["decisions"]``.
 
-        By a pilot or by the scene alone; an empty list where neither decides, about which
-        ``statistics["no_pilot"]`` says why. The parameter ``decisions`` of other renders takes it as JSON.
-        All ``seed``s decide alike.
+        The list is empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the
+        reason. As JSON it is the value of the parameter ``decisions`` of other renders. Decisions do not
+        depend on ``seed``.
         """
         check_made_for(self, scene)
         sensor = resolve_sensor(scene, sensor)
@@ -218,10 +220,9 @@ class BDPTIntegrator:
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        """The image of a snapshot; what `render` would have returned.
+        """Return the image of a snapshot, as `render` would have.
 
-        Also of several that were joined (`Snapshot.joined`), traced by this integrator or one with the same
-        parameters.
+        The snapshot may be joined from several (`Snapshot.joined`) of integrators with the same parameters.
         """
         check_made_for(self, scene)
         if not isinstance(snapshot, Snapshot):
@@ -303,10 +304,12 @@ def _class_of_variant():
 
     Mitsuba's base class is another one in each variant, and allows no second base.
     """
-    own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in ("__dict__", "__weakref__")}
-    return type(mi.SamplingIntegrator)(
+    apart = ("__dict__", "__weakref__", "__abstractmethods__", "_abc_impl")
+    own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in apart}
+    made = type(mi.SamplingIntegrator)(
         "BDPTIntegrator", (mi.SamplingIntegrator,), own | {"__doc__": DOCUMENTATION}
     )
+    return BDPTIntegrator.register(made)
 
 
 def register():

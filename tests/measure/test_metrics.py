@@ -212,6 +212,17 @@ def test_hdr_flip():
     assert there == pytest.approx(0.232887, abs=1e-4) and back == pytest.approx(0.144833, abs=1e-4)
 
 
+@pytest.mark.parametrize("metric", ["delta_e_2000", "delta_e_itp", "hdr_flip"])
+def test_metrics_of_the_extra_say_so(metric, monkeypatch):
+    """Expected: without the extra's packages an error that names the module and what installs it."""
+    monkeypatch.setitem(sys.modules, "colour", None)
+    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
+    metrics._of_the_extra.cache_clear()
+    gray = np.full((8, 8, 3), 0.5)
+    with pytest.raises(CommandError, match=rf"^{metric} needs the module \w+: pip install '.*\[measure\]'$"):
+        getattr(metrics, metric)(gray, gray)
+
+
 def test_hdr_flip_sees_light_in_black():
     """A reference that is black for more than half: flip-evaluator 1.6 reports 0 for any image."""
     reference = np.zeros((16, 16, 3))

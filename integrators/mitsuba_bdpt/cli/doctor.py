@@ -22,7 +22,7 @@ import mitsuba_bdpt
 
 from ..host import llvm
 
-PACKAGES = ("mitsuba", "drjit", "numpy", "OpenEXR", "colour-science", llvm.WHEEL)
+PACKAGES = ("mitsuba", "drjit", "numpy", "OpenEXR", llvm.WHEEL)
 TIME_LIMIT = 300
 """Seconds for the test image: a cold start takes two or three, a busy machine longer."""
 

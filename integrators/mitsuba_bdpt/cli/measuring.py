@@ -16,7 +16,7 @@ from ..errors import CommandError
 from . import mistakes
 from .values import number, property_
 
-NEEDED = ("flip_evaluator", "matplotlib", "pyarrow", "scipy")
+NEEDED = ("colour", "flip_evaluator", "matplotlib", "pyarrow", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
 
 RESOLUTION = 128

@@ -11,6 +11,7 @@ colour-science and flip-evaluator are imported when first used, since they take 
 from __future__ import annotations
 
 import functools
+import importlib
 import warnings
 
 import numpy as np
@@ -154,12 +155,18 @@ def tone_map(image, exposure=0.0) -> np.ndarray:
 
 
 @functools.cache
-def _colour():
-    """The package colour, without its notes on packages that it misses and that are not used here."""
+def _of_the_extra(module: str, needed_by: str):
+    """Import a module that the extra ``[measure]`` installs; raise ``CommandError`` without it.
+
+    Silences what modules say at import about packages that they miss and that are not used here.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import colour
-    return colour
+        try:
+            return importlib.import_module(module)
+        except ImportError as error:
+            install = "pip install 'mitsuba-bdpt[measure]'"
+            raise CommandError(f"{needed_by} needs the module {module}: {install}") from error
 
 
 def delta_e_2000(image, reference, exposure=0.0) -> float:
@@ -168,7 +175,7 @@ def delta_e_2000(image, reference, exposure=0.0) -> float:
     sRGB to XYZ to L*a*b* under D65, k_L = k_C = k_H = 1. Source: CIE 142-2001; G. Sharma, W. Wu,
     E. Dalal, The CIEDE2000 color-difference formula, 2005.
     """
-    colour = _colour()
+    colour = _of_the_extra("colour", "delta_e_2000")
     labs = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(tone_map(x, exposure))) for x in pair_of(image, reference)]
     return float(np.mean(colour.delta_E(*labs, method="CIE 2000")))
 
@@ -179,7 +186,7 @@ def delta_e_itp(image, reference, exposure=0.0, white=WHITE) -> float:
     720 sqrt(dI^2 + (dC_T / 2)^2 + dC_P^2) in IC_TC_P of BT.2100 (PQ), linear BT.2020 in cd/m^2 with 1 at
     ``white``. Source: Recommendation ITU-R BT.2124. It tells dark differences better than `delta_e_2000`.
     """
-    colour = _colour()
+    colour = _of_the_extra("colour", "delta_e_itp")
     white = number_of("white", white, 0)
     encoded = []
     for x in pair_of(image, reference):
@@ -197,10 +204,7 @@ def hdr_flip(image, reference):
     highlights and any light in black counts nearly 1. Source: P. Andersson, J. Nilsson, P. Shirley,
     T. Akenine-Moller, Visualizing Errors in Rendered High Dynamic Range Images, Eurographics 2021.
     """
-    try:
-        import flip_evaluator
-    except ImportError as error:
-        raise CommandError("hdr_flip needs flip-evaluator: pip install 'mitsuba-bdpt[measure]'.") from error
+    flip_evaluator = _of_the_extra("flip_evaluator", "hdr_flip")
     pair = pair_of(image, reference)
     for name, x in zip(("image", "reference"), pair, strict=True):
         if x.min() < 0 or x.max() > np.finfo(np.float32).max:

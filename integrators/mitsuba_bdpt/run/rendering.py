@@ -45,19 +45,25 @@ from .work import Meter
 
 @dataclass(frozen=True)
 class PassReport:
-    """Progress after a pass: samples per pixel, seconds and rays so far.
+    """Progress after a pass.
 
-    ``error``: the relMSE estimated when ``target_error`` was last looked at, else ``None``. Of the newest
-    report: ``snapshot()``, what a later render can start from, and ``image()``, the image so far as `render`
-    returns it, which is stored in the film, too."""
+    ``snapshot`` and ``image`` may be called until the next pass has been reported.
+    """
 
     spp_done: int
+    """Samples per pixel so far."""
     spp_total: int
+    """Samples per pixel of the whole render."""
     seconds: float
+    """Seconds since the render began."""
     rays: int
+    """Rays so far, of all kinds."""
     error: float | None
+    """The relMSE at the last estimate for ``target_error``, else ``None``."""
     snapshot: Callable[[], Snapshot]
+    """Returns the snapshot from which another render can continue."""
     image: Callable[[], mi.TensorXf]
+    """Returns the image so far, as `render` does, and stores it in the film."""
 
 
 class Render:

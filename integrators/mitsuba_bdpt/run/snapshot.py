@@ -44,19 +44,21 @@ def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The raw sums of the passes that are done, and all that the next pass depends on.
+    """The raw sums of the passes that are done, and everything on which the next pass depends.
 
-    ``identity`` says of which render, see `identity`; ``passes``: samples per pixel of each. ``arrays``, all
-    in double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums, see
-    `accumulator.Accumulator`; flat), ``inverse_threshold`` of roulette, ``replicates.last.*``, the sums after
-    the last replicate of the variance. The scene is not part of it: whoever goes on has to bring the same
-    one.
+    The scene is not part of it.
     """
 
     identity: dict
+    """What two renders must have in common for one to continue the other: parameters, variant, seed, film."""
     passes: tuple[int, ...]
+    """Samples per pixel of each pass."""
     progress: Progress
+    """State of the render beside its sums."""
     arrays: dict
+    """Arrays in double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums,
+    flat); ``inverse_threshold`` of roulette; ``replicates.last.*``, the sums after the last replicate of the
+    variance."""
 
     @property
     def spp(self) -> int:
@@ -64,7 +66,7 @@ class Snapshot:
         return sum(self.passes)
 
     def check(self, identity: dict, apart_from=()):
-        """Raise ``UsageError`` naming the first entry in which this is another render than ``identity``."""
+        """Raise ``UsageError`` that names the first entry in which ``identity`` differs."""
         # The version first: parameters of another one may differ in name only.
         names = sorted(set(identity) | set(self.identity), key=lambda name: (name != "version", name))
         for name in names:
@@ -76,7 +78,7 @@ class Snapshot:
                 )
 
     def joined(self, other: Snapshot) -> Snapshot:
-        """Both as one render: sums and counts are added.
+        """Return both as one render, whose sums and counts are those of both.
 
         Raises `UsageError` if they differ in more than seed and samples per pixel, or have a seed in common.
         """
@@ -100,12 +102,12 @@ class Snapshot:
         )
 
     def image_only(self) -> Snapshot:
-        """What an image is made of, to be sent elsewhere and joined; a render cannot go on from it."""
+        """Return what an image needs, to be sent and joined; a render cannot continue from it."""
         kept = {n: a for n, a in self.arrays.items() if not n.startswith("replicates.last.")}
         return replace(self, progress=self.progress.image_only(), arrays=kept)
 
     def to_bytes(self) -> bytes:
-        """As a file of NumPy's ``npz`` format, without pickled objects."""
+        """Return the bytes of a file of NumPy's ``npz`` format, without pickled objects."""
         progress, arrays = self.progress.stored()
         text = json.dumps({"identity": self.identity, "passes": self.passes, "progress": progress})
         file = io.BytesIO()
@@ -114,7 +116,7 @@ class Snapshot:
 
     @staticmethod
     def from_bytes(data: bytes) -> Snapshot:
-        """The snapshot of `to_bytes`; raises ``UsageError`` if it is none."""
+        """Return the snapshot that `to_bytes` wrote; raises ``UsageError`` for other bytes."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}

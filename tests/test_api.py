@@ -1,0 +1,52 @@
+"""What `mitsuba_bdpt` exports."""
+
+import re
+import typing
+from pathlib import Path
+
+import mitsuba_bdpt
+import pytest
+
+import mitsuba as mi  # isort: skip
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "user" / "api.md"
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_integrators_are_instances_of_the_public_class(variant):
+    """Rationale: each variant has a class of its own. Expected: the integrator of a dictionary and that of a
+    scene are instances of `BDPTIntegrator` in every variant; one of Mitsuba's is none.
+    """
+    mi.set_variant(variant)
+    scene = mi.cornell_box()
+    scene["integrator"] = {"type": "bdpt"}
+    for integrator in (mi.load_dict({"type": "bdpt"}), mi.load_dict(scene).integrator()):
+        assert isinstance(integrator, mitsuba_bdpt.BDPTIntegrator)
+        assert issubclass(type(integrator), mitsuba_bdpt.BDPTIntegrator)
+    assert not isinstance(mi.load_dict({"type": "path"}), mitsuba_bdpt.BDPTIntegrator)
+
+
+def test_all_public_names_are_documented():
+    """Expected: what `__all__` names exists, and the page of the API shows the docstring of each class."""
+    names = set(mitsuba_bdpt.__all__)
+    assert all(hasattr(mitsuba_bdpt, name) for name in names)
+    shown = re.findall(r"^\.\. auto(?:class|exception):: (\w+)", PAGE.read_text(), re.MULTILINE)
+    assert sorted(shown) == sorted(names - {"__version__", "llvm_choice"})
+    assert all(getattr(mitsuba_bdpt, name).__doc__ for name in shown)
+
+
+def test_statistics_are_of_their_declared_type():
+    """Expected: a render's statistics have all keys that `Statistics` requires, no others than it declares,
+    and values of the declared types.
+    """
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2, "variance": True, "skip": "impossible"})
+    scene = mi.cornell_box()
+    scene["sensor"]["film"].update(width=8, height=8)
+    integrator.render(mi.load_dict(scene), spp=8, develop=False)
+    declared = typing.get_type_hints(mitsuba_bdpt.Statistics, include_extras=True)
+    optional = {key for key, hint in declared.items() if typing.get_origin(hint) is typing.NotRequired}
+    found = integrator.statistics
+    assert declared.keys() - optional <= found.keys() <= declared.keys() and "error" in found
+    for key in found.keys() - {"error"}:
+        kind = typing.get_args(declared[key])[0] if key in optional else declared[key]
+        assert isinstance(found[key], typing.get_origin(kind) or kind), key
