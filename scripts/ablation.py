@@ -205,7 +205,8 @@ def changed(way: Way, kernels: list[dict]):
 
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(dr, "kernel_history", told))
-        stack.enter_context(mock.patch.object(schedule, "LAUNCH_SAMPLES", way.launch))
+        for name in ("LAUNCH_SAMPLES", "LAUNCH_SAMPLES_CUDA"):
+            stack.enter_context(mock.patch.object(schedule, name, way.launch))
         stack.enter_context(mock.patch.object(inputs, "STORE_SIZES", (way.store, *inputs.STORE_SIZES)))
         stack.enter_context(evaluated_mode(way.evaluated))
         if way.counters:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
+
 from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport.batch import Batch
@@ -12,6 +15,10 @@ from ..transport.batch import Batch
 # `batches`). Nothing per sample is kept in memory, so this only bounds how long a launch runs (seconds on a
 # few cores) and with it the delay of Ctrl-C, timeout and progress.
 LAUNCH_SAMPLES = 1 << 21
+
+# The same on a GPU, which traces 2^21 camera subpaths in less time than Python needs to record the pass
+# (docs/reports/cuda.md, "Where the time goes").
+LAUNCH_SAMPLES_CUDA = 1 << 24
 
 # Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
 # every pass and does not average out (constant radiance, 2^12: 4e-6; 2^16: 5e-5; 2^20: 1e-3).
@@ -30,7 +37,9 @@ FIRST_REPLICATE = 4
 
 def _most_samples(settings: Settings) -> int:
     """Samples in one launch."""
-    return LAUNCH_SAMPLES_SAMPLER if settings.points == "sampler" else LAUNCH_SAMPLES
+    if settings.points == "sampler":
+        return LAUNCH_SAMPLES_SAMPLER
+    return LAUNCH_SAMPLES_CUDA if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else LAUNCH_SAMPLES
 
 
 def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
