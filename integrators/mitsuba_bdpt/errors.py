@@ -31,6 +31,10 @@ class CommandError(UsageError):
     prefix = ""
 
 
+class FailureError(RuntimeError):
+    """A command could not do what it was rightly asked for: a full disk, a cluster that is gone."""
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """The question for the most similar of the ``known`` names, and a space; empty if none is similar."""
     import difflib  # which takes 5 ms, and only mistakes need it

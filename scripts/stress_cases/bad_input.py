@@ -268,7 +268,7 @@ CASES = (
     _case(
         "missing-files",
         "`python -m mitsuba_bdpt render` without scene, mesh, texture, include; with half of one",
-        "one line that says so, status 1, nothing written",
+        "one line that says so, status 2, nothing written",
         outputs.missing_files,
     ),
     _case(

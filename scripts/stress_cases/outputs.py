@@ -104,7 +104,7 @@ def missing_files() -> Outcome:
                 scene.write_text(PLAIN.format(more=text) if text.startswith(("<sh", "<em", "<in")) else text)
             before = _listing(folder)
             status, said, _ = _said([scene, "-o", folder / "a.exr", "--spp", 1])
-            if status != 1 or not said.startswith("error: ") or "Traceback" in said:
+            if status != 2 or not said.startswith("error: ") or "Traceback" in said:
                 wrong.append(f"{words}: status {status}, {said.strip()[-160:] or 'nothing said'}")
             elif _listing(folder) != before:
                 wrong.append(f"{words}: files were left behind")
@@ -169,7 +169,7 @@ def output_names() -> Outcome:
             before = _listing(Path(name))
             more = ["--checkpoint", "60"] if "checkpoint" in kind else []
             status, text, rendered = _said([scene, "-o", output, "--spp", 1, *more])
-            if status != 1 or not text.startswith("error: ") or rendered:
+            if status != 2 or not text.startswith("error: ") or rendered:
                 wrong.append(f"{kind}: status {status}, {text.strip()[:120] or 'nothing said'}, {rendered=}")
             elif _listing(Path(name)) != before:
                 wrong.append(f"{kind}: files were changed")

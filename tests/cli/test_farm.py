@@ -68,7 +68,7 @@ def test_a_finished_render_goes_on_with_more_samples(capsys):
         (["--spp", "32", "-P", "max_depth=3"], "its max_depth is"),
         (["--spp", "32", "--size", "8x8"], "is of another scene"),
     ):
-        assert main([*arguments, "--resume", *others]) == 1
+        assert main([*arguments, "--resume", *others]) == 2
         assert words in capsys.readouterr().err
     assert main([*arguments, "--resume", "--spp", "32"]) == 0
     whole, after = rendered.image("more.exr", "RGB")
@@ -87,7 +87,7 @@ def test_a_finished_render_goes_on_with_more_samples(capsys):
 
 
 def test_what_is_kept_needs_checkpoints(capsys):
-    assert main([*SMALL, "--keep-checkpoint"]) == 1
+    assert main([*SMALL, "--keep-checkpoint"]) == 2
     assert "keep_checkpoint needs --checkpoint MINUTES" in capsys.readouterr().err
 
 
@@ -129,7 +129,7 @@ def test_sizes_that_are_refused(capsys):
         ),
         (["cropped.xml", "--size", "16x16"], "has a film with a crop window"[6:]),
     ):
-        assert main(["render", *arguments]) == 1
+        assert main(["render", *arguments]) == 2
         assert words in capsys.readouterr().err
     assert (
         main(["render", "cropped.xml", "--size", "16x16", "--crop", "0,0,4,4", "--spp", "1", "-o", "a.exr"])
@@ -188,7 +188,7 @@ def test_frames_are_sensors(capsys):
         (["--frames", "0", "-s", "1"], "frames together with sensor"),
         (["--frames", "0", "--resume", "--checkpoint", "1"], "frames together with checkpoint"),
     ):
-        assert main(["render", "frames.xml", "-o", "other.exr", *arguments]) == 1
+        assert main(["render", "frames.xml", "-o", "other.exr", *arguments]) == 2
         assert words in capsys.readouterr().err
     assert not list(Path().glob("other*"))
 
@@ -207,7 +207,7 @@ def test_files_elsewhere(capsys):
         '<integer name="height" value="4"/></film></sensor></scene>'
     )
     arguments = ["render", "scene/scene.xml", "--spp", "1", "-o", "a.exr"]
-    assert main([*arguments, "-a", "nowhere"]) == 1
+    assert main([*arguments, "-a", "nowhere"]) == 2
     assert "append='nowhere' is no folder" in capsys.readouterr().err
     assert main([*arguments, "-a", "textures"]) == 0
     from mitsuba_bdpt.cli import checkpoints

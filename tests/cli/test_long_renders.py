@@ -88,11 +88,11 @@ def test_an_interrupted_render_leaves_a_checkpoint_and_is_not_begun_anew(monkeyp
         (["--resume", "-P", "max_depth=3"], "its max_depth is"),
         (["--resume", "-D", "resolution=8"], "is of another scene"),
     ):
-        assert main([*arguments, *others]) == 1
+        assert main([*arguments, *others]) == 2
         assert words in capsys.readouterr().err
     assert main([*arguments, "--resume"]) == 0
     assert rendered.image("a.exr")[1]["spp"] == 32
-    assert main([*arguments, "--resume"]) == 1
+    assert main([*arguments, "--resume"]) == 2
     assert "there is no checkpoint" in capsys.readouterr().err
 
 
@@ -181,7 +181,7 @@ def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):
     arguments = [*command, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     interrupt(monkeypatch, arguments)
     Path("part.xml").write_text(SCENE.read_text().replace("</scene>", "<!-- other --></scene>"))
-    assert main([*arguments, "--resume"]) == 1
+    assert main([*arguments, "--resume"]) == 2
     assert "is of another scene" in capsys.readouterr().err
     Path("part.xml").write_text(SCENE.read_text())
     assert main([*arguments, "--resume"]) == 0
@@ -260,7 +260,7 @@ def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
     interrupt(monkeypatch, arguments)
     file = Path("a.checkpoint.npz")
     file.write_bytes(file.read_bytes()[:200])
-    assert main([*arguments, "--resume"]) == 1
+    assert main([*arguments, "--resume"]) == 2
     error = capsys.readouterr().err
     assert "'a.checkpoint.npz' is not a snapshot" in error and "delete it" in error
     assert "Traceback" not in error
@@ -296,7 +296,7 @@ def test_until_an_error(capsys):
     ],
 )
 def test_contradictions_are_refused(arguments, words, capsys):
-    assert main([*ARGUMENTS[:4], "-o", "a.exr", *arguments]) == 1
+    assert main([*ARGUMENTS[:4], "-o", "a.exr", *arguments]) == 2
     assert words in capsys.readouterr().err and not Path("a.exr").exists()
 
 

@@ -4,6 +4,7 @@ Images are tiny, and most are made by Mitsuba's ``path`` or by `Passes`, an inte
 that paints the film one colour: what is tested is the command, not the light.
 """
 
+import errno
 import json
 import os
 import re
@@ -20,6 +21,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import render
 from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.errors import CommandError, FailureError, UnsupportedError
 from mitsuba_bdpt.files import images
 from mitsuba_bdpt.files.loading import in_proportion, load
 
@@ -74,7 +76,7 @@ class Passes(mi.SamplingIntegrator):
         self.calls = []
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        assert not develop
+        assert develop, "as integrators do that are not asked by bdpt's attributes"
         passes, film = [], scene.sensors()[sensor].film()
         film.prepare([])
         for spp_of_pass in (3, 2)[: self.stop_after]:
@@ -271,7 +273,7 @@ def test_other_integrators_take_the_place_inside(around):
 def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
     assert change[0] in around.read_text()
     around.write_text(around.read_text().replace(*change))
-    assert main(["render", str(around), "--integrator", "bdpt"]) == 1
+    assert main(["render", str(around), "--integrator", "bdpt"]) == 2
     assert re.search(words, capsys.readouterr().err)
 
 
@@ -313,7 +315,7 @@ def test_an_integrator_around_none_is_named(around, capsys):
     around.write_text(
         text.replace(text[start:end], "").replace('<default name="integrator" value="path"/>', "")
     )
-    assert main(["render", str(around), "--integrator", "bdpt"]) == 1
+    assert main(["render", str(around), "--integrator", "bdpt"]) == 2
     assert "aov is around none" in (error := capsys.readouterr().err) and "write one inside of it" in error
 
 
@@ -322,7 +324,7 @@ def test_an_integrator_around_none_is_named(around, capsys):
 )
 def test_a_file_without_a_scene_is_reported(scene, capsys, text):
     scene.write_text(text)
-    assert main(["render", str(scene)]) == 1
+    assert main(["render", str(scene)]) == 2
     error = capsys.readouterr().err
     assert "plain.xml' holds a single object" in error and "no <scene>" in error
 
@@ -386,7 +388,7 @@ def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
     ],
 )
 def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message):
-    assert main(["render", str(scene), *arguments]) == 1
+    assert main(["render", str(scene), *arguments]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("error: ") and message in captured.err and not captured.out
     assert "Traceback" not in captured.err
@@ -424,7 +426,7 @@ def test_images_that_cannot_be_are_refused(scene, capsys, old, new, arguments, m
     after the render; a sampler without samples ended the process under `path`; `moment` around nothing gave
     an image. Expected: words, before anything is rendered."""
     scene.write_text(SCENE.replace(old, new, 1))
-    assert main(["render", str(scene), *arguments]) == 1
+    assert main(["render", str(scene), *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and message in error
 
@@ -434,7 +436,7 @@ def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
         raise ImportError("the CUDA backend hasn't been initialized")
 
     monkeypatch.setattr(render.mi, "set_variant", no_gpu)
-    assert main(["render", str(scene), "--variant", "cuda_ad_rgb"]) == 1
+    assert main(["render", str(scene), "--variant", "cuda_ad_rgb"]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: variant='cuda_ad_rgb' cannot be used on this machine")
     assert "llvm_ad_rgb" in error
@@ -443,6 +445,47 @@ def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
 def test_no_time_at_all_is_one_pass(scene, capsys):
     assert main(["render", str(scene), "--integrator", "bdpt", "--time", "0", "-o", "a.exr"]) == 0
     assert " 1 spp " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["prb", "prbvolpath"])
+@pytest.mark.parametrize("time", [[], ["--time", "0"]], ids=" ".join)
+def test_integrators_that_must_develop_their_image_render_too(scene, kind, time):
+    """Rationale: Mitsuba's integrators for derivatives raise an error if they are to leave the image to the
+    film, as the command asks of `bdpt`. Expected: the image, 2 everywhere."""
+    assert main(["render", str(scene), "--integrator", kind, *time, "-o", "a.exr"]) == 0
+    np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (CommandError("wrong"), 2),
+        (UnsupportedError("wrong"), 2),
+        (FailureError("gone"), 1),
+        (OSError(errno.EIO, "Input/output error", "a.exr"), 1),
+        (OSError(errno.ENOENT, "No such file or directory", "drive/a.exr"), 1),
+        (RuntimeError("jit_malloc(): out of memory"), 1),
+        (MemoryError(), 1),
+    ],
+)
+def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, error, status):
+    """Expected: 2 for what would happen again, 1 for what may not, in one line; a path that is gone while a
+    render runs is a failure, though one that was never there is a usage error."""
+
+    def broken(*_):
+        raise error
+
+    monkeypatch.setattr(render, "render", broken)
+    assert main(["render", str(scene), "-o", "a.exr"]) == status
+    *_, last = capsys.readouterr().err.splitlines()
+    assert last.startswith("error: ") and "Traceback" not in last
+
+
+def test_a_bug_shows_its_traceback(scene, monkeypatch):
+    """Expected: an error that names nothing of the user's is raised."""
+    monkeypatch.setattr(render, "render", lambda *_: {}["bug"])
+    with pytest.raises(KeyError, match="bug"):
+        main(["render", str(scene), "-o", "a.exr"])
 
 
 @pytest.mark.parametrize("kind", ["path", "ptracer"])
@@ -474,7 +517,7 @@ def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
 def test_missing_scene_is_reported(scene, capsys, name, words):
     Path("other.xml").write_text(SCENE)
     Path("empty").mkdir()
-    assert main(["render", name]) == 1
+    assert main(["render", name]) == 2
     assert f"scene={name!r} is not a file; {words}\n" in capsys.readouterr().err
     assert not Path("renders").exists()
 
@@ -506,7 +549,7 @@ def test_mistyped_names_are_answered_with_those_that_exist(scene, capsys, argume
         text = SCENE.replace("<default", '<include filename="part.xml"/><default', 1)
         scene.write_text(text.replace('name="width" value="6"', 'name="width" value="$width"'))
         arguments = [*arguments, "-Dwidth=6"]
-    assert main(["render", str(scene), *arguments]) == 1
+    assert main(["render", str(scene), *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
 
@@ -519,14 +562,14 @@ def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, caps
     start, end = SCENE.index("<integrator"), SCENE.index("<sensor")
     text = SCENE.replace(SCENE[start:end], "").replace('<default name="integrator" value="path"/>', "")
     scene.write_text(text)
-    assert main(["render", str(scene), "--integrator", kind]) == 1
+    assert main(["render", str(scene), "--integrator", kind]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: integrator={kind!r} is a plugin of ") and error.count("\n") == 1
 
 
 def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
     scene.write_text(SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="$light"'))
-    assert main(["render", str(scene), "-Dlight=-1"]) == 1
+    assert main(["render", str(scene), "-Dlight=-1"]) == 2
     error = capsys.readouterr().err
     assert '-D light=-1: Property "sample_count": value -1 is out of bounds' in error
 
@@ -549,6 +592,13 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
         ),
         (('"constant"', '"cnstant"'), [], 'Plugin "cnstant" not found! Did you mean constant?'),
         (('"hdrfilm"', '"hdr"'), [], "Did you mean hdrfilm?"),
+        (
+            ("<emitter", '<bsdf type="principled"><float name="spec_tnt" value="1"/></bsdf><emitter'),
+            [],
+            'property in bsdf plugin of type "principled".*"spec_tnt".*; did you mean spec_tint?\n',
+        ),
+        (("<emitter", '<bsdf type="hair"><float name="xyzzy" value="1"/></bsdf><emitter'), [])
+        + ('"xyzzy": 1\n',),
         (("<emitter", '<shape type="ply"><string name="filename" value="blal.ply"/></shape><emitter'), [])
         + ("folder '{folder}'; did you mean ball.ply?",),
         (("<emitter", '<shape type="obj"><string name="filename" value="no/x.obj"/></shape><emitter'), [])
@@ -574,7 +624,7 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
             text = text.replace("</integrator>", "</integrator></integrator>")
             text = text.replace('<default name="integrator" value="path"/>', "")
         scene.write_text(text)
-    assert main(["render", str(scene), *arguments]) == 1
+    assert main(["render", str(scene), *arguments]) == 2
     error = capsys.readouterr().err
     words = re.escape(words.replace("{folder}", str(scene.parent))).replace(r"\.\*", ".*")
     assert "error: " in error and re.search(words, error), error
@@ -588,6 +638,9 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
         (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
         (["render", "plain.xml", "--traget-error=1"], "did you mean --target-error?"),
         (["explain", "plain.xml", "--integrator", "path"], "that is an option of render"),
+        (["render", "plain.xml", "--sp", "4"], "did you mean --spp?"),
+        (["render", "plain.xml", "--check", "4"], "did you mean --checkpoint?"),
+        (["sweep", "preset", "--sched=x"], "did you mean --scheduler?"),
     ],
 )
 def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys, arguments, question):
@@ -598,7 +651,7 @@ def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys
 
 def test_a_parameter_without_a_value_is_reported(scene, capsys):
     scene.write_text(SCENE.replace('<default name="light" value="2"/>', ""))
-    assert main(["render", str(scene)]) == 1
+    assert main(["render", str(scene)]) == 2
     assert "undefined parameter: $light; give it a value: -D light=VALUE" in capsys.readouterr().err
 
 
@@ -606,7 +659,7 @@ def test_scene_without_sensor_is_reported(scene, capsys):
     start, end = SCENE.index("<sensor"), SCENE.index("</sensor>") + len("</sensor>")
     text = SCENE.replace(SCENE[start:end], "")
     scene.write_text(text.replace('<default name="format" value="float32"/>', ""))
-    assert main(["render", str(scene)]) == 1
+    assert main(["render", str(scene)]) == 2
     assert "no sensor" in capsys.readouterr().err
 
 
@@ -614,7 +667,7 @@ def test_scene_without_sensor_is_reported(scene, capsys):
 def test_a_file_of_another_format_is_not_overwritten(scene, capsys, name):
     """A name given by mistake must not cost the user the file; a former image may go."""
     Path(name).write_text("precious")
-    assert main(["render", str(scene), "-o", "a.exr"]) == 1
+    assert main(["render", str(scene), "-o", "a.exr"]) == 2
     assert Path(name).read_text() == "precious"
     assert "would overwrite" in capsys.readouterr().err
     Path(name).unlink()
@@ -653,7 +706,7 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_render(scene, ca
         Path({"folder.png": "a.png", "checkpoint": "a.checkpoint.npz"}.get(kind, "a.exr")).mkdir()
     more = ["--checkpoint", "1"] if kind == "checkpoint" else []
     before = sorted(Path().iterdir())
-    assert main(["render", str(scene), "-o", str(output), *more]) == 1
+    assert main(["render", str(scene), "-o", str(output), *more]) == 2
     assert capsys.readouterr().err.startswith("error: ") and sorted(Path().iterdir()) == before
 
 
@@ -685,7 +738,9 @@ def test_help_does_nothing_else(scene, capsys, words):
     """Expected: the usage, status 0, no file."""
     with pytest.raises(SystemExit) as ended:
         main(words)
-    assert ended.value.code == 0 and capsys.readouterr().out.startswith("usage: mitsuba_bdpt")
+    said = capsys.readouterr().out
+    assert ended.value.code == 0 and said.startswith("usage: mitsuba_bdpt")
+    assert re.search(r"0 done; 1\s+failed.* 2\s+usage\s+error.* 130\s+.* 143\s+", said, re.DOTALL)
     assert [path.name for path in Path().iterdir()] == ["plain.xml"]
 
 
@@ -754,8 +809,9 @@ def test_what_bdpt_cannot_replace_is_rendered_by_the_files_own(around, capsys):
     assert main(["render", str(around), "--integrator", "scene", "-o", "a.exr"]) == 0
 
 
-def test_a_pipe_that_closes_ends_explain_quietly(scene, monkeypatch, capsys):
-    """Rationale: ``explain | head -1``. Expected: status 0."""
+@pytest.mark.parametrize("words", [["explain", "plain.xml"], ["completion", "bash"]], ids=" ".join)
+def test_a_pipe_that_closes_ends_the_command_quietly(scene, monkeypatch, capsys, words):
+    """Rationale: ``explain | head -1``. Expected: status 0, and nothing on standard error."""
 
     class Closed:
         def write(self, text):
@@ -765,7 +821,8 @@ def test_a_pipe_that_closes_ends_explain_quietly(scene, monkeypatch, capsys):
 
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", Closed())
-        assert main(["explain", str(scene)]) == 0
+        assert main(words) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_explain(scene, capsys):
@@ -774,6 +831,6 @@ def test_explain(scene, capsys):
     assert main(["explain", str(scene), "-P", "max_depth=1", "-Dlight=3"]) == 0
     said = capsys.readouterr().out
     assert "used: s=0" in said and "max_depth=1 allows no such path" in said and "no pilot" in said
-    assert main(["explain", str(scene), "-P", "max_depth=oops"]) == 1
+    assert main(["explain", str(scene), "-P", "max_depth=oops"]) == 2
     assert "max_depth" in capsys.readouterr().err
     assert list(scene.parent.iterdir()) == [scene]

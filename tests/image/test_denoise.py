@@ -117,5 +117,5 @@ def test_the_command(tmp_path, capsys):
         (["--integrator", "path"], "denoise is for the integrator bdpt, not for path"),
         (["-P", "denoise=false"], "-P denoise=false together with --denoise"),
     ):
-        assert main([*arguments, "--denoise", *others]) == 1
+        assert main([*arguments, "--denoise", *others]) == 2
         assert words in capsys.readouterr().err

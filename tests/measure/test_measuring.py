@@ -305,7 +305,7 @@ def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, ca
     }[command]
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "scipy" else find(name))
-    assert main([command, *arguments]) == measuring.mistakes.STATUS
+    assert main([command, *arguments]) == measuring.mistakes.USAGE
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line == f"error: {command} needs scipy; install them with: pip install 'mitsuba-bdpt[measure]'"
 

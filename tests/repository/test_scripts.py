@@ -278,7 +278,7 @@ def test_bugs_are_not_taken_for_mistakes():
     with pytest.raises(ValueError, match="own"):
         mistakes.answered(lambda: raised(ValueError("own")))
     for error in (CommandError("own"), UsageError("own"), UnsupportedError("own")):
-        assert mistakes.answered(lambda error=error: raised(error)) == mistakes.STATUS
+        assert mistakes.answered(lambda error=error: raised(error)) == mistakes.USAGE
 
 
 def test_equal_time_of_a_scene_file(here, capsys):

@@ -20,7 +20,7 @@ import mitsuba_bdpt
 
 from ..errors import did_you_mean
 from ..progress import KINDS
-from . import measuring
+from . import measuring, mistakes
 from .tev import PORT
 from .values import crop, definition, frames, number, property_, size, tev_address
 
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return doctor.run(options.variant)
     if mitsuba_bdpt.failure is not None:
         print(f"error: {mitsuba_bdpt.failure}", file=sys.stderr)
-        return 1
+        return mistakes.FAILURE
     if options.command in measuring.COMMANDS:
         return measuring.run(options)
     from . import render
@@ -50,11 +50,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors ask whether another command or option was meant."""
+    """A parser that takes whole words only, and asks whether another command or option was meant."""
+
+    def __init__(self, **settings):
+        self._options: list[str] = []
+        self._commands: dict[str, Parser] = {}
+        self._subparsers_action = None
+        # Half of an option may be another one in the next version.
+        super().__init__(allow_abbrev=False, **settings)
+
+    def add_argument(self, *names, **settings):
+        """Declare an argument as argparse does."""
+        self._options += [name for name in names if name.startswith("-")]
+        return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
-        known = [*self._option_string_actions, *self._commands()]
-        known += [name for parser in self._commands().values() for name in parser._option_string_actions]
+        """End the process with a usage error."""
+        known = [*self._options, *self._commands]
+        known += [name for parser in self._commands.values() for name in parser._options]
         wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
         if wrong:
             name = wrong[1] or wrong[2]
@@ -65,41 +78,48 @@ class Parser(argparse.ArgumentParser):
             message = f"{message}; {question}".rstrip("; ")
         super().error(message)
 
-    def _commands(self) -> dict[str, argparse.ArgumentParser]:
-        """The parsers of the commands, by name."""
-        kinds = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
-        return {name: parser for action in kinds for name, parser in action.choices.items()}
+    def add_command(self, name: str, help_text: str) -> Parser:
+        """The parser of a new command."""
+        if self._subparsers_action is None:
+            self._subparsers_action = self.add_subparsers(dest="command", required=True, metavar="COMMAND")
+        made = self._subparsers_action.add_parser(
+            name, help=help_text, description=help_text, epilog=mistakes.STATUSES
+        )
+        self._commands[name] = made
+        return made
 
     def _commands_with(self, option: str) -> list[str]:
         """The commands that have this ``option``."""
-        found = [name for name, parser in self._commands().items() if option in parser._option_string_actions]
-        return found or [self.prog]
+        return [name for name, parser in self._commands.items() if option in parser._options] or [self.prog]
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    parser = Parser(prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3.")
+    parser = Parser(
+        prog="mitsuba_bdpt",
+        description="Bidirectional path tracing for Mitsuba 3.",
+        epilog=mistakes.STATUSES,
+    )
     parser.add_argument("--version", action="version", version=_versions())
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     help_text = "say what is installed and render a tiny image to prove that it works"
-    doctor = commands.add_parser("doctor", help=help_text, description=help_text)
+    doctor = parser.add_command("doctor", help_text)
     doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
 
     help_text = "print a script that completes commands and options: source it in the shell's start-up file"
-    completion = commands.add_parser("completion", help=help_text, description=help_text)
+    completion = parser.add_command("completion", help_text)
     completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
 
     help_text = "render a Mitsuba scene file to an EXR and a PNG image"
-    add_render_arguments(commands.add_parser("render", help=help_text, description=help_text))
+    add_render_arguments(parser.add_command("render", help_text))
 
     help_text = (
         "say which strategies a render of a scene file uses, which it skips, and what light none finds"
     )
-    explain = commands.add_parser("explain", help=help_text, description=help_text)
+    explain = parser.add_command("explain", help_text)
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
-    measuring.add_commands(commands)
+    measuring.add_commands(parser.add_command)
     return parser
 
 

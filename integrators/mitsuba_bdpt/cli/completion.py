@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from .mistakes import USAGE
 from .render import say
 
 
@@ -17,7 +18,7 @@ def run(shell: str, parser: argparse.ArgumentParser) -> int:
             "error: completion needs shtab; install it with: pip install 'mitsuba-bdpt[completion]'",
             file=sys.stderr,
         )
-        return 2
+        return USAGE
     parser.prog = "mitsuba-bdpt"
     say(shtab.complete(parser, shell))
     return 0

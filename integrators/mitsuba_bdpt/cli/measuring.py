@@ -48,10 +48,10 @@ def check_installed(command: str) -> None:
         )
 
 
-def add_commands(commands) -> None:
-    """Add the parsers of all subcommands to those of ``commands``."""
+def add_commands(add_command: Callable[[str, str], argparse.ArgumentParser]) -> None:
+    """Declare all subcommands; ``add_command`` makes the parser of one, of its name and help."""
     for name, (help_text, declare, measuring) in COMMANDS.items():
-        parser = commands.add_parser(name, help=help_text, description=help_text)
+        parser = add_command(name, help_text)
         text = "folder with scenes/, references/, presets/, results/; default: the current one"
         parser.add_argument("--project", type=Path, default=Path(), metavar="DIR", help=text)
         declare(parser)

@@ -1,15 +1,17 @@
-"""What a command answers to a user's mistake: one line, and the exit status 2 (as argparse's), no traceback.
+"""How a command ends on an error: one line on standard error without a traceback, and an exit status.
 
-Taken for mistakes is what names something that the user gave:
+Usage errors, `USAGE`, name something that the user gave; the same command would fail again:
 
 * `errors.UsageError` and `errors.UnsupportedError`: a value, a file or a name that cannot be used; also
   where Mitsuba or Dr.Jit have wrapped them.
 * ``argparse.ArgumentTypeError``: words of the command line that are read after the rest of it.
-* ``OSError``: a file or a folder that is missing, or cannot be written.
+* ``OSError`` about a path that is missing or cannot be written (`PATHS`).
 * ``RuntimeError`` of Mitsuba's parser: about a scene's file, an unknown plugin, or its parameters; where it
   holds the traceback of a plugin in Python, only if that ends in one of the first.
 
-All else is a bug, whose traceback must be seen.
+Failures, `FAILURE`, may not happen again: `errors.FailureError`, ``MemoryError`` and other ``OSError``.
+
+All else is a bug, whose traceback must be seen; Python's exit status is then that of a failure.
 """
 
 from __future__ import annotations
@@ -21,13 +23,26 @@ import sys
 from collections.abc import Callable
 from typing import TypeVar
 
-from ..errors import UnsupportedError, UsageError, behind, message
+from ..errors import FailureError, UnsupportedError, UsageError, behind, message
 
-STATUS = 2
-"""The exit status after a mistake."""
+FAILURE = 1
+"""The exit status after a failure."""
+
+USAGE = 2
+"""The exit status after a usage error, as argparse's."""
 
 INTERRUPTED = 130
 """The exit status of a process that SIGINT has ended."""
+
+TERMINATED = 143
+"""The exit status of a process that SIGTERM has ended."""
+
+STATUSES = (
+    f"Exit status: 0 done; {FAILURE} failed, which may not happen again (a full disk, a lost cluster, too "
+    f"little memory); {USAGE} usage error in the command line or the scene, which would happen again; "
+    f"{INTERRUPTED} ended by SIGINT (Ctrl-C), {TERMINATED} by SIGTERM."
+)
+"""What ``--help`` says of them."""
 
 Status = TypeVar("Status", int, int | None)
 
@@ -35,16 +50,17 @@ IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt
 
 
 def answered(main: Callable[[], Status]) -> Status | int:
-    """The exit status of ``main``; that of a mistake if there was one, which is printed."""
+    """The exit status of ``main``; that of its error if it raises one, which is printed."""
     try:
         return main()
     except Exception as error:
         if behind(error, KeyboardInterrupt) is not None:
             raise KeyboardInterrupt from error
-        if not is_mistake(error):
+        status = status_of(error)
+        if status is None:
             raise
         print(f"error: {' '.join(in_words(error).split())}", file=sys.stderr)
-        return STATUS
+        return status
 
 
 REMEDIES = {
@@ -61,17 +77,35 @@ REMEDIES = {
 """What to do about errors of the system."""
 
 
+PATHS = (*REMEDIES.keys() - {errno.ENOSPC, errno.EDQUOT}, errno.ENAMETOOLONG, errno.ELOOP)
+"""Errors of the system about a path that the user gave."""
+
+
 def in_words(error: Exception) -> str:
     """What went wrong; of what the system could not do, with which file, and what to do about it."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({message(error) or 'no more was given'}); {MEMORY_REMEDY}"
     if not isinstance(error, OSError) or error.strerror is None or error.filename is None:
         return message(error)
     remedy = REMEDIES.get(error.errno or 0)
     return f"{str(error.filename)!r}: {error.strerror}" + (f"; {remedy}" if remedy else "")
 
 
+MEMORY_REMEDY = "render a smaller --size, or parts of the image by --crop"
+
+
+def status_of(error: Exception) -> int | None:
+    """The exit status after an ``error``, see above; None for a bug."""
+    if is_mistake(error):
+        return USAGE
+    return FAILURE if isinstance(error, FailureError | MemoryError | OSError) else None
+
+
 def is_mistake(error: Exception) -> bool:
-    """Whether the user is to mend it, see above."""
-    if isinstance(error, OSError | argparse.ArgumentTypeError):
+    """Whether an ``error`` is a usage error, see above."""
+    if isinstance(error, OSError):
+        return error.errno in PATHS
+    if isinstance(error, argparse.ArgumentTypeError):
         return True
     if behind(error, UsageError, UnsupportedError) is not None:
         return True

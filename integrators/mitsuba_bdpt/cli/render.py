@@ -16,14 +16,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError
+from ..errors import CommandError, FailureError, behind
 from ..files.images import check_channels, check_png, prepare_output, write_images
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..host.versions import versions
 from ..progress import display, readable
 from ..run.rendering import PassReport
 from . import checkpoints, cluster, extension, live
-from .mistakes import INTERRUPTED, in_words
+from .mistakes import INTERRUPTED, answered, in_words, is_mistake
 from .signals import Ending, terminable
 
 UNLIMITED_SPP = 1 << 16
@@ -54,28 +54,36 @@ def run(options: Namespace) -> int:
     """Render as the command line `options` say and return the exit status."""
     with terminable() as ending:
         try:
-            check_file(options.scene)  # before a folder is made for its image
-            jobs = jobs_of(options)
-            for job in jobs:
-                prepare_output(job.output)
-                check_options(job)
-            scene, integrator, used = loaded(options)
-            check_integrator(options, integrator)
-            for job in jobs:
-                film = choose_sensor(scene, job.sensor).film()
-                check_png(film)
-                check_channels(film, integrator.aov_names())
-                samples_per_pixel(scene, job)
-            print(f"integrator: {used}", file=sys.stderr)
-            for job in jobs:
-                if not render_job(scene, integrator, job, ending):
-                    return ending.status
+            return answered(lambda: _run(options, ending))
         except KeyboardInterrupt:
             print("interrupted; no image written", file=sys.stderr)
             return ending.status
-        except (OSError, RuntimeError, TypeError, ValueError) as error:
-            print(f"error: {in_words(error)}", file=sys.stderr)
-            return 1
+
+
+def _run(options: Namespace, ending: Ending) -> int:
+    """`run`, whose errors are raised."""
+    check_file(options.scene)  # before a folder is made for its image
+    jobs = jobs_of(options)
+    for job in jobs:
+        prepare_output(job.output)
+        check_options(job)
+    scene, integrator, used = loaded(options)
+    check_integrator(options, integrator)
+    for job in jobs:
+        film = choose_sensor(scene, job.sensor).film()
+        check_png(film)
+        check_channels(film, integrator.aov_names())
+        samples_per_pixel(scene, job)
+    print(f"integrator: {used}", file=sys.stderr)
+    for job in jobs:
+        try:
+            if not render_job(scene, integrator, job, ending):
+                return ending.status
+        except (OSError, RuntimeError) as error:
+            # What was wrong with a path has come out before.
+            if behind(error, KeyboardInterrupt) or (is_mistake(error) and not isinstance(error, OSError)):
+                raise
+            raise FailureError(in_words(error)) from error
     return 0
 
 
@@ -102,7 +110,13 @@ def loaded(options: Namespace) -> Loaded:
     if options.verbose:
         levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
         mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
-    found = load(options)
+    try:
+        found = load(options)
+    except RuntimeError as error:
+        of_plugin = "Traceback (most" in str(error)
+        if behind(error, KeyboardInterrupt) or is_mistake(error) or of_plugin:
+            raise
+        raise CommandError(in_words(error)) from error
     # After the scene: with one thread Mitsuba reads no EXR, see `two_threads`.
     if options.threads is not None:
         dr.set_thread_count(options.threads)
@@ -162,31 +176,33 @@ def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
             write_images(film, rescued, attributes, job.exposure)
         except OSError:
             raise error from None
-        raise CommandError(f"{in_words(error)}; the image is {str(rescued)!r} instead") from error
+        raise FailureError(f"{in_words(error)}; the image is {str(rescued)!r} instead") from error
 
 
 def say(line: str) -> None:
-    """Print a ``line``; that nobody listens any more must not cost an image, or the next ones."""
+    """Print a ``line``; that nobody reads it any more must not cost an image, or the next ones."""
     try:
         print(line, flush=True)
     except OSError as error:
         sys.stdout = None
-        print(f"warning: standard output: {error}", file=sys.stderr)
+        if not isinstance(error, BrokenPipeError):  # of a reader who has seen enough, such as head
+            print(f"warning: standard output: {error}", file=sys.stderr)
 
 
 def explain(options: Namespace) -> int:
     """Print what a render as the command line `options` say would do, and return the exit status."""
     try:
-        scene, integrator, _ = loaded(options)
-        sensor = choose_sensor(scene, options.sensor)
-        spp = options.spp or sensor.sampler().sample_count()
-        say(integrator.explain(scene, sensor, spp))
+        return answered(lambda: _explain(options))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
-        print(f"error: {in_words(error)}", file=sys.stderr)
-        return 1
+
+
+def _explain(options: Namespace) -> int:
+    """`explain`, whose errors are raised."""
+    scene, integrator, _ = loaded(options)
+    sensor = choose_sensor(scene, options.sensor)
+    say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
     return 0
 
 
@@ -222,7 +238,7 @@ def check_options(options: Namespace) -> None:
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
     """Raise ``CommandError`` for options that only ``bdpt`` can follow, and for what these cannot."""
     for name in ("checkpoint", "scheduler", "preview", "tev"):
-        if getattr(options, name) is not None and not hasattr(integrator, "assemble"):
+        if getattr(options, name) is not None and not is_ours(integrator):
             raise CommandError(
                 f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "
                 "--integrator bdpt."
@@ -287,7 +303,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
             watch = all_of([*watchers, shown])
             integrator.on_pass = watch if rest is None else rest.watching(watch)
         arguments = {} if start is None else {"start": start}
-        integrator.render(scene, options.sensor, seed, spp, develop=False, evaluate=True, **arguments)
+        integrator.render(scene, options.sensor, seed, spp, not is_ours(integrator), **arguments)
         dr.sync_thread()
         shown.finish()
     except KeyboardInterrupt:
@@ -315,6 +331,11 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
         else:
             kept.write()
     return outcome
+
+
+def is_ours(integrator: mi.Integrator) -> bool:
+    """Whether this is `bdpt`, which can leave its result to the film; `prb` renders only what it develops."""
+    return hasattr(integrator, "assemble")
 
 
 def asked_error(integrator) -> float:
@@ -348,7 +369,7 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
     try:
         while done < spp and (done == 0 or time.perf_counter() - started < options.time):
             size, seed = min(PASS_SPP, spp - done), options.seed + done // PASS_SPP
-            integrator.render(scene, options.sensor, seed, size, develop=False, evaluate=True)
+            integrator.render(scene, options.sensor, seed, size)
             # Raw sums with their weights: passes of any size and filter add up.
             total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
             done += size

@@ -8,10 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from .mistakes import INTERRUPTED
-
-TERMINATED = 143
-"""The exit status of a process that SIGTERM has ended."""
+from .mistakes import INTERRUPTED, TERMINATED
 
 STATUS = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
 

@@ -12,7 +12,7 @@ import struct
 import sys
 from typing import TYPE_CHECKING
 
-from ..errors import CommandError
+from ..errors import FailureError
 
 # Not here: `doctor` runs where it is missing.
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class Tev:
         try:
             self._socket = socket.create_connection((host, port), TIMEOUT)
         except OSError as error:
-            raise CommandError(
+            raise FailureError(
                 f"tev={host}:{port} does not answer ({error}); start tev there (it listens on port {PORT} "
                 "unless told otherwise), or leave --tev out."
             ) from error

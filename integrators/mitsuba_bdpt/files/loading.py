@@ -325,6 +325,8 @@ def _in_words(error: str, options: Namespace) -> str | None:
     )
     if missing:
         return f"{error}{_files_near(options.scene, missing[1])}"
+    if suggested := _unused_parameters(error, options):
+        return suggested
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
     given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
     if strange and given:
@@ -341,6 +343,29 @@ def _in_words(error: str, options: Namespace) -> str | None:
     if missing[1] == options.integrator:
         return f"integrator={missing[1]!r} is not a plugin; {question or 'use for example bdpt'}".rstrip()
     return f"{error} {question.capitalize()}".rstrip() if question else None
+
+
+def _unused_parameters(error: str, options: Namespace) -> str | None:
+    """What to say of Mitsuba's ``error`` about parameters of the scene file that a plugin does not have.
+
+    None for other errors, and for names that resemble none of the plugin's.
+    """
+    found = re.search(r'Found \d+ unreferenced \w+ in \w+ plugin of type "([^"]*)"', error)
+    names = re.findall(r'^  - \w+ "([^"]*)"', error, re.MULTILINE) if found else []
+    if found is None or set(names) & {key for key, _ in options.properties}:
+        return None
+    questions = "".join(did_you_mean(name, words_of(found[1])) for name in names)
+    return f"{error.rstrip()}; {questions.rstrip()}" if questions else None
+
+
+def words_of(plugin: str) -> list[str]:
+    """Words in the library of one of Mitsuba's plugins, among them most names of its parameters.
+
+    Mitsuba cannot list parameters that are not given. Empty for plugins in Python.
+    """
+    library = next((Path(mi.__file__).parent / "plugins").glob(f"{plugin}.*"), None)
+    words = re.findall(rb"(?<=\0)[a-z][a-z0-9_]{2,}(?=\0)", library.read_bytes()) if library else []
+    return [word.decode() for word in words]
 
 
 def _rejected(error: str, options: Namespace) -> str | None:
