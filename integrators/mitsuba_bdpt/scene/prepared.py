@@ -12,6 +12,7 @@ from ..errors import UnsupportedError
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, children, is_instance, named
 from ..media.media import Media, Space
+from ..sensors.checks import check_sensor
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
@@ -30,6 +31,7 @@ class PreparedScene:
         self.scene = scene
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene, ShapeFacts.of(scene, sensor))
+        check_sensor(sensor, scene.sensors())
         self.camera = prepare(sensor, self.emitters.shape_errors, self.surfaces)
         found = bsdfs(scene)
         _prepare_bitmaps(found)

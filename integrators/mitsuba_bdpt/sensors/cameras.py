@@ -21,6 +21,8 @@ import numpy as np
 
 from ..geometry import rays
 from ..host.introspection import number, own_parameters
+from . import checks
+from .checks import inverse, rays_of
 from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
 
 KINDS = ("PerspectiveCamera", "ThinLensCamera")
@@ -224,7 +226,7 @@ class Camera(Sensor):
 def _numbers(sensor, share: float):
     """What `_View.of` takes; ``share`` see `Region`."""
     lens = sensor.class_name() == KINDS[1]
-    to_world = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    to_world = checks.to_world(sensor)
     to_film, origin = _film_map(sensor, to_world)
     # Area at z = 1 that one crop window covers, times the share that a border adds.
     area = 1 / abs(np.linalg.det(to_film)) * share
@@ -250,9 +252,8 @@ def _transform(rows, v, w):
 def _film_map(sensor, to_world):
     """Affine map from (x/z, y/z) in camera space to the crop window's unit square."""
     u = mi.Point2f([0, 1, 0], [0, 0, 1])
-    ray, _ = sensor.sample_ray(0, 0.5, u, mi.Point2f(0.5))
-    d = np.array(ray.d, dtype=np.float64)
+    _, d, _ = rays_of(sensor, u, mi.Point2f(0.5))
     local = np.linalg.inv(to_world[:3, :3]) @ d
     xy = (local[:2] / local[2]).T
-    to_film = np.linalg.inv(np.stack([xy[1] - xy[0], xy[2] - xy[0]], axis=1))
+    to_film = inverse(np.stack([xy[1] - xy[0], xy[2] - xy[0]], axis=1), sensor)
     return to_film, -to_film @ xy[0]

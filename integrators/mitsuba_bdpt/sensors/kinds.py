@@ -6,9 +6,8 @@ import mitsuba as mi
 
 from ..errors import UnsupportedError
 from ..geometry.rounding import ShapeErrors
-from ..geometry.to_world import check_to_world
-from ..host.introspection import children, named, number
-from . import cameras
+from ..host.introspection import children, named
+from . import cameras, checks
 from .others import Distant, IrradianceMeter, Orthographic, RayOnlySensor
 from .records import Sensor
 
@@ -32,19 +31,26 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, bounded: bool = True) 
     if kind == "IrradianceMeter":
         return _meter(sensor, shape_errors)
     if kind == "RadianceMeter":
-        return RayOnlySensor(
+        return _by_rays(
             sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
         )
     if kind == "DistantSensorImpl":
         # Only its text tells the three kinds apart.
         if UNTARGETED in str(sensor):
             return Distant(sensor) if bounded else RayOnlySensor(sensor, "the scene has no surface")
-        return RayOnlySensor(sensor, "the target of a distant sensor is out of a plugin's reach")
-    return RayOnlySensor(sensor, f"of the class {kind} nothing but its camera rays is known")
+        return _by_rays(sensor, "the target of a distant sensor is out of a plugin's reach")
+    return _by_rays(sensor, f"of the class {kind} nothing but its camera rays is known")
+
+
+def _by_rays(sensor: mi.Sensor, reason: str, views: list[mi.Sensor] | None = None) -> Sensor:
+    """A sensor that takes part by its camera rays alone, which are tried first."""
+    for view in views or [sensor]:
+        checks.check_rays(view)
+    return RayOnlySensor(sensor, reason, views)
 
 
 def _batch(sensor) -> Sensor:
-    views = [view for view in children(sensor).values() if isinstance(view, mi.Sensor)]
+    views = checks.views(sensor)
     if sensor.film().sample_border():
         raise UnsupportedError(
             f"film of batch sensor {named(sensor)} has sample_border, which has no meaning beside "
@@ -58,7 +64,7 @@ def _batch(sensor) -> Sensor:
     kinds = {view.class_name() for view in views}
     if len(kinds) == 1 and kinds <= set(cameras.KINDS):
         return cameras.Camera(sensor, views)
-    return RayOnlySensor(sensor, "the views of the batch are not all perspective or all thinlens", views)
+    return _by_rays(sensor, "the views of the batch are not all perspective or all thinlens", views)
 
 
 def _meter(sensor, shape_errors) -> Sensor:
@@ -68,13 +74,6 @@ def _meter(sensor, shape_errors) -> Sensor:
             f"film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
             "its shape; set it to false"
         )
-    shape = sensor.get_shape()
-    if number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
-        raise UnsupportedError(
-            f"irradiance meter {named(sensor)} is on a {shape.class_name()} ({named(shape)}), of which "
-            "Mitsuba samples no points; put it on another shape"
-        )
-    check_to_world(shape, f"irradiance meter {named(sensor)}")
     if tuple(film.size()) != (1, 1):
         return RayOnlySensor(
             sensor, "the film has more than one pixel: which of them a point belongs to is unknown"

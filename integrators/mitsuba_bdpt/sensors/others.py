@@ -10,6 +10,7 @@ from ..geometry import rays
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..geometry.smooth_meshes import SmoothMeshes
 from ..host.introspection import number
+from .checks import inverse, rays_of
 from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
 
 
@@ -53,11 +54,10 @@ class Orthographic(_Parallel):
 
     def __init__(self, sensor):
         super().__init__(sensor)
-        ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.Point2f(0.5))
-        o, d = (np.array(v, dtype=np.float64) for v in (ray.o, ray.d))
+        o, d, ray = rays_of(sensor, mi.Point2f([0, 1, 0], [0, 0, 1]), mi.Point2f(0.5))
         origin, axis = o[:, 0], d[:, 0] / np.linalg.norm(d[:, 0])
         basis = np.stack([o[:, 1] - origin, o[:, 2] - origin, axis], axis=1)
-        rows = np.linalg.inv(basis)
+        rows = inverse(basis, sensor)
         vector = mi.Vector3f
         self._origin, self._axis = dr.opaque(mi.Point3f, origin.tolist()), dr.opaque(vector, axis.tolist())
         self._along = [dr.opaque(vector, basis[:, i].tolist()) for i in (0, 1)]
@@ -91,8 +91,7 @@ class Distant(_Parallel):
     def __init__(self, sensor):
         super().__init__(sensor)
         u = mi.Point2f([0.5, 1, 0.5], [0.5, 0.5, 1])  # the middle and two points of the rim
-        ray, _ = sensor.sample_ray(0, 0.5, mi.Point2f(0.5), u)
-        o, d = (np.array(v, dtype=np.float64) for v in (ray.o, ray.d))
+        o, d, _ = rays_of(sensor, mi.Point2f(0.5), u)
         axis, across = d[:, 0] / np.linalg.norm(d[:, 0]), o[:, 1:] - o[:, :1]
         vector = mi.Vector3f
         self._origin = dr.opaque(mi.Point3f, o[:, 0].tolist())
