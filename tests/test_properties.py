@@ -17,6 +17,7 @@ import mitsuba_bdpt
 import numpy as np
 import pytest
 import scene_parts as parts
+from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.properties import check_variant
 from mitsuba_bdpt.run import schedule, work
 from mitsuba_bdpt.scene.prepared import PreparedScene
@@ -816,8 +817,8 @@ def test_strategy_images_check_their_memory():
     [
         (0, 8, "of 0 x 8 has no pixels"),
         (8, 0, "of 8 x 0 has no pixels"),
-        (1 << 16, 1 << 14, "of 65536 x 16384 takes .* GiB and 4294967296 numbers"),
-        (100_000, 100_000, "of 100000 x 100000 takes .* crop windows"),
+        (1 << 16, 1 << 14, "of 65536 x 16384 pixels takes about 288 GiB of memory"),
+        (100_000, 100_000, "of 100000 x 100000 pixels takes .* crop windows"),
     ],
 )
 def test_films_that_are_refused(width, height, words):
@@ -872,11 +873,13 @@ def test_gradients_do_not_matter_to_what_is_told():
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Rationale: features add to the sums of camera samples, `variance` keeps sums and images of its own.
     Expected: on a machine that has room for the film alone, each of them is refused in words."""
-    monkeypatch.setattr("mitsuba_bdpt.image.film_limits.available", lambda: 300 * 64 * 64)
+    monkeypatch.setattr(memory, "available", lambda: memory.Available(300 * 64 * 64, "the machine's memory"))
     scene = glowing_sphere(size=64)
     assert image(integrator(), scene, spp=8).shape == (64, 64, 3)
     for more in ({"variance": True}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
-        with pytest.raises(ValueError, match="bdpt: the film of 64 x 64 takes .* crop windows"):
+        with pytest.raises(
+            ValueError, match="bdpt: the film of 64 x 64 pixels takes .* GiB .the machine's memory.; render"
+        ):
             integrator(**more).render(scene, spp=8)
 
 

@@ -218,6 +218,17 @@ def test_files_elsewhere(capsys):
     assert checkpoints.digest(options) != before
 
 
+def test_a_film_that_takes_more_memory_than_is_asked_for_is_refused_before_the_render(capsys):
+    """Expected: at once, by render and explain, with the size and what there is."""
+    for command in ("render", "explain"):
+        assert main([command, str(SCENE), "--size", "4096x4096", "--spp", "1", "--memory", "2"]) == 2
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert (
+            "4096 x 4096 pixels takes about 4.5 GiB of memory; there are 2 GiB (what was asked for" in error
+        )
+    assert main([*SMALL, "--spp", "1", "-o", "a.exr"]) == 0, "the next command has no such limit"
+
+
 def test_threads_and_log(capfd):
     """Expected: Dr.Jit has so many threads, and -v shows what the integrator logs."""
     before, level = dr.thread_count(), mi.log_level()

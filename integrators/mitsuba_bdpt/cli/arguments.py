@@ -160,6 +160,11 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add("--crop", type=crop, metavar="X,Y,W,H", help=text)
     text = "number of threads; default: one for each core"
     add("--threads", type=number(int, 1), metavar="N", help=text)
+    text = (
+        "memory that the process may take: films that need more are an error before the first sample; "
+        "default: the limits of the machine, of its control groups and of ulimit"
+    )
+    add("--memory", type=number(float, 1e-3), metavar="GIB", help=text)
     text = "say more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
     add("-v", "--verbose", action="count", default=0, help=text)
 

@@ -19,6 +19,7 @@ import numpy as np
 from ..errors import CommandError, FailureError, behind
 from ..files.images import check_channels, check_png, prepare_output, write_images
 from ..files.loading import Loaded, check_file, choose_sensor, load
+from ..host import memory
 from ..host.versions import versions
 from ..progress import display, readable
 from ..run.rendering import PassReport
@@ -106,7 +107,8 @@ def jobs_of(options: Namespace) -> list[Namespace]:
 
 
 def loaded(options: Namespace) -> Loaded:
-    """`load`, with what holds for the whole process: how much is logged, and the number of threads."""
+    """`load`, with what holds for the whole process: its log, its memory and the number of its threads."""
+    memory.set_limit(options.memory and options.memory * 2**30)
     if options.verbose:
         levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
         mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
@@ -213,7 +215,7 @@ def check_options(options: Namespace) -> None:
             raise CommandError(f"{name} needs --checkpoint MINUTES: how often to write them.")
     if options.parts is not None and options.scheduler is None:
         raise CommandError("parts needs --scheduler: without one, a render is made in one piece.")
-    for name in ("checkpoint", "target_error", "time", "threads"):
+    for name in ("checkpoint", "target_error", "time", "threads", "memory"):
         if options.scheduler is not None and getattr(options, name) is not None:
             raise CommandError(
                 f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
@@ -237,7 +239,7 @@ def check_options(options: Namespace) -> None:
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
     """Raise ``CommandError`` for options that only ``bdpt`` can follow, and for what these cannot."""
-    for name in ("checkpoint", "scheduler", "preview", "tev"):
+    for name in ("checkpoint", "scheduler", "preview", "tev", "memory"):
         if getattr(options, name) is not None and not is_ours(integrator):
             raise CommandError(
                 f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-import os
-
 import mitsuba as mi
 
 from ..errors import UsageError
+from ..host import memory
 from .channels import Channels
 from .layers import image_count
 
@@ -21,19 +19,35 @@ STRATEGY_MEMORY = 2 << 30
 # which there are two while the former are added, in double precision.
 SINGLE, DOUBLE, ALL = 4, 8, 2 * 8
 
+# Bytes of a number of the film while the image is made of the sums: two in double, three in single precision.
+OF_IMAGE = 2 * DOUBLE + 3 * SINGLE
+
+# Images in double precision while the variance is computed: two of two halves, and six of both.
+OF_VARIANCE = 2 * 2 + 6
+
 
 def check_film(film, channels: Channels, variance: bool):
-    """Raise `UsageError` if the film is larger than the machine, or than Dr.Jit can count."""
+    """Raise `UsageError` if the film takes more memory than there is, or more numbers than Dr.Jit counts."""
     width, height = (int(x) for x in film.crop_size())
     numbers = width * height * max(channels.camera, channels.light)
     per_pixel = channels.camera * (SINGLE + ALL) + channels.light * (DOUBLE + ALL)
-    if variance:  # sums at the last replicate; means and squares of two halves
-        per_pixel += DOUBLE * (channels.camera + channels.light) + 2 * 2 * DOUBLE * channels.colours
-    needed, there = width * height * per_pixel, available()
-    if needed > there or numbers >= MOST_NUMBERS:
+    of_film = channels.camera + channels.stokes
+    if variance:  # and sums at the last replicate
+        of_film += channels.colours
+        per_pixel += DOUBLE * (channels.camera + channels.light + OF_VARIANCE * channels.colours)
+    needed, there = width * height * (per_pixel + OF_IMAGE * of_film), memory.available()
+    # What a GPU has is not known here.
+    on_gpu = (mi.variant() or "").startswith("cuda")
+    if needed > there.bytes and not on_gpu:
         raise UsageError(
-            f"the film of {width} x {height} takes {needed / 2**30:.3g} GiB and {numbers} numbers; "
-            f"there are {there / 2**30:.3g} GiB, and Dr.Jit counts to {MOST_NUMBERS}; render crop windows"
+            f"the film of {width} x {height} pixels takes about {needed / 2**30:.3g} GiB of memory; there "
+            f"are {there.bytes / 2**30:.3g} GiB ({there.limit}); render a smaller film, or crop windows "
+            "one by one"
+        )
+    if numbers >= MOST_NUMBERS:
+        raise UsageError(
+            f"the film of {width} x {height} pixels takes {numbers} numbers, and Dr.Jit counts to "
+            f"{MOST_NUMBERS}; render crop windows one by one"
         )
 
 
@@ -51,12 +65,3 @@ def check_strategies(film, depth: int, merges: bool):
             f"{needed / 2**30:.1f} GiB, more than {STRATEGY_MEMORY / 2**30:.0f} GiB; use a smaller "
             "film or max_depth"
         )
-
-
-def available() -> float:
-    """What the machine has, in bytes."""
-    if (mi.variant() or "").startswith("cuda"):
-        return math.inf  # what a GPU has is not known here
-    if not hasattr(os, "sysconf"):
-        return math.inf  # Windows: Dr.Jit says it
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
