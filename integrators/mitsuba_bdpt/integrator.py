@@ -15,7 +15,6 @@ import mitsuba as mi
 from .emitters.kinds import third_party_elsewhere
 from .errors import UnsupportedError, UsageTypeError
 from .host import tracebacks
-from .host.notices import warn_once
 from .image.features import feature_names
 from .image.layers import layer_names
 from .planning.budget import is_open
@@ -42,9 +41,11 @@ counts like any other, so that the rest of the image is as if it were zero in tr
 ``statistics["non_finite"]`` counts them, ``statistics["non_finite_in_pilot"]`` those of the pilots, which
 decide from the rest, and one message of Mitsuba's log (``Warn``) after the render names the parameters that
 hold such numbers. One before the first render of a scene names BSDFs that reflect more light than they
-receive; one after it the lamps without area of whose light more than a hundredth of the image's is missing,
-because they shine through glass on what is seen through glass. ``statistics["lost_light"]`` has the estimated
-shares by the number of the emitter; what is lost is estimated at the first render, and again after edits.
+receive. Another one names lamps without area whose light is missing where it is seen through glass, if that
+is more than a hundredth of the image's: before the first pass where the brightness of the image is known from
+a pilot or from ``decisions``, else after a first pass of one sample per pixel. ``statistics["lost_light"]``
+has the estimated shares by the number of the emitter; they are estimated at the first render, and again after
+edits.
 
 Layers of the film come in this order: colours and alpha, Stokes vectors, features, denoised colours,
 variance, strategies.
@@ -164,7 +165,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
             self.statistics = statistics(render)
             messages.warn_of_non_finite(self.statistics, scene)
         messages.log(self.statistics)
-        self._look_for_lost_light(render)
+        self.statistics["lost_light"] = render.lost_light()
         messages.warn_of_late_decisions(self.settings.decisions, len(self.statistics["passes"]))
         return _result(sensor.film(), develop, evaluate)
 
@@ -233,16 +234,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         render.accumulator.finish()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
-        self._look_for_lost_light(render)
+        self.statistics["lost_light"] = render.lost_light()
         return _result(sensor.film(), develop, evaluate)
-
-    def _look_for_lost_light(self, render: Render):
-        """Say once, and put into the statistics, what light no strategy in use finds."""
-        shares, text = render.lost_light()
-        self.statistics["lost_light"] = shares
-        if text:
-            about = "lost light", render.plan.splat, render.plan.direct
-            warn_once(render.prepared.scene, render.sensor, text, about)
 
     def aov_names(self) -> list[str]:
         """Names of the film's layers beside colours and alpha."""

@@ -235,9 +235,9 @@ def test_edits_during_a_render_are_seen(monkeypatch):
 
     def look(prepared, plan, max_depth):
         looks.append(max_depth)
-        return {}
+        return lost_light.LostLight({})
 
-    monkeypatch.setattr(lost_light, "lost_radiance", look)
+    monkeypatch.setattr(lost_light, "estimate", look)
     texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
     painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     scene, integrator = behind_glass(painted=painted), bdpt()

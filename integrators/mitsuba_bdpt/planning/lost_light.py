@@ -80,7 +80,8 @@ class _Ends:
 
     ``p`` position, ``n`` geometric normal on the side they come from, ``through``: light is scattered through
     the surface, ``weight`` and ``reflectance`` of the surface as `_carried`, ``edges``, ``distance``
-    travelled (of what is seen: the radius of its disk, see `_seen`), ``active``: there is such an end.
+    travelled (of what is seen: the radius of its disk, see `_seen`), ``through_shape``: index of the first
+    shape with a delta event, ``active``: there is such an end.
     """
 
     p: mi.Point3f
@@ -90,6 +91,7 @@ class _Ends:
     edges: mi.UInt32
     distance: mi.Float
     reflectance: mi.UnpolarizedSpectrum
+    through_shape: mi.UInt32
     active: mi.Bool
 
     def some(self):
@@ -116,14 +118,41 @@ class _Ends:
 class _Walk:
     """A subpath on its way.
 
-    Its ray, what it carries, its edges, the distance that it has come; whether it goes on.
+    Its ray, what it carries, its edges, the distance that it has come, the index of the first shape with a
+    delta event; whether it goes on.
     """
 
     ray: mi.Ray3f
     weight: mi.UnpolarizedSpectrum
     edges: mi.UInt32
     distance: mi.Float
+    through_shape: mi.UInt32
     active: mi.Bool
+
+
+@dataclass(frozen=True)
+class LostLight:
+    """What no strategy samples: the mean over the film, by the index of the emitter.
+
+    ``colours`` as they are summed; ``through``: ids of the shapes through which most of it is seen, the
+    brightest first.
+    """
+
+    colours: dict[int, np.ndarray]
+    through: tuple[str, ...] = ()
+
+    @property
+    def radiance(self) -> dict[int, float]:
+        """The brightest colour of the sum over all lamps, of which each has a part by its own brightest."""
+        single = {i: float(colour.max()) for i, colour in self.colours.items()}
+        brightest = float(sum(self.colours.values()).max()) if single else 0.0
+        scale = brightest / max(sum(single.values()), np.finfo(float).tiny)
+        return {i: radiance * scale for i, radiance in single.items()}
+
+    @property
+    def intensity(self) -> float:
+        """The mean over the colours, in which pilots measure images."""
+        return float(sum(colour.mean() for colour in self.colours.values()))
 
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
@@ -137,35 +166,45 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
     return bool(unreachable_paths(prepared, plan, settings))
 
 
-def lost_radiance(prepared: PreparedScene, plan: Plan, max_depth: int) -> dict[int, float]:
-    """Mean radiance over the film that is lost, by the index of the emitter.
+def estimate(prepared: PreparedScene, plan: Plan, max_depth: int) -> LostLight:
+    """Estimate the light that is lost.
 
     ``max_depth`` see `Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says
     so, as of one that emits into directions that are: a render that does not make such paths may meet no such
-    number itself, and `diagnostics` is asked only if it did. Of several lamps together it is the brightest
-    colour of their sum, of which each has a part by its own brightest.
+    number itself, and `diagnostics` is asked only if it did.
     """
     total = np.zeros((len(prepared.scene.emitters()), len(mi.UnpolarizedSpectrum())))
+    through: tuple[str, ...] = ()
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         points, _, times = _seen(prepared, plan, max_depth).some()
         if points is None:
-            return {}
+            return LostLight({})
         light, lamp, astray = _lit(prepared, plan, max_depth)
         total[dr.gather(mi.UInt32, lamp, dr.compress(astray)).numpy()] = np.nan
         photons, index, more = light.some()
         if photons is not None:
-            found = _meetings(photons, points, max_depth) * (times * more / SUBPATHS**2)
+            found, shapes = _meetings(photons, points, max_depth)
+            found *= times * more / SUBPATHS**2
             lamps = dr.gather(mi.UInt32, lamp, index)
-            dr.eval(found, lamps)
+            dr.eval(found, shapes, lamps)
+            through = _ids(shapes, found)
             for colour, values in zip(total.T, found, strict=True):
                 colour += np.bincount(lamps.numpy(), values.numpy(), len(colour))
     finite = np.isfinite(total).all(axis=1)
     if not finite.all():
         _warn_of_not_finite(prepared, np.flatnonzero(~finite))
     total = np.where(finite[:, None], total, 0)
-    single = total.max(axis=1)
-    single *= total.sum(axis=0).max() / max(single.sum(), np.finfo(float).tiny)
-    return {int(i): float(single[i]) for i in np.flatnonzero(single)}
+    return LostLight({int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}, through)
+
+
+def _ids(shapes: mi.UInt32, found: mi.UnpolarizedSpectrum) -> tuple[str, ...]:
+    """Ids of the ``shapes`` through which `NAMED` at most of what was ``found`` is seen, the most first."""
+    values = np.sum([np.array(colour) for colour in found], axis=0)
+    amounts = np.bincount(shapes.numpy(), np.where(np.isfinite(values), values, 0))
+    order = [i for i in np.argsort(-amounts) if i and amounts[i] >= WORTH_A_WORD * amounts.sum()]
+    names = [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0].id() for i in order[:NAMED]]
+    # A shape without id, or one that was merged of several, has none, or one that Mitsuba made up.
+    return tuple(name for name in names if name and not name.startswith("_unnamed_"))
 
 
 def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
@@ -179,10 +218,28 @@ def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
-def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float]) -> str:
+def shares(lost: LostLight, mean: float) -> dict[int, float]:
+    """Shares of the light of an image with this ``mean`` of its brightest colour, by the emitter's index."""
+    whole = mean + sum(lost.radiance.values())
+    return {i: radiance / whole for i, radiance in lost.radiance.items()}
+
+
+def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
+    """`shares` before the first pass, by the ``mean`` intensity that a pilot has measured.
+
+    None if they are too close to `WORTH_A_WORD` for the noise of a pilot: what it says may be twice as much.
+    """
+    share = lost.intensity / (mean + lost.intensity)
+    if not share >= 2 * WORTH_A_WORD:
+        return {}
+    whole = sum(lost.radiance.values())
+    return {i: share * radiance / whole for i, radiance in lost.radiance.items()}
+
+
+def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], through: Iterable[str]) -> str:
     """What is missing, and what to do, if it is `WORTH_A_WORD`; else empty.
 
-    ``shares`` of the image's light by the index of the emitter.
+    ``shares`` of the image's light by the index of the emitter; ``through`` see `LostLight`.
     """
     lost = sum(shares.values())
     if not lost >= WORTH_A_WORD:
@@ -194,7 +251,7 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float]) -> s
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "a lamp without area cannot be found that way", _remedy(lamps)
     if plan.splat:
-        what += " on what is seen through them"
+        what += f" on what is seen through {' and '.join(map(repr, through)) or 'them'}"
     elif not prepared.camera.connectible:
         why = f"no light can be traced to the sensor: {prepared.camera.reason}"
     else:
@@ -215,8 +272,8 @@ def _called(emitter: mi.Emitter) -> str:
 
 def _remedy(emitters: Iterable[mi.Emitter]) -> str:
     if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
-        return "set merging, or give the sun a disk: sunsky, an envmap, or an area light far away"
-    return "set merging, or give it a small area: an area light on a small sphere or disk"
+        return "set merging=true, or give the sun a disk: sunsky, an envmap, or an area light far away"
+    return "set merging=true, or give it a small area: an area light on a small sphere or disk"
 
 
 def _shared(prepared: PreparedScene, generator: PCG32) -> Shared:
@@ -320,6 +377,8 @@ def _follow(
         arrived = replace(walk, weight=weight, distance=distance, active=here)
         ends = dr.select(here, _end(si, surface, arrived, reflectance), ends)
         active = active & ~here & delta & (walk.edges < last)
+        first = active & (walk.edges == 1)
+        through = dr.select(first, dr.reinterpret_array(mi.UInt32, si.shape), walk.through_shape)
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         factor = mi.unpolarized_spectrum(factor)
@@ -329,9 +388,9 @@ def _follow(
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)
         edges = walk.edges + dr.select(active, mi.UInt32(1), 0)
         ray = rays.spawn(anchor, si.to_world(bs.wo), ray)
-        return _Walk(ray, weight, edges, distance, active), generator, ends
+        return _Walk(ray, weight, edges, distance, through, active), generator, ends
 
-    walk = _Walk(ray, weight, mi.UInt32(1), mi.Float(0), active)
+    walk = _Walk(ray, weight, mi.UInt32(1), mi.Float(0), mi.UInt32(0), active)
     *_, ends = dr.while_loop(
         (walk, generator, _nowhere()), lambda walk, *_: walk.active, body, label="delta events"
     )
@@ -342,7 +401,8 @@ def _follow(
 def _nowhere() -> _Ends:
     no = mi.Bool(False)
     black = mi.UnpolarizedSpectrum(0)
-    return _Ends(mi.Point3f(0), mi.Normal3f(0), no, black, mi.UInt32(0), mi.Float(0), black, no)
+    none = mi.UInt32(0)
+    return _Ends(mi.Point3f(0), mi.Normal3f(0), no, black, mi.UInt32(0), mi.Float(0), black, none, no)
 
 
 def _reflectance(si: mi.SurfaceInteraction3f, surface: mi.BSDFPtr, generator: PCG32, active: mi.Bool):
@@ -376,6 +436,7 @@ def _end(
         edges=walk.edges,
         distance=walk.distance,
         reflectance=reflectance * opacity,
+        through_shape=walk.through_shape,
         active=walk.active & seen,
     )
 
@@ -385,20 +446,24 @@ def _has(surface: mi.BSDFPtr, kind: mi.BSDFFlags):
 
 
 def _meetings(photons: _Ends, points: _Ends, max_depth: int):
-    """What each of the ``photons`` adds to the ``points`` around it."""
+    """What each of the ``photons`` adds to the ``points`` around it, and a shape through which it is seen."""
     count = dr.opaque(mi.UInt32, dr.width(points.p))
     longest = dr.opaque(mi.UInt32, max_depth)
 
-    def body(i: mi.UInt32, total: mi.UnpolarizedSpectrum) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum]:
+    def body(
+        i: mi.UInt32, total: mi.UnpolarizedSpectrum, shape: mi.UInt32
+    ) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
         point = dr.gather(_Ends, points, i)
         cos = dr.dot(point.n, photons.n)
         cos = dr.select(point.through, dr.abs(cos), cos)
         r2 = dr.square(point.distance)
         near = (dr.squared_norm(point.p - photons.p) < r2) & (cos > SAME_SURFACE)
         near &= point.edges + photons.edges <= longest
-        return i + 1, total + dr.select(near, point.weight / (dr.pi * r2), 0)
+        shape = dr.select(near, point.through_shape, shape)
+        return i + 1, total + dr.select(near, point.weight / (dr.pi * r2), 0), shape
 
-    state = mi.UInt32(0), dr.zeros(mi.UnpolarizedSpectrum, dr.width(photons.p))
-    _, total = dr.while_loop(state, lambda i, total: i < count, body, label="meetings")
+    width = dr.width(photons.p)
+    state = mi.UInt32(0), dr.zeros(mi.UnpolarizedSpectrum, width), dr.zeros(mi.UInt32, width)
+    _, total, shape = dr.while_loop(state, lambda i, *_: i < count, body, label="meetings")
     # One that meets nothing adds nothing, even if its weight is not finite.
-    return dr.select(spectra.is_zero(total), 0, total * photons.weight)
+    return dr.select(spectra.is_zero(total), 0, total * photons.weight), shape

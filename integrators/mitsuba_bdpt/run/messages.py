@@ -9,6 +9,8 @@ import mitsuba as mi
 
 from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
+from ..planning import lost_light
+from ..planning.lost_light import LostLight
 from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
 
 # Culprits that a message names, at most.
@@ -84,6 +86,12 @@ def warn_of_media(prepared, sensor):
             "bdpt: the medium that the sensor declares has no end, and no light from infinity (sky, sun) "
             "arrives through it; put a shape with a null BSDF around it",
         )
+
+
+def warn_of_lost_light(prepared, plan, shares: dict[int, float], lost: LostLight):
+    """Warn once, for a scene and ``plan``, of light that is not sampled, if its ``shares`` are large."""
+    if text := lost_light.in_words(prepared, plan, shares, lost.through):
+        warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
 
 
 def _some(found: list[str]) -> str:

@@ -22,6 +22,7 @@ from ..planning import lost_light
 from ..planning.choice import Prediction
 from ..planning.decision import MOST_ROULETTE
 from ..planning.findings import Findings
+from ..planning.lost_light import LostLight
 from ..planning.planner import Planner
 from ..properties import check_film, check_merging, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
@@ -35,6 +36,7 @@ from ..transport.merging import Merging, coefficient
 from ..transport.photon_guide import Guide
 from ..transport.plan import Plan
 from ..transport.wavelength_sets import SETS
+from . import messages
 from .pass_points import PassPoints
 from .progress import Progress
 from .schedule import REPLICATES, Step, batches, passes_since, schedule
@@ -101,7 +103,8 @@ class Render:
         self.kernel = self._kernel()
         # What `_guide` has made.
         self._guides: tuple[Guide | None] | None = None
-        # Whether the first pass, of one sample, gives roulette the scale of the image; see `_steps`.
+        # Whether the first pass, of one sample, gives the scale of the image, to roulette and to the share of
+        # light that is not sampled; see `_steps`.
         self._small_first: bool | None = None
         self._error: float | None = None
         # Of the newest report, see `_freeze`.
@@ -134,7 +137,11 @@ class Render:
                 if not number and self._is_exact_enough():  # the one that it goes on from was
                     break
                 self._decide_again()
+                if not number:
+                    self._predict_lost_light()
                 self._pass(step)
+                if not number:
+                    self.lost_light()
                 # The second pass is recorded while the first, a short one, runs.
                 if watched or number > 0:
                     self.meter.wait()
@@ -203,7 +210,8 @@ class Render:
         if self._small_first is None:
             plan, decisions = self.plan, self.settings.decisions
             known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
-            self._small_first = bool(plan.roulette and plan.light and not known)
+            wanted = (plan.roulette and plan.light) or self._lost() is not None
+            self._small_first = bool(wanted and not known)
         earlier = sum(self.passes)
         for step in schedule(self.prepared.camera, self.spp, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
@@ -345,19 +353,38 @@ class Render:
         self.meter.resume(progress.work, snapshot.spp)
         self._small_first = progress.small_first
 
-    def lost_light(self) -> tuple[dict, str]:
-        """Shares of the image's light that no strategy in use finds, by the index of the emitter.
+    def lost_light(self) -> dict[int, float]:
+        """Shares of the image's light that no strategy in use samples, by the index of the emitter.
 
-        Also in words, which are empty where it is little. Estimated once for a scene and plan, until an edit.
+        A warning says so, once for a scene and plan, where they are large.
+        """
+        lost = self._lost() if self.passes else None
+        if lost is None:
+            return {}
+        shares = lost_light.shares(lost, number(self.accumulator.mean()))
+        messages.warn_of_lost_light(self.prepared, self.plan, shares, lost)
+        return shares
+
+    def _lost(self) -> LostLight | None:
+        """Light that no strategy in use samples; None if there is none.
+
+        Estimated once for a scene and plan, until an edit.
         """
         prepared, plan, max_depth = self.prepared, self.plan, self.settings.max_depth
-        if not self.passes or not lost_light.is_possible(prepared, plan, self.settings):
-            return {}, ""
-        look = partial(lost_light.lost_radiance, prepared, plan, max_depth)
+        if not lost_light.is_possible(prepared, plan, self.settings):
+            return None
+        look = partial(lost_light.estimate, prepared, plan, max_depth)
         lost, _ = self.findings.find("lost light", (plan.splat, plan.direct, max_depth), look)
-        whole = number(self.accumulator.mean()) + sum(lost.values())
-        shares = {i: radiance / whole for i, radiance in lost.items()}
-        return shares, lost_light.in_words(prepared, plan, shares)
+        return lost if lost.colours else None
+
+    def _predict_lost_light(self):
+        """Warn before the first pass of light that is not sampled, if a decision knows the image's mean."""
+        made = self.planner.decided.decisions
+        if (lost := self._lost()) is None:
+            return
+        if made and made[-1].mean > 0:
+            shares = lost_light.predicted_shares(lost, made[-1].mean)
+            messages.warn_of_lost_light(self.prepared, self.plan, shares, lost)
 
 
 def raise_interrupt(error: BaseException):
