@@ -1,6 +1,8 @@
 """``render`` on a farm: signals, sizes, frames, more samples, what schedulers read."""
 
 import errno
+import json
+import math
 import os
 import re
 import signal
@@ -16,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import rendered
-from mitsuba_bdpt.cli import render, values
+from mitsuba_bdpt.cli import checkpoints, render, values
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.cli.signals import TERMINATED
 from mitsuba_bdpt.run.snapshot import read
@@ -186,11 +188,91 @@ def test_frames_are_sensors(capsys):
     for arguments, words in (
         (["--frames", "0-3"], "sensor=3 is not in the scene"),
         (["--frames", "0", "-s", "1"], "frames together with sensor"),
-        (["--frames", "0", "--resume", "--checkpoint", "1"], "frames together with checkpoint"),
     ):
         assert main(["render", "frames.xml", "-o", "other.exr", *arguments]) == 2
         assert words in capsys.readouterr().err
     assert not list(Path().glob("other*"))
+
+
+def test_frames_go_on_where_they_were(capsys, monkeypatch):
+    """Rationale: a queue repeats a command of a hundred frames that was ended at the fifty-seventh. Expected:
+    with checkpoints, frames that are done are not rendered again by the same command, the one that was
+    interrupted goes on, the others begin; by another command, or an edited scene, all are.
+    """
+    sensors(3)
+    arguments = ["render", "frames.xml", "--frames", "0-2", "--spp", "8", "-P", "spp_per_pass=2"]
+    arguments += ["-o", "shot.exr", "--checkpoint", "60", "--statistics", "shot.json"]
+    original, ended = render.render_job, []
+
+    def interrupted(scene, integrator, job, ending):
+        if job.sensor == 1 and not ended:
+            ended.append(job)
+            watch = checkpoints.Checkpoints.after_pass
+
+            def after_pass(self, report):
+                watch(self, report)
+                raise KeyboardInterrupt
+
+            with monkeypatch.context() as patch:
+                patch.setattr(checkpoints.Checkpoints, "after_pass", after_pass)
+                return original(scene, integrator, job, ending)
+        return original(scene, integrator, job, ending)
+
+    monkeypatch.setattr(render, "render_job", interrupted)
+    assert main(arguments) == 130
+    assert Path("shot.0001.checkpoint.npz").exists() and not Path("shot.0002.exr").exists()
+    first = Path("shot.0000.exr").stat().st_mtime_ns
+    capsys.readouterr()
+    assert main(arguments) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("shot.0000.exr: rendered before by the same command\nshot.0001.exr: ")
+    assert said.err.count("resume: goes on from 1 of 8") == 1
+    assert Path("shot.0000.exr").stat().st_mtime_ns == first
+    assert json.loads(Path("shot.0001.json").read_text())["spp"] == 8
+    for others in (["--seed", "1"], ["-D", "none=1"], ["--resume", "never"]):
+        if others[0] == "-D":
+            text = Path("frames.xml").read_text()
+            Path("frames.xml").write_text(text.replace("<sensor", "<!-- edited --><sensor", 1))
+            others = []
+        assert main([*arguments, *others]) == 0
+        assert "rendered before" not in capsys.readouterr().out
+
+
+def test_frames_keep_scene_and_kernels():
+    """Expected: the scene is loaded once, and only its first frame compiles kernels, though the sensors
+    differ in place and angle."""
+    sensors(3)
+    text = Path("frames.xml").read_text()
+    for number, angle in enumerate((30, 40, 50)):
+        place = f'<translate x="{100 * number}"/></transform>'
+        text = text.replace(place, f'{place}<float name="fov" value="{angle}"/>')
+    Path("frames.xml").write_text(text)
+    arguments = ["render", "frames.xml", "--frames", "0-2", "--spp", "2", "-P", "skip=none", "-o", "a.exr"]
+    assert main([*arguments, "--statistics", "a.json"]) == 0
+    found = [json.loads(Path(f"a.000{n}.json").read_text())["kernels"] for n in range(3)]
+    assert all(kernels["compiled"] == 0 < kernels["cached"] for kernels in found[1:])
+
+
+def test_statistics_are_a_file(capsys):
+    """Expected: what the header of the image has, with settings and memory, as JSON without Infinity or NaN;
+    a folder that is made; an error before the render where it cannot be written."""
+    arguments = [*SMALL, "--spp", "8", "-o", "a.exr", "--statistics"]
+    assert main([*arguments, "new/a.json", "-P", "variance=true"]) == 0
+    text = Path("new/a.json").read_text()
+    assert "Infinity" not in text and "NaN" not in text
+    found = json.loads(text)
+    assert found["spp"] == sum(found["passes"]) == 8 and found["settings"]["scene"] == str(SCENE)
+    assert found["resident_memory"] > 2**26 and not found["interrupted"] and found["versions"]["mitsuba"]
+    header = rendered.image("a.exr", "RGB")[1]
+    assert {key: found[key] for key in header} == header
+    capsys.readouterr()
+    assert main([*arguments, "a.exr/b.json"]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_plain_values_are_json():
+    odd = {"a": [math.inf, 1.5, (np.float64(2), np.float32(3))], 4: None, "b": {"c": Path("x")}, "d": True}
+    assert render.plain(odd) == {"a": [None, 1.5, [2.0, "3.0"]], "4": None, "b": {"c": "x"}, "d": True}
 
 
 def test_files_elsewhere(capsys):
@@ -210,8 +292,6 @@ def test_files_elsewhere(capsys):
     assert main([*arguments, "-a", "nowhere"]) == 2
     assert "append='nowhere' is no folder" in capsys.readouterr().err
     assert main([*arguments, "-a", "textures"]) == 0
-    from mitsuba_bdpt.cli import checkpoints
-
     options = build_parser().parse_args([*arguments, "-a", "textures"])
     before = checkpoints.digest(options)
     mi.Bitmap(np.full((2, 2, 3), 0.25, np.float32)).write("textures/appended_sky.exr")

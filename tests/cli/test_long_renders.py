@@ -1,5 +1,6 @@
 """``render`` with --checkpoint, --resume and --target-error."""
 
+import re
 import signal
 import subprocess
 import sys
@@ -76,17 +77,37 @@ def interrupt(monkeypatch, arguments, after=3):
         assert main(arguments) == 130
 
 
-def test_an_interrupted_render_leaves_a_checkpoint_and_is_not_begun_anew(monkeypatch, capsys):
-    """Expected: Ctrl-C writes a checkpoint at once, whatever the minutes; another render to the same image
-    is refused until one says what to do with it; going on needs the same scene and parameters."""
+def test_the_same_command_goes_on_or_begins(monkeypatch, capsys):
+    """Rationale: a queue repeats a command that was ended, word for word. Expected: it begins without a
+    checkpoint and goes on with one, to the image of the uninterrupted render; ``--resume never`` begins anew
+    in place of the checkpoint."""
+    arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
+    assert main([*ARGUMENTS, "--spp", "32", "-o", "whole.exr"]) == 0
+    expected = rendered.image("whole.exr")[0]
+    interrupt(monkeypatch, arguments)
+    capsys.readouterr()
+    assert main(arguments) == 0
+    assert re.search(r"^resume: goes on from \d+ of 32 samples", capsys.readouterr().err, re.MULTILINE)
+    np.testing.assert_allclose(rendered.image("a.exr")[0], expected, rtol=2e-3, atol=1e-5)
+    assert not Path("a.checkpoint.npz").exists()
+    for words in ([], ["--resume", "auto"]):
+        interrupt(monkeypatch, [*arguments, *words])
+        assert main([*arguments, "--resume", "never"]) == 0
+        assert "goes on" not in capsys.readouterr().err
+
+
+def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsys):
+    """Expected: Ctrl-C writes a checkpoint at once, whatever the minutes; going on needs the same scene and
+    parameters; ``--resume`` alone needs a checkpoint."""
     arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     interrupt(monkeypatch, arguments)
     assert read(Path("a.checkpoint.npz")).spp < 32
     for others, words in (
-        ([], "go on by --resume (with a larger --spp if it is finished), or delete it"),
+        (["--seed", "6"], "its seed is 5, here it is 6"),
         (["--resume", "--seed", "6"], "its seed is 5, here it is 6"),
-        (["--resume", "-P", "max_depth=3"], "its max_depth is"),
-        (["--resume", "-D", "resolution=8"], "is of another scene"),
+        (["-P", "max_depth=3"], "its max_depth is"),
+        (["-D", "resolution=8"], "is of another scene"),
+        (["--resume", "-D", "resolution=8"], "or begin anew by --resume never"),
     ):
         assert main([*arguments, *others]) == 2
         assert words in capsys.readouterr().err
@@ -262,7 +283,7 @@ def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
     file.write_bytes(file.read_bytes()[:200])
     assert main([*arguments, "--resume"]) == 2
     error = capsys.readouterr().err
-    assert "'a.checkpoint.npz' is not a snapshot" in error and "delete it" in error
+    assert "'a.checkpoint.npz' is not a snapshot" in error and "begin anew by --resume never" in error
     assert "Traceback" not in error
 
 
@@ -280,6 +301,7 @@ def test_until_an_error(capsys):
     ("arguments", "words"),
     [
         (["--resume"], "resume needs --checkpoint"),
+        (["--resume", "never"], "resume needs --checkpoint"),
         (["--parts", "3"], "parts needs --scheduler"),
         (["--scheduler", "x:1", "--time", "1"], "scheduler together with time"),
         (["--scheduler", "x:1", "--checkpoint", "1"], "scheduler together with checkpoint"),

@@ -22,7 +22,7 @@ from ..errors import did_you_mean
 from ..progress import KINDS
 from . import measuring, mistakes
 from .tev import PORT
-from .values import crop, definition, frames, number, property_, size, tev_address
+from .values import RESUME, crop, definition, frames, number, property_, size, tev_address
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -186,12 +186,18 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="X",
         help=text,
     )
-    text = "write what is done beside the image so often, to go on from with --resume; removed in the end"
+    text = "write what is done beside the image so often, for --resume; removed in the end"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
     text = "keep the last checkpoint of a finished render, so that --resume --spp MORE can go on from it"
     add("--keep-checkpoint", action="store_true", help=text)
-    text = "go on from the checkpoint of an earlier render; with a larger --spp also from a finished one"
-    add("--resume", action="store_true", help=text)
+    text = (
+        "go on from the checkpoint of an earlier render, with a larger --spp also of a finished one: auto "
+        "(default with --checkpoint) if there is one, must (also --resume alone) or end with an error, never "
+        "(begin anew, in place of it)"
+    )
+    add("--resume", nargs="?", choices=RESUME, const="must", metavar="WHEN", help=text)
+    text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
+    add("--statistics", type=Path, metavar="FILE", help=text)
     text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"
     add("--frames", type=frames, metavar="RANGE", help=text)
     text = (

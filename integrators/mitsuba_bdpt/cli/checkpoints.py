@@ -14,7 +14,11 @@ from pathlib import Path
 from ..errors import CommandError
 from ..files.named import named_files
 from ..files.whole import check_writable, replacing
+from ..host.versions import versions
 from ..run.snapshot import Snapshot, read
+
+BEGIN_ANEW = "begin anew by --resume never"
+"""What to do about a checkpoint that is of no use."""
 
 
 def path_of(output: Path) -> Path:
@@ -31,35 +35,43 @@ def digest(options: Namespace) -> str:
     return found.hexdigest()
 
 
-def check(options: Namespace, output: Path) -> None:
-    """Raise an error if the checkpoint would overwrite another one unasked, or cannot be written.
+def identity(options: Namespace, spp: int) -> str:
+    """What determines the image of a command line with ``spp`` samples per pixel, as a hash."""
+    names = "variant", "integrator", "properties", "seed", "time", "target_error", "denoise", "exposure"
+    values = [digest(options), spp, versions(), *(getattr(options, name) for name in names)]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
-    ``CommandError`` if it would overwrite one, ``OSError`` if none can be written.
-    """
+
+def check(options: Namespace, output: Path) -> None:
+    """Raise an error if no checkpoint can be written."""
     path = path_of(output)
     if options.checkpoint is not None:
         check_writable(path)
-    if options.checkpoint is not None and path.exists() and not options.resume:
-        raise CommandError(
-            f"checkpoint={str(path)!r} of an earlier render exists; go on by --resume (with a larger --spp "
-            "if it is finished), or delete it."
-        )
 
 
-def start(options: Namespace, output: Path) -> Snapshot:
-    """The snapshot to go on from; raises ``CommandError`` if there is none, or one of another scene."""
+def start(options: Namespace, output: Path) -> Snapshot | None:
+    """The snapshot to go on from, None to begin; raises ``CommandError`` for one of another scene.
+
+    Also if there has to be one and there is none.
+    """
     path = path_of(output)
+    if options.checkpoint is None or options.resume == "never":
+        return None
     if not path.exists():
-        raise CommandError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew.")
+        if options.resume == "must":
+            raise CommandError(
+                f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew."
+            )
+        return None
     try:
         kept = read(path)
     except ValueError as error:
-        raise CommandError(f"resume: {error}; delete it and leave out --resume to begin anew.") from error
+        raise CommandError(f"resume: {error}; {BEGIN_ANEW}.") from error
     if kept.progress.scene != digest(options):
         raise CommandError(
             f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
             "it names, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
-            "or delete it."
+            f"or {BEGIN_ANEW}."
         )
     return kept
 

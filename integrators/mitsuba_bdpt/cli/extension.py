@@ -17,6 +17,7 @@ import mitsuba as mi
 from ..errors import CommandError
 from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
+from .checkpoints import BEGIN_ANEW
 from .cluster import STRIDE
 
 
@@ -29,7 +30,8 @@ def is_needed(kept: Snapshot, spp: int) -> bool:
         return False
     if kept.spp >= spp:
         raise CommandError(
-            f"resume: the checkpoint has {kept.spp} samples per pixel already; ask for more by --spp."
+            f"resume: the checkpoint has {kept.spp} samples per pixel already; ask for more by --spp, or "
+            f"{BEGIN_ANEW}."
         )
     return True
 

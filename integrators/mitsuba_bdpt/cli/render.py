@@ -17,8 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, FailureError, behind
-from ..files.images import check_channels, check_png, prepare_output, write_images
+from ..files.images import attribute, check_channels, check_png, prepare_output, write_images
 from ..files.loading import Loaded, check_file, choose_sensor, load
+from ..files.texts import write_json
+from ..files.whole import check_writable
 from ..host import memory
 from ..host.versions import versions
 from ..progress import display, readable
@@ -35,6 +37,10 @@ PASS_SPP = 16
 
 SETS = {"time": {"timeout"}, "target_error": {"target_error", "until_error", "variance"}}
 """The integrator's parameters that an option sets, see `loading.load`."""
+
+
+IDENTITY = "bdptIdentity"
+"""Attribute of images that are finished: what has determined them."""
 
 
 @dataclass
@@ -67,6 +73,9 @@ def _run(options: Namespace, ending: Ending) -> int:
     jobs = jobs_of(options)
     for job in jobs:
         prepare_output(job.output)
+        if job.statistics is not None:
+            job.statistics.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(job.statistics)
         check_options(job)
     scene, integrator, used = loaded(options)
     check_integrator(options, integrator)
@@ -93,17 +102,24 @@ def jobs_of(options: Namespace) -> list[Namespace]:
     output = options.output or Path("renders") / f"{options.scene.stem}.exr"
     if options.frames is None:
         return [Namespace(**vars(options) | {"output": output})]
-    given = ("sensor", options.sensor != 0), ("checkpoint", options.checkpoint is not None)
-    for name, is_given in given:
-        if is_given:
-            raise CommandError(
-                f"frames together with {name} is not possible: each frame is a sensor and has an image of "
-                "its own; leave out one or the other."
-            )
-    return [
-        Namespace(**vars(options) | {"sensor": n, "output": output.with_stem(f"{output.stem}.{n:04d}")})
-        for n in dict.fromkeys(options.frames)
-    ]
+    if options.sensor != 0:
+        raise CommandError(
+            "frames together with sensor is not possible: each frame is a sensor; leave out one or the other."
+        )
+
+    def of_frame(number: int) -> Namespace:
+        named = {"output": output, "statistics": options.statistics}
+        numbered = {key: path and path.with_stem(f"{path.stem}.{number:04d}") for key, path in named.items()}
+        return Namespace(**vars(options) | {"sensor": number} | numbered)
+
+    return [of_frame(number) for number in dict.fromkeys(options.frames)]
+
+
+def is_done(job: Namespace, spp: int) -> bool:
+    """Whether a frame has its image from an earlier run of the same command with checkpoints."""
+    if job.frames is None or job.checkpoint is None or job.resume == "never":
+        return False
+    return attribute(job.output, IDENTITY) == checkpoints.identity(job, spp)
 
 
 def loaded(options: Namespace) -> Loaded:
@@ -131,14 +147,22 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
     Once rendered, it is written whatever signals come, and only then a checkpoint is removed.
     """
     sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
+    if is_done(job, spp):
+        say(f"{job.output}: rendered before by the same command")
+        return True
     outcome = render(scene, integrator, job, spp)
     ending.patient = True
     try:
         if outcome.interrupted and not outcome.spp:
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
             return False
-        attributes = {"bdptSettings": settings(job, spp), "bdptStatistics": report(outcome)}
+        found = report(outcome)
+        attributes = {"bdptSettings": json.dumps(settings(job, spp)), "bdptStatistics": json.dumps(found)}
+        if job.checkpoint is not None and not outcome.interrupted:
+            attributes[IDENTITY] = checkpoints.identity(job, spp)
         write(sensor.film(), job, attributes)
+        if job.statistics is not None:
+            write_json(job.statistics, {"settings": settings(job, spp)} | found)
         outcome.written()
         say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
     finally:
@@ -286,12 +310,13 @@ def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
 
 def render_here(scene, integrator, options: Namespace, spp: int, watchers: list) -> Outcome:
     """Render in one go, with checkpoints if they are wanted."""
-    started, interrupted, seed, start, rest = time.perf_counter(), False, options.seed, None, None
+    started, interrupted, seed, rest = time.perf_counter(), False, options.seed, None
     if hasattr(integrator, "statistics"):
         integrator.statistics = {}  # of the render before
     kept, limit, asked = None, options.time, spp
-    if options.resume:
-        start = checkpoints.start(options, options.output)
+    start = checkpoints.start(options, options.output)
+    if start is not None:
+        print(f"resume: goes on from {start.spp} of {spp} samples per pixel", file=sys.stderr)
         limit = limit and limit + start.progress.work.seconds
         if extension.is_needed(start, spp):
             rest, start = extension.Extension(start, scene, integrator, options), None
@@ -388,27 +413,35 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
     return Outcome(time.perf_counter() - started, done, interrupted)
 
 
-def settings(options: Namespace, spp: int) -> str:
-    """The command line as JSON, for the header of the image."""
+def settings(options: Namespace, spp: int) -> dict:
+    """The command line as values that JSON knows."""
     values = {key: str(v) if isinstance(v, Path) else v for key, v in vars(options).items()}
     values |= {"spp": spp, "defines": dict(options.defines), "append": list(map(str, options.append))}
     values["properties"] = dict(options.properties)
-    return json.dumps(values)
+    return values
 
 
-def report(outcome: Outcome) -> str:
-    """What was rendered, and with what, as JSON for the header of the image."""
+def report(outcome: Outcome) -> dict:
+    """What was rendered, and with what, as values that JSON knows."""
     own = {
         "wall_seconds": round(outcome.seconds, 3),
         "spp": outcome.spp,
         "interrupted": outcome.interrupted,
+        "resident_memory": memory.peak(),
         "versions": versions(),
     }
-    found = own | outcome.statistics
-    if found.get("error") == math.inf:  # which JSON does not know
-        found["error"] = None
-    # A value that JSON does not know must not cost a finished image.
-    return json.dumps(found, default=str)
+    return {key: plain(value) for key, value in (own | outcome.statistics).items()}
+
+
+def plain(value):
+    """A ``value`` as JSON knows it: None for numbers that are not finite, the text of other objects."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(held) for key, held in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(held) for held in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, str | int | float) else str(value)
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float) -> str:

@@ -12,6 +12,9 @@ from . import tev
 
 PropertyValue = bool | int | float | str
 
+RESUME = ("auto", "must", "never")
+"""When a render goes on from a checkpoint: if there is one, in any case, or not at all."""
+
 MOST_FRAMES = 1 << 20
 """Sensors in a range, at most."""
 

@@ -67,6 +67,17 @@ def prepare_output(output: Path) -> None:
         ) from error
 
 
+def attribute(path: Path, name: str) -> str | None:
+    """A text in the header of an EXR file; None if it is not there, or the file is none."""
+    if not path.is_file():
+        return None
+    try:
+        found = OpenEXR.File(str(path), header_only=True).header().get(name)
+    except (OSError, RuntimeError, ValueError):
+        return None
+    return found if isinstance(found, str) else None
+
+
 def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
     """Write the film as an EXR with these header `attributes`, and as a PNG beside it."""
     bitmap = film.bitmap()

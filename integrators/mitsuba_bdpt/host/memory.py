@@ -41,6 +41,16 @@ def available() -> Available:
     return min(_limits(), key=lambda found: found.bytes, default=Available(math.inf, "nothing"))
 
 
+def peak() -> int | None:
+    """Bytes of memory that this process has taken at most so far; None where the system has no count."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return found if sys.platform == "darwin" else 1024 * found
+
+
 def _limits() -> Iterator[Available]:
     for most in _asked:
         yield Available(most, "what was asked for (--memory)")
