@@ -12,8 +12,11 @@ import pytest
 import scene_parts as parts
 from mitsuba_bdpt.emitters import disks as emitter_disks
 from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.geometry import boxes
+from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.sensors import kinds as sensors
+from mitsuba_bdpt.transport.aim import Aim
 from scipy import stats
 
 COUNT = 200_000
@@ -434,6 +437,22 @@ def test_rectangles_that_mitsuba_merges():
     found, expected = (emitter_disks.Disks(scene).scene for scene in (merged, apart))
     np.testing.assert_allclose(np.array(found.center), np.array(expected.center), atol=1e-6)
     assert float(found.radius[0]) == pytest.approx(float(expected.radius[0]), rel=1e-6)
+
+
+def test_sizes_of_scenes_with_merged_rectangles():
+    """Rationale: as above, of all that asks how large a scene or a shape is. Expected: the scene's box is
+    that of the rectangles, beside which a ball of radius .1, a thousandth of them, is small; spheres around
+    merged mirrors, at which photons are aimed, are finite.
+    """
+    text = CORNER.replace("diffuse", "conductor").replace(
+        '<rotate x="1" angle="-90"/>', '<scale value="100"/>'
+    )
+    merged, apart = (mi.load_string(text, optimize=on) for on in (True, False))
+    whole, true = (boxes.scene_box(scene) for scene in (merged, apart))
+    assert len(merged.shapes()) == 2 and whole == true and true == apart.bbox()
+    assert ShapeErrors(merged).small and ShapeErrors(apart).small
+    aims = Aim.of(merged, Emitters(merged))
+    assert all(np.isfinite(float(sphere.radius[0])) for sphere in aims.spheres)
 
 
 @pytest.mark.parametrize("name", FROM_INFINITY)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UnsupportedError, UsageError
+from ..geometry.boxes import scene_box
 from ..geometry.flat import is_flat
 from ..geometry.mitsubas_choices import (
     TEXTURE_SAMPLED,
@@ -112,7 +113,7 @@ class AreaEmitters(Group):
         self.by_texture, self._by_shape = Mask(by_texture), Mask(by_shape)
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         self._surfaces = Surfaces(emitters, context, spheres, self._by_shape)
-        extent = 2 * context.scene.bbox().bounding_sphere().radius
+        extent = 2 * scene_box(context.scene).bounding_sphere().radius
         found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
         self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
         self._seen_through = any(

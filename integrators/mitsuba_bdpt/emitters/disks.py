@@ -16,8 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..host import renamed
-from ..host.introspection import own_parameters
+from ..geometry.boxes import boxes
 from .emission_tables import Factor
 
 # A shape is a detail if the longest side of its box is not more than this part of the scene's.
@@ -184,27 +183,6 @@ def _frame(d) -> mi.Frame3f:
     turned = mi.Frame3f(mi.Vector3f(dr.dot(x, d), dr.dot(y, d), dr.dot(z, d)))
     s, t = (v.x * x + v.y * y + v.z * z for v in (turned.s, turned.t))
     return mi.Frame3f(s, t, d)
-
-
-def boxes(scene) -> list:
-    """Valid bounding boxes of the shapes; of meshes those of their finite vertices.
-
-    Of rectangles that Mitsuba merges into a mesh when it loads a scene's file ``bbox`` is invalid, and not
-    part of the scene's; with a vertex that is not finite it is invalid, though rays meet other triangles.
-    """
-    found = []
-    for shape in scene.shapes():
-        box = mi.ScalarBoundingBox3f(shape.bbox())
-        params = own_parameters(shape) if shape.is_mesh() else {}
-        if renamed.holds_a_mesh(params):
-            vertices = np.array(renamed.positions(params)).reshape(-1, 3)
-            vertices = vertices[np.isfinite(vertices).all(axis=1)]
-            box = mi.ScalarBoundingBox3f()
-            for corner in (vertices.min(axis=0), vertices.max(axis=0)) if len(vertices) else ():
-                box.expand(mi.ScalarPoint3f(corner.tolist()))
-        if box.valid() and np.isfinite([box.min, box.max]).all():
-            found.append(box)
-    return found
 
 
 def details(found: list, whole):

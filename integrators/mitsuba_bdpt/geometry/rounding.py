@@ -10,6 +10,7 @@ import numpy as np
 
 from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
+from .boxes import scene_box
 from .quadrics import ROUND, outward_sign
 
 # Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
@@ -70,7 +71,7 @@ class ShapeErrors:
 
     def __init__(self, scene: mi.Scene):
         shapes = scene.shapes()
-        extent = 2 * scene.bbox().bounding_sphere().radius
+        extent = 2 * scene_box(scene).bounding_sphere().radius
         with np.errstate(all="ignore"):  # numbers that are not finite are somebody else's business
             # An instance does not tell of which group it is: it has the largest curvature of all of them.
             within = (_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene))

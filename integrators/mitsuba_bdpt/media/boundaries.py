@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 
@@ -33,44 +35,131 @@ def behind(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, m
     return number, arrived
 
 
-@dr.syntax
-def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-    """The number of the medium before the first boundary that ``ray`` meets, and whether it meets one.
+@dataclass
+class NearSide:
+    """The first boundary that rays meet: the ``number`` of the medium before it.
 
-    Surfaces that bound no medium are passed, opaque ones too.
+    Masks: ``found``, there is one; ``escaped``, the ray has left the scene without meeting one. Neither holds
+    for a ray that stays among opaque surfaces.
     """
-    o, number, found = mi.Point3f(ray.o), mi.UInt32(0), mi.Bool(False)
+
+    number: mi.UInt32
+    found: mi.Bool
+    escaped: mi.Bool
+
+
+# Reflections at opaque surfaces after which a ray is given up.
+_REFLECTIONS = 16
+
+
+@dr.syntax
+def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> NearSide:
+    """Find the first boundary along ``ray``.
+
+    Surfaces that bound no medium are passed straight on if they transmit light. Opaque ones reflect the ray
+    as mirrors do, so that it stays where light can go.
+    """
+    o, d, number = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.UInt32(0)
+    found, escaped, reflections = mi.Bool(False), mi.Bool(False), mi.UInt32(0)
     going = mi.Bool(active)
     while dr.hint(going, label="the first boundary", exclude=[space, ray, active]):
-        segment = mi.Ray3f(o, ray.d, ray.time, ray.wavelengths)
+        segment = mi.Ray3f(o, d, ray.time, ray.wavelengths)
         si = space.scene.ray_intersect(segment, mi.RayFlags.Minimal, coherent=False, active=going)
         hit = going & si.is_valid()
         bounds = hit & si.is_medium_transition()
-        number = dr.select(bounds, space.media.number(si.target_medium(-ray.d)), number)
+        number = dr.select(bounds, space.media.number(si.target_medium(-d)), number)
         found |= bounds
-        o = mi.Point3f(segment(rays.passed(segment, si, space.shape_errors)))
-        going = hit & ~bounds
-    return number, found
+        escaped |= going & ~hit
+        opaque = hit & ~bounds & ~_transmits(si)
+        d = dr.select(opaque, _mirrored(d, si.n), d)
+        o = _onwards(space, segment, si, d, opaque)
+        reflections += dr.select(opaque, mi.UInt32(1), 0)
+        going = hit & ~bounds & (reflections < _REFLECTIONS)
+    return NearSide(number, found, escaped)
+
+
+@dataclass
+class Lines:
+    """Lines along which boundaries are compared.
+
+    ``medium`` the number of the one that each ``ray`` starts in. Mask ``reflected``: opaque surfaces reflect
+    the line towards its ``target``, as often as light may go on there; other lines go through.
+    """
+
+    ray: mi.Ray3f
+    medium: mi.UInt32
+    reflected: mi.Bool
+    target: mi.Point3f
+
+
+# Reflections of such a line.
+_AIMED = 4
 
 
 @dr.syntax
-def disagreements(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, mi.UInt32]:
-    """Crossings of boundaries along ``ray``, which starts in ``medium``, and how many of them disagree.
+def disagreements(space: Space, lines: Lines) -> tuple[mi.UInt32, mi.UInt32]:
+    """Number of boundaries along ``lines`` that are compared with the one before, and how many disagree.
 
-    Of two boundaries that follow each other, the far side of the first has to be the near side of the second.
+    Of two boundaries that follow each other, the far side of the first has to be the near side of the second,
+    where light may leave both into the segment between them. Behind an opaque surface that bounds no medium
+    the medium is not known until the next boundary.
     """
-    o, current = mi.Point3f(ray.o), mi.UInt32(medium) + dr.zeros(mi.UInt32, dr.width(ray.o))
-    crossings, wrong = dr.zeros(mi.UInt32, dr.width(ray.o)), dr.zeros(mi.UInt32, dr.width(ray.o))
+    ray = lines.ray
+    o, d, current = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.UInt32(lines.medium)
+    width = dr.width(ray.o)
+    known, reflections = dr.full(mi.Bool, True, width), dr.zeros(mi.UInt32, width)
+    compared, wrong = dr.zeros(mi.UInt32, width), dr.zeros(mi.UInt32, width)
     going = mi.Bool(True)
-    while dr.hint(going, label="boundaries along a line", exclude=[space, ray]):
-        segment = mi.Ray3f(o, ray.d, ray.time, ray.wavelengths)
-        si = space.scene.ray_intersect(segment, mi.RayFlags.Minimal, coherent=False, active=going)
+    while dr.hint(going, label="boundaries along a line", exclude=[space, lines, ray, width]):
+        segment = mi.Ray3f(o, d, ray.time, ray.wavelengths)
+        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
         hit = going & si.is_valid()
         bounds = hit & si.is_medium_transition()
-        near = space.media.number(si.target_medium(-ray.d))
-        crossings += dr.select(bounds, mi.UInt32(1), 0)
-        wrong += dr.select(bounds & (near != current), mi.UInt32(1), 0)
-        current = dr.select(bounds, space.media.number(si.target_medium(ray.d)), current)
-        o = mi.Point3f(segment(rays.passed(segment, si, space.shape_errors)))
-        going = mi.Bool(hit)
-    return crossings, wrong
+        near, beyond = (space.media.number(si.target_medium(side)) for side in (-d, d))
+        back, onwards = _may_leave(si, -d), _may_leave(si, d)
+        both = bounds & known & back
+        compared += dr.select(both, mi.UInt32(1), 0)
+        wrong += dr.select(both & (near != current), mi.UInt32(1), 0)
+        opaque = hit & ~_transmits(si)
+        turned = opaque & lines.reflected
+        current = dr.select(bounds, dr.select(turned, near, beyond), current)
+        known = dr.select(bounds, dr.select(turned, back, onwards), known & (turned | ~opaque))
+        d = dr.select(turned, _towards(lines.target, si, d), d)
+        o = _onwards(space, segment, si, d, turned)
+        reflections += dr.select(turned, mi.UInt32(1), 0)
+        going = hit & (~turned | (back & (reflections < _AIMED)))
+    return compared, wrong
+
+
+def _transmits(si) -> mi.Bool:
+    """Mask: the BSDF of the surface ``si`` has lobes through which light gets to the other side."""
+    return (si.bsdf().flags() & int(mi.BSDFFlags.Transmission)) != 0
+
+
+def _may_leave(si, d) -> mi.Bool:
+    """Mask: light may leave the surface ``si`` along ``d``, by emission or by its BSDF.
+
+    A BSDF that states no side may scatter to both.
+    """
+    front = dr.dot(si.sh_frame.n, d) > 0
+    sides = mi.UInt32(int(mi.BSDFFlags.FrontSide)), mi.UInt32(int(mi.BSDFFlags.BackSide))
+    flags = si.bsdf().flags()
+    scatters = (flags & dr.select(front, *sides)) != 0
+    unstated = (flags & (sides[0] | sides[1])) == 0
+    return scatters | unstated | (front & (si.shape.emitter() != dr.zeros(mi.EmitterPtr)))
+
+
+def _mirrored(d, n) -> mi.Vector3f:
+    return d - n * (2 * dr.dot(d, n))
+
+
+def _towards(target, si, d) -> mi.Vector3f:
+    """Direction from ``si`` to ``target``, that of a mirror where this is on the other side than ``-d``."""
+    aimed = dr.normalize(target - si.p)
+    return dr.select(dr.dot(si.n, aimed) * dr.dot(si.n, d) < 0, aimed, _mirrored(d, si.n))
+
+
+def _onwards(space: Space, segment, si, d, turned) -> mi.Point3f:
+    """Start of the ray that goes on from ``si`` along ``d``, on the same side where it is ``turned``."""
+    straight = segment(rays.passed(segment, si, space.shape_errors))
+    return dr.select(turned, rays.surface_anchor(si, segment, space.shape_errors).towards(d), straight)

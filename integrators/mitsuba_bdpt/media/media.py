@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import UnsupportedError, UsageError
 from ..geometry.rounding import ShapeErrors
 from ..host.introspection import all_shapes, children, is_instance, named
+from .equal import representatives
 
 # Optical depth beyond which T~ is that of this depth: ratios of densities stay within single precision.
 # (Whatever T~ is there, joins across such edges add next to nothing.)
@@ -28,26 +29,30 @@ _PROBES = 4096
 class Media:
     """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
 
-    ``objects`` the media, ``looks`` what each is like (`_Look`); ``sensor`` the number of the one that the
-    sensor declares. What there is, for branches while a kernel is recorded: ``grids``: some medium is not
-    homogeneous; ``coloured_grids``: the extinction of some grid depends on the wavelength; ``scatters``: some
-    albedo is not 0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical
-    depths are ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction
-    (microflakes); ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``:
-    visibility rays have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
+    Media that are equal (`equal.representatives`) have one number. ``objects`` the media, one of each number,
+    ``looks`` what each is like (`_Look`); ``sensor`` the number of the one that the sensor declares. What
+    there is, for branches while a kernel is recorded: ``grids``: some medium is not homogeneous;
+    ``coloured_grids``: the extinction of some grid depends on the wavelength; ``scatters``: some albedo is
+    not 0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths are
+    ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
+    ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
+    have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
     (``sample_emitters``).
 
     Raises ``UnsupportedError`` for media whose own calls contradict each other, ``UsageError`` for numbers
     that are no medium's.
     """
 
-    def __init__(self, objects: list[mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
-        self.objects = objects
+    def __init__(self, found: dict[int, mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
+        media = list(found.values())
+        firsts = representatives(media, _answers)
+        distinct = sorted(set(firsts))
+        self.objects = objects = [media[i] for i in distinct]
+        self._number_of = {place: distinct.index(i) + 1 for place, i in zip(found, firsts, strict=True)}
         homogeneous = [m.is_homogeneous() for m in objects]
         self.grids = not all(homogeneous)
-        self.sensor = 1 + objects.index(sensor) if sensor is not None else 0
-        self._ids = [_registry_id(m) for m in objects]
-        self._numbers = _numbers(self._ids)
+        self.sensor = self.number_of(sensor)
+        self._numbers = _numbers(self._number_of)
         self.looks = looks = [_Look(m) for m in objects]
         self.scatters = any(look.scatters for look in looks)
         self.gray = all(look.gray for look in looks)
@@ -72,11 +77,7 @@ class Media:
     def of(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Iterable[mi.BSDF]) -> Media | None:
         """Those of a scene seen by a sensor, whose shapes have these BSDFs; None if there are none."""
         found = media_of(scene, [sensor])
-        declared = sensor.get_medium()
-        if not found:
-            return None
-        sensor_medium = None if declared is None else found[_registry_id(declared)]
-        return Media(list(found.values()), sensor_medium, bsdfs)
+        return Media(found, sensor.get_medium(), bsdfs) if found else None
 
     def _table(self, majorants):
         """Extinction by number, ``Float`` or ``Spectrum``; None if it depends on more than the number."""
@@ -86,8 +87,8 @@ class Media:
         return mi.Float(entries[:, 0]) if self.gray else mi.UnpolarizedSpectrum(entries.T)
 
     def number_of(self, medium: mi.Medium | None) -> int:
-        """The number of a medium of the scene, 0 for none."""
-        return 0 if medium is None else self._ids.index(_registry_id(medium)) + 1
+        """The number of a medium of the scene or of the sensor, 0 for none."""
+        return 0 if medium is None else self._number_of[_registry_id(medium)]
 
     def number(self, medium: mi.MediumPtr) -> mi.UInt32:
         """The number of a medium that the scene's shapes point to."""
@@ -221,12 +222,9 @@ def _registry_id(medium: mi.Medium) -> int:
     return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
 
 
-def _numbers(ids: list[int]) -> mi.UInt32:
-    """Numbers of media by their place in Mitsuba's registry, which is ``ids``."""
-    numbers = [0] * (max(ids) + 1)
-    for number, index in enumerate(ids, 1):
-        numbers[index] = number
-    return mi.UInt32(numbers)
+def _numbers(number_of: dict[int, int]) -> mi.UInt32:
+    """A table of the numbers of media by their place in Mitsuba's registry."""
+    return mi.UInt32([number_of.get(place, 0) for place in range(max(number_of) + 1)])
 
 
 def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray):
@@ -251,6 +249,19 @@ def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray)
             "Mitsuba takes those at the origin for flights; use a constant S, or a medium of type "
             "heterogeneous"
         )
+
+
+def _answers(medium: mi.Medium) -> np.ndarray:
+    """Majorant, sigma_s, sigma_t and phase function at `probes`, one row for each channel of each."""
+    mei = probes(medium)
+    wo = random_directions(np.random.default_rng(1), _PROBES)
+    value, _ = medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, wo)
+    sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei)
+    zeros = dr.zeros(mi.UnpolarizedSpectrum, _PROBES)
+    phase = mi.unpolarized_spectrum(mi.Spectrum(value))
+    parts = [mi.UnpolarizedSpectrum(part) + zeros for part in (sigma_s, sigma_t, phase)]
+    dr.eval(parts)
+    return np.concatenate([_majorants(medium, mei), *(np.array(part) for part in parts)])
 
 
 def _majorants(medium: mi.Medium, mei: mi.MediumInteraction3f) -> np.ndarray:

@@ -6,14 +6,17 @@ found by rays of emission: the near side of the first boundary that they meet, o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..emitters.emitters import Emitters
+from ..geometry.boxes import box_of, scene_box
 from ..host.introspection import is_instance, named
 from ..media import boundaries
-from ..media.media import Space
+from ..media.media import Space, random_directions
 from ..transport.inputs import Shared
 from ..transport.phase import asymmetry
 
@@ -21,10 +24,10 @@ from ..transport.phase import asymmetry
 # A part of an emitter that is a thousandth of it and lies in another medium is missed by one in sixty.
 _PROBES, _OF_EMITTER, _OF_EMITTERS = 64, 4096, 1 << 20
 
-# Random lines by which boundaries are looked at, and the share of crossings that may disagree (rounding;
-# edges): lines through the scene, and so many through each shape that bounds a medium.
-_LINES, _TOLERATED = 1024, 0.01
-_OF_SHAPE, _TOLERATED_OF_SHAPE, _MOST_SHAPES = 32, 0.05, 1024
+# Random lines by which boundaries are compared, and the share of them that may disagree (rounding; edges):
+# lines through the scene, and so many through each shape that bounds a medium; half of both from the sensor.
+_LINES, _TOLERATED = 2048, 0.01
+_OF_SHAPE, _TOLERATED_OF_SHAPE, _MOST_SHAPES = 64, 0.05, 1024
 
 # Relative difference of sigma_t rho and its reverse, on average, that rounding leaves.
 _SYMMETRIC = 1e-3
@@ -40,12 +43,12 @@ class LightMedia:
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int):
         self._space, self._emitters = space, emitters
-        number, found = _around(space, sensor)
-        self.outside = _outside(space, found)
+        rays = _rays_around(sensor, _PROBES, 0)
+        around = _Asked.of(boundaries.near_side(space, rays, mi.Bool(True)), _PROBES)
+        self.outside = _outside(space, around)
         self._outside = dr.opaque(mi.UInt32, self.outside)
         self.contradiction = (
-            _contradiction_of_shapes(space, self.outside)
-            or _contradiction_of_sensor(space, sensor, number[found])
+            _contradiction_of_media(space, sensor, around, self.outside)
             or _contradiction_of_phases(space)
             or (_contradiction_at_infinity(space, self.outside) if emitters.at_infinity else "")
             or _contradiction_at_far_plane(space, sensor, 0 if far == self.outside else far)
@@ -77,12 +80,12 @@ class LightMedia:
         if not self.mixed:
             return number
         asked = dr.gather(mi.Bool, self._mixed, e.index) & ~e.infinite
-        return dr.select(asked, self._near_side(e, asked), number)
+        found = self._near_side(e, asked)
+        number = dr.select(found.escaped, self._outside, number)
+        return dr.select(found.found, found.number, number)
 
-    def _near_side(self, e, active) -> mi.UInt32:
-        ray = mi.Ray3f(e.anchor.towards(e.d), e.d)
-        number, found = boundaries.near_side(self._space, ray, active)
-        return dr.select(found, number, self._outside)
+    def _near_side(self, e, active) -> boundaries.NearSide:
+        return boundaries.near_side(self._space, mi.Ray3f(e.anchor.towards(e.d), e.d), active)
 
     def _probed(self) -> tuple[list[int], list[bool]]:
         """By emitter: the medium that its rays start in, and whether they do not all start in the same."""
@@ -97,15 +100,18 @@ class LightMedia:
             zeros += 550
         shared = Shared(mi.Float(0), zeros, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(u_point, mi.Point2f(u[1], u[2]), shared, mi.Bool(True))
-        number = np.array(self._near_side(e, mi.Bool(True)) + dr.zeros(mi.UInt32, n))
+        asked = _Asked.of(self._near_side(e, mi.Bool(True)), n)
+        number = np.where(asked.found, asked.number, self.outside)
+        known = asked.found | asked.escaped
         index = np.array(e.index + dr.zeros(mi.UInt32, n))
         order = np.argsort(index, kind="stable")
-        parts = np.split(number[order], np.searchsorted(index[order], np.arange(1, count)))
+        parts = np.split(order, np.searchsorted(index[order], np.arange(1, count)))
         probed, mixed = [], []
-        for emitter, of_this in zip(self._emitters.scene.emitters(), parts, strict=True):
-            probed.append(int(of_this[0]) if len(of_this) else 0)
+        for emitter, part in zip(self._emitters.scene.emitters(), parts, strict=True):
+            of_this = number[part[known[part]]]
+            probed.append(int(np.bincount(of_this).argmax()) if len(of_this) else self.outside)
             # One that is seldom chosen is not known well enough.
-            unknown = len(of_this) < _PROBES // 2 and emitter.sampling_weight() > 0
+            unknown = len(part) < _PROBES // 2 and emitter.sampling_weight() > 0
             mixed.append(unknown or bool((of_this != probed[-1]).any()))
         return probed, mixed
 
@@ -121,26 +127,46 @@ def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
     return front, back
 
 
-def _outside(space: Space, found: np.ndarray) -> int:
-    """The number of the medium that surrounds the scene; ``found`` see `_around`.
+@dataclass(frozen=True)
+class _Asked:
+    """A `boundaries.NearSide` as arrays of NumPy."""
 
-    The sensor's if some of its rays meet no boundary, else what boundaries say that are met from outside.
+    number: np.ndarray
+    found: np.ndarray
+    escaped: np.ndarray
+
+    @classmethod
+    def of(cls, side: boundaries.NearSide, count: int) -> _Asked:
+        """Those of ``count`` rays."""
+        dr.eval(side)  # one kernel
+        return cls(*(np.broadcast_to(np.array(x), count) for x in (side.number, side.found, side.escaped)))
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The media before the boundaries that were found."""
+        return self.number[self.found]
+
+
+def _outside(space: Space, around: _Asked) -> int:
+    """The number of the medium that surrounds the scene.
+
+    The sensor's if some of the rays ``around`` it escape, or if none meets a boundary; else what most
+    boundaries say that are met from outside.
     """
-    if not found.all():
+    if around.escaped.any() or not around.found.any():
         return space.media.sensor
-    rays, _ = _lines(space, 0)
-    number, met = (np.array(x) for x in boundaries.near_side(space, rays, mi.Bool(True)))
-    return int(np.bincount(number[met]).argmax()) if met.any() else 0
+    rng = np.random.default_rng(1)
+    rays = _through_scene(space, _points_in([scene_box(space.scene)], _LINES, rng), rng)
+    met = _Asked.of(boundaries.near_side(space, rays, mi.Bool(True)), _LINES)
+    return int(np.bincount(met.numbers).argmax()) if met.found.any() else 0
 
 
-def _around(space: Space, sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the media before the first boundaries around the sensor, and whether there are any."""
-    own, u = _camera_rays(sensor, _PROBES, 0)
+def _rays_around(sensor: mi.Sensor, count: int, seed: int) -> mi.Ray3f:
+    """Rays that start where those of a sensor do, in all directions if that is near to one point."""
+    own, u = _camera_rays(sensor, count, seed)
     at_one_point = sensor.class_name() in _AT_ONE_POINT
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1])) if at_one_point else own.d
-    rays = mi.Ray3f(own.o + dr.zeros(mi.Point3f, _PROBES), d)
-    number, found = boundaries.near_side(space, rays, mi.Bool(True))
-    return np.array(number), np.array(found)
+    return mi.Ray3f(own.o + dr.zeros(mi.Point3f, count), d)
 
 
 def _camera_rays(sensor: mi.Sensor, count: int, seed: int):
@@ -153,6 +179,20 @@ def _camera_rays(sensor: mi.Sensor, count: int, seed: int):
 
 # Sensors whose rays start near to one point, around which everything is looked at.
 _AT_ONE_POINT = frozenset("PerspectiveCamera ThinLensCamera RadianceMeter".split())
+
+
+def _contradiction_of_media(space: Space, sensor: mi.Sensor, around: _Asked, outside: int) -> str:
+    """Why the sensor and boundaries do not agree on the media between them; empty if they do.
+
+    ``around`` are the boundaries around the sensor. Where these are everywhere, and none is in the sensor's
+    medium, the sensor is at fault.
+    """
+    if not space.scene.shapes():
+        return ""
+    of_sensor = _contradiction_of_sensor(space, sensor, around.numbers)
+    if of_sensor and around.found.all() and (around.numbers != space.media.sensor).all():
+        return of_sensor
+    return _contradiction_of_shapes(space, sensor, outside) or of_sensor
 
 
 def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: np.ndarray) -> str:
@@ -172,26 +212,34 @@ def _called(space: Space, number: int) -> str:
     return f"the medium {named(space.media.objects[number - 1])}" if number else "no medium"
 
 
-def _contradiction_of_shapes(space: Space, outside: int) -> str:
+def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int) -> str:
     """Why boundaries do not agree on the medium between them; empty if they do."""
-    if not space.scene.shapes():
-        return ""
     remedy = (
         "disagree about the medium between them: give each the interior and exterior medium that is there, "
         "and leave a gap where faces coincide"
     )
-    bounds = [s for s in space.scene.shapes() if s.is_medium_transition() or is_instance(s)][:_MOST_SHAPES]
-    if bounds:
-        crossings, wrong = boundaries.disagreements(space, *_lines_through(space, bounds, outside))
-        crossings, wrong = (np.array(x).reshape(len(bounds), _OF_SHAPE).sum(1) for x in (crossings, wrong))
-        share = np.where(wrong > 2, wrong / np.maximum(crossings, 1), 0)  # of few crossings one tells nothing
+    bounds = [s for s in space.scene.shapes() if s.is_medium_transition() or is_instance(s)]
+    boxes = [(s, box) for s in bounds if (box := box_of(s)) is not None][:_MOST_SHAPES]
+    if boxes:
+        lines = _lines(space, sensor, [box for _, box in boxes], _OF_SHAPE, outside)
+        compared, wrong = _counted(space, lines, len(boxes))
+        # Of few comparisons one tells nothing.
+        share = np.where(wrong > 2, wrong / np.maximum(compared, 1), 0)
         if share.max() > _TOLERATED_OF_SHAPE:
-            return f"shape {named(bounds[int(share.argmax())])} and those around it {remedy}"
-    crossings, wrong = boundaries.disagreements(space, *_lines(space, outside))
-    crossings, wrong = int(np.array(crossings).sum()), int(np.array(wrong).sum())
-    if wrong <= _TOLERATED * crossings:
+            return f"shape {named(boxes[int(share.argmax())][0])} and those around it {remedy}"
+    (compared,), (wrong,) = _counted(
+        space, _lines(space, sensor, [scene_box(space.scene)], _LINES, outside), 1
+    )
+    if wrong <= _TOLERATED * compared:
         return ""
-    return f"at {100 * wrong / crossings:.0f} % of the boundaries that random lines cross shapes {remedy}"
+    return f"at {100 * wrong / compared:.0f} % of the boundaries that random lines cross shapes {remedy}"
+
+
+def _counted(space: Space, lines: boundaries.Lines, parts: int) -> list[np.ndarray]:
+    """Of each of so many ``parts`` of the ``lines``: boundaries compared, and how many of them disagree."""
+    found = boundaries.disagreements(space, lines)
+    dr.eval(found)  # one kernel
+    return [np.array(x).reshape(parts, -1).sum(1) for x in found]
 
 
 def _contradiction_of_phases(space: Space) -> str:
@@ -249,28 +297,36 @@ def _contradiction_at_far_plane(space: Space, sensor: mi.Sensor, far: int) -> st
     )
 
 
-def _lines(space: Space, outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
-    """Random lines through the scene, from outside, and the medium that they start in."""
-    box = space.scene.bbox()
-    low, high = (np.array(x, dtype=np.float64)[:, None] for x in (box.min, box.max))
-    return _through(space, low, high, _LINES, 1), dr.opaque(mi.UInt32, outside)
+def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int) -> boundaries.Lines:
+    """Random lines, ``each`` of them through random points of every box, box by box.
+
+    Every other one goes straight through the scene, from the medium ``outside``. The others start at the
+    sensor, and stay where light can go: they find what the first do not, which know no medium behind walls.
+    """
+    count = each * len(boxes)
+    rng = np.random.default_rng(1)
+    through = _points_in(boxes, each, rng)
+    straight, (ray, _) = _through_scene(space, through, rng), _camera_rays(sensor, count, 2)
+    own = mi.Ray3f(mi.Point3f(ray.o), mi.Vector3f(ray.d))
+    lane = dr.arange(mi.UInt32, count)
+    if sensor.class_name() in _AT_ONE_POINT:  # every other one of those goes to its point at once
+        own.d = dr.select(lane % 4 == 1, dr.normalize(through - own.o), own.d)
+    reflected = lane % 2 == 1
+    medium = dr.select(reflected, dr.opaque(mi.UInt32, space.media.sensor), dr.opaque(mi.UInt32, outside))
+    return boundaries.Lines(dr.select(reflected, own, straight), medium, reflected, through)
 
 
-def _lines_through(space: Space, shapes: list[mi.Shape], outside: int) -> tuple[mi.Ray3f, mi.UInt32]:
-    """As `_lines`, `_OF_SHAPE` through the box of each shape, one shape after the other."""
-    boxes = [shape.bbox() for shape in shapes]
+def _points_in(boxes: list, each: int, rng) -> mi.Point3f:
+    """``each`` random points in every box, box by box."""
     low, high = (
-        np.repeat(np.array([np.array(x, dtype=np.float64).ravel() for x in corner]), _OF_SHAPE, axis=0).T
+        np.repeat(np.array([np.array(x, dtype=np.float64).ravel() for x in corner]), each, axis=0)
         for corner in ([box.min for box in boxes], [box.max for box in boxes])
     )
-    return _through(space, low, high, _OF_SHAPE * len(shapes), 2), dr.opaque(mi.UInt32, outside)
+    return mi.Point3f((low + rng.random(low.shape) * (high - low)).T)
 
 
-def _through(space: Space, low: np.ndarray, high: np.ndarray, count: int, seed: int) -> mi.Ray3f:
-    """So many random lines through random points between ``low`` and ``high``, from outside of the scene."""
-    scene = space.scene.bbox()
-    diagonal = np.array(scene.max, dtype=np.float64) - np.array(scene.min, dtype=np.float64)
-    u = np.random.default_rng(seed).random((5, count))
-    d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1]))
-    through = low + u[2:] * (high - low)
-    return mi.Ray3f(mi.Point3f(through) - d * (float(np.linalg.norm(diagonal)) * 1.1), d)
+def _through_scene(space: Space, through: mi.Point3f, rng) -> mi.Ray3f:
+    """Random lines ``through`` these points of the scene, from outside of it."""
+    box = scene_box(space.scene)
+    d = random_directions(rng, dr.width(through))
+    return mi.Ray3f(through - d * (float(np.linalg.norm(np.array(box.extents()))) * 1.1), d)

@@ -19,6 +19,7 @@ import mitsuba as mi
 from ..emitters.emitters import Emitters
 from ..emitters.infinite import contrast
 from ..emitters.records import Emission
+from ..geometry.boxes import box_of
 from ..host.introspection import grouped_shapes, is_instance
 
 # Spheres; one for all where they would be more.
@@ -162,7 +163,8 @@ def _sphere(box) -> Sphere:
 def _delta_boxes(scene: mi.Scene) -> list:
     """The boxes of shapes with delta lobes; of all instances if one of the shapes in groups has some."""
     grouped = any(_is_delta(shape) for shape in grouped_shapes(scene))
-    return [s.bbox() for s in scene.shapes() if (grouped if is_instance(s) else _is_delta(s))]
+    found = (box_of(s) for s in scene.shapes() if (grouped if is_instance(s) else _is_delta(s)))
+    return [box for box in found if box is not None]
 
 
 def _is_delta(shape: mi.Shape) -> bool:

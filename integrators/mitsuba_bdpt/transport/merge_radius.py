@@ -9,6 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..geometry.boxes import scene_box
+
 # Camera rays by which a scene is asked for the size of its pixels: so many columns and rows of them.
 _PROBES = 64
 
@@ -84,6 +86,7 @@ class Footprints:
 
     @staticmethod
     def _without_pixels(scene: mi.Scene) -> Footprints:
-        diagonal = math.dist([*scene.bbox().min], [*scene.bbox().max])
+        box = scene_box(scene)
+        diagonal = math.dist([*box.min], [*box.max])
         size = diagonal * _OF_DIAGONAL if 0 < diagonal < math.inf else 1.0
         return Footprints((0.0, 0.0, 0.0), size, 0.0, size)

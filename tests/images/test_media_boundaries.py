@@ -1,0 +1,214 @@
+"""What the boundaries of media say about where light is: rooms of fog as users make them.
+
+Expected, unless said: whether there are light subpaths, and in which medium they start. Seeds are fixed.
+"""
+
+from __future__ import annotations
+
+import media_parts as parts
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+from mitsuba_bdpt.media.equal import representatives
+from mitsuba_bdpt.media.media import _answers
+from mitsuba_bdpt.scene.prepared import PreparedScene
+from test_media_edges import ALL, CAMERA, assert_agree, means
+from test_media_plugins import register
+
+# Walls of a box that is open to the front: how to turn a rectangle that faces +z at z = -1.
+WALLS = {
+    "floor": ([1, 0, 0], -90),
+    "ceiling": ([1, 0, 0], 90),
+    "left": ([0, 1, 0], 90),
+    "right": ([0, 1, 0], -90),
+    "back": ([0, 1, 0], 0),
+}
+DISAGREE = "disagree about the medium between them"
+
+
+def fog(sigma_t=1.0, **more):
+    return parts.fog(sigma_t, 0.9, 0.0, **more)
+
+
+def plaster():
+    return {"type": "twosided", "bsdf": parts.matte(0.7, 0.6, 0.5)}
+
+
+def below_the_ceiling(half, down=True, gap=0.02):
+    """Where a rectangle is, 2 cm below the ceiling."""
+    turned = parts.transform().translate([0, 1 - gap, 0]).rotate([1, 0, 0], 90 if down else -90)
+    return turned.scale(half)
+
+
+def box(medium, walls=None, lamp=None, half=0.05, optimize=True, **changed):
+    """A box of fog seen through its front, which is null; a ball of glass, and a lamp under the ceiling.
+
+    ``medium()`` is that of the front, the glass and the ``lamp``, unless ``lamp`` and ``walls`` say what
+    these state instead.
+    """
+    lamp = {"exterior": medium()} if lamp is None else lamp
+    shapes = {
+        name: {"type": "rectangle", "bsdf": plaster(), **(walls() if walls else {})}
+        | {"to_world": parts.transform().rotate(*turn).translate([0, 0, -1])}
+        for name, turn in WALLS.items()
+    }
+    shapes["front"] = {
+        "type": "rectangle",
+        "to_world": parts.transform().translate([0, 0, 1]),
+        "bsdf": {"type": "null"},
+        "interior": medium(),
+    }
+    shapes["glass"] = parts.ball("dielectric", 0.4, (0.3, -0.6, 0), exterior=medium())
+    emitter = {"type": "area", "radiance": 1 / half**2}
+    shapes["lamp"] = {"type": "rectangle", "to_world": below_the_ceiling(half), "emitter": emitter, **lamp}
+    eye = parts.sensor(origin=(0, 0, 4), target=(0, 0, 0), fov=35, size=8)
+    scene = {"type": "scene", "sensor": eye, "fog": fog(id="fog"), **shapes, **changed}
+    return mi.load_dict(scene, optimize=optimize)
+
+
+def shared():
+    return {"type": "ref", "id": "fog"}
+
+
+def prepared(scene):
+    """Its media, and where light starts in them."""
+    found = PreparedScene(scene, scene.sensors()[0])
+    return found.space.media, found.light_media
+
+
+@pytest.mark.parametrize("optimize", [True, False], ids=["merged", "apart"])
+@pytest.mark.parametrize("tagged", [True, False], ids=["tagged", "plain"])
+@pytest.mark.parametrize("medium", [shared, fog], ids=["shared", "each"])
+def test_fog_between_opaque_walls(medium, tagged, optimize):
+    """Rationale: lines that look for contradictions went through walls, where no light goes, and to the back
+    of the lamp, which scatters nothing; equal media were told apart; a mesh of rectangles that Mitsuba has
+    merged has no valid box. Expected: no contradiction and one medium, in which the lamp shines; also where
+    the lamp states no medium, and all its rays end at the ceiling.
+    """
+    up = {"to_world": below_the_ceiling(0.05, down=False)}
+    for lamp in (None, {}, up):
+        scene = box(medium, (lambda: {"exterior": medium()}) if tagged else None, lamp, optimize=optimize)
+        media, light = prepared(scene)
+        assert (len(media.objects), light.contradiction, light.outside) == (1, "", 0)
+        assert not light.mixed and light._front[0] == 1
+
+
+def test_light_in_a_room_of_opaque_walls():
+    """As above, with a lamp that states no medium. Expected: all strategies see what camera subpaths see."""
+    scene = box(fog, lamp={}, half=0.5)
+    assert_agree(means(scene, 10, depth=4, **ALL), means(scene, 300, depth=4, **CAMERA))
+
+
+def closed_room():
+    """Fog that the sensor declares, in plain walls; behind a pillar glass that says it stands in nothing."""
+    behind = parts.ball("dielectric", 0.05, (0, 0.2, -0.8), interior=fog(2.0), id="glass")
+    pillar = parts.ball(parts.matte(0.5, 0.5, 0.5), 0.3, (0, 0.1, -0.2))
+    scene = parts.room(parts.sensor(origin=(0, 0, 0.7), medium=fog()), parts.point(), behind=behind)
+    return mi.load_dict(scene | {"pillar": pillar})
+
+
+CONTRADICTIONS = {
+    "a lamp whose back scatters": lambda: box(
+        shared, lamp={"exterior": shared(), "bsdf": plaster(), "to_world": below_the_ceiling(0.3, gap=0.5)}
+    ),
+    "glass in nothing": lambda: box(
+        shared, glass=parts.ball("dielectric", 0.4, (0.3, -0.6, 0), interior=fog(2.0), id="glass")
+    ),
+    "glass in other fog": lambda: box(shared, glass=parts.ball("dielectric", 0.4, exterior=fog(2.0))),
+    "merged walls in other fog": lambda: box(shared, lambda: {"exterior": fog(2.0)}),
+    "a ceiling in nothing": lambda: box(
+        shared,
+        ceiling={
+            "type": "rectangle",
+            "to_world": parts.transform().rotate(*WALLS["ceiling"]).translate([0, 0, -1]),
+            "bsdf": plaster(),
+            "interior": fog(2.0),
+        },
+    ),
+    "glass behind a pillar": closed_room,
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_contradictions_in_rooms(name):
+    """Rationale: light and camera subpaths would see two scenes. Expected: an error of one shape among
+    others that agree, in the box above, and out of sight of a sensor that alone declares the medium.
+    """
+    _, light = prepared(CONTRADICTIONS[name]())
+    assert DISAGREE in light.contradiction
+
+
+def grid(values=None, edge=1.0, **more):
+    values = np.arange(27.0).reshape(3, 3, 3) if values is None else values
+    return parts.grid(values, [0, 0, 0], edge, **more)
+
+
+def nearest(medium):
+    return medium | {"sigma_t": medium["sigma_t"] | {"filter_type": "nearest"}}
+
+
+def fine(more=0.0):
+    """A grid of which no random point sees the one voxel that is larger."""
+    values = np.linspace(0, 1, 64**3).reshape(64, 64, 64)
+    values[40, 7, 21] += more
+    return grid(values)
+
+
+# Pairs of media, and whether they are equal.
+PAIRS = {
+    "numbers": (fog, fog, True),
+    "a scale": (lambda: fog(0.8), lambda: fog(0.4, scale=2.0), True),
+    "colours": (parts.coloured, parts.coloured, True),
+    "grids": (grid, grid, True),
+    "another extinction": (fog, lambda: fog(1.01), False),
+    "another albedo": (fog, lambda: parts.fog(1.0, 0.91, 0.0), False),
+    "another phase function": (fog, lambda: parts.fog(1.0, 0.9, 0.1), False),
+    "another way of sampling": (fog, lambda: fog(sample_emitters=False), False),
+    "another scale of a grid": (grid, lambda: grid(scale=2.9), False),
+    "one other voxel": (fine, lambda: fine(0.01), False),
+    "another size": (grid, lambda: grid(edge=1.01), False),
+    "another filter": (grid, lambda: nearest(grid()), False),
+    "two kinds of medium": (lambda: fog(3.0), lambda: grid(np.ones((3, 3, 3))), False),
+    "parts of a blend": (
+        *(
+            lambda g=g: (
+                fog()
+                | {
+                    "phase": {
+                        "type": "blendphase",
+                        "weight": 0.3,
+                        "a": {"type": "rayleigh"},
+                        "b": {"type": "hg", "g": g},
+                    }
+                }
+            )
+            for g in (0.5, 0.6)
+        ),
+        False,
+    ),
+}
+
+
+@pytest.mark.parametrize("variant", [variants.of("rgb"), variants.of("spectral")])
+def test_media_are_told_apart_by_what_they_are(variant):
+    """Rationale: two objects of equal numbers were two media, whose boundaries contradict each other: no
+    light subpaths, 44 times the variance. Expected: equal where all that a medium holds and answers is.
+    """
+    mi.set_variant(variant)
+    for name, (one, other, equal) in PAIRS.items():
+        media = [mi.load_dict(fog(0.1)), mi.load_dict(one()), mi.load_dict(other())]
+        assert representatives(media, _answers) == [0, 1, 1 if equal else 2], name
+
+
+def test_media_of_python_are_equal_to_themselves_only():
+    """Rationale: what a plugin in Python is, its parameters do not tell. Expected: two objects are two
+    media, also where the phase function alone is of Python.
+    """
+    register()
+    own = (
+        {"type": "own_fog", "extinction": 4.0, "albedo": 0.9},
+        fog() | {"phase": {"type": "own_phase", "a": 0.3}},
+    )
+    for medium in own:
+        assert representatives([mi.load_dict(medium) for _ in range(2)], _answers) == [0, 1]
