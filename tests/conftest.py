@@ -1,9 +1,10 @@
 """What every test needs: the package imported first, then Mitsuba with a variant."""
 
-import mitsuba_bdpt  # noqa: F401, I001  (chooses the LLVM library; must precede mitsuba)
+import mitsuba_bdpt.workers  # noqa: I001  (chooses the LLVM library; must precede mitsuba)
 import mitsuba as mi
 import pytest
 import variants
+from patience import PATIENCE
 
 VARIANT = variants.of("rgb")
 mi.set_variant(VARIANT)
@@ -15,8 +16,15 @@ def _variant():
     mi.set_variant(VARIANT)
 
 
+@pytest.fixture
+def workers(_cluster, monkeypatch):
+    """A dask.distributed cluster, whose scheduler may answer as late as the machine's load makes it."""
+    monkeypatch.setattr(mitsuba_bdpt.workers, "ANSWERS_WITHIN", PATIENCE)
+    return _cluster
+
+
 @pytest.fixture(scope="session")
-def workers():
+def _cluster():
     """A dask.distributed cluster of two processes on this machine, without a dashboard."""
     from distributed import LocalCluster
 

@@ -22,6 +22,7 @@ from mitsuba_bdpt.properties import check_variant
 from mitsuba_bdpt.run import schedule, work
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
+from patience import PATIENCE
 
 T = mi.ScalarTransform4f
 
@@ -608,7 +609,7 @@ print(first, bdpt.statistics["kernels"]["compiled"])
 """
     environment = os.environ | {"DRJIT_CACHE_DIR": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=200
+        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=PATIENCE
     )
     assert done.returncode == 0, done.stderr
     first, second = (int(x) for x in done.stdout.split())
@@ -655,7 +656,7 @@ def test_lamps_share_their_code(tmp_path):
     many in other places."""
     environment = os.environ | {"DRJIT_CACHE_DIR": str(tmp_path)}
     done = subprocess.run(
-        [sys.executable, "-c", LAMPS], capture_output=True, text=True, env=environment, timeout=200
+        [sys.executable, "-c", LAMPS], capture_output=True, text=True, env=environment, timeout=PATIENCE
     )
     assert done.returncode == 0, done.stderr
     first, second = (int(x) for x in done.stdout.split())
@@ -1171,7 +1172,9 @@ def test_frozen_functions_are_refused_in_words(method):
     and where freezing is switched off, the render goes as ever. (In a process of its own: dr.freeze takes
     every object of Mitsuba's that lives in the process as an input, those that other tests left behind too,
     and ended the process there once.)"""
-    done = subprocess.run([sys.executable, "-c", FROZEN, method], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", FROZEN, method], capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr[-500:]
     refused, last = done.stdout.splitlines()
     assert re.match("UnsupportedError bdpt: .*dr.freeze is not supported.*call render outside", refused)
@@ -1248,7 +1251,7 @@ def test_registration(code):
     environment = os.environ | {"DRJIT_LIBLLVM_PATH": str(mitsuba_bdpt.llvm_choice.path)}
     script = f"{code}\nprint(type(mi.load_dict({{'type': 'bdpt'}})).__name__)"
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=120
+        [sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=PATIENCE
     )
     assert done.stdout.strip() == "BDPTIntegrator", done.stderr
 

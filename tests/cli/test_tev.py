@@ -11,6 +11,7 @@ import OpenEXR
 import pytest
 from mitsuba_bdpt.cli import live, tev
 from mitsuba_bdpt.cli.arguments import build_parser, main
+from patience import PATIENCE
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 
@@ -32,7 +33,7 @@ class Viewer:
         self.server.close()
 
     def received(self):
-        self.thread.join(timeout=60)
+        self.thread.join(timeout=PATIENCE)
         return [parsed(data) for data in self.messages]
 
 

@@ -1,11 +1,11 @@
 """scripts/endurance.py: what a run adds to the record of earlier ones."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import endurance
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import repository
 from mitsuba_bdpt.measure import reference
+from patience import PATIENCE
 
 SCRIPT = Path(endurance.__file__)
 TINY = ["--render-samples", "2048"]
@@ -62,40 +63,46 @@ def test_settings_are_varied():
     assert len({(p["heuristic"], width) for p, width in seen}) == 4 * len(endurance.SIZES)
 
 
+INTERRUPTED = """
+import os, signal, sys
+from pathlib import Path
+import endurance, mitsuba_bdpt.run.rendering
+kept, record, traced = [], Path(sys.argv[1]), mitsuba_bdpt.run.rendering.Render._pass
+
+def interrupted(self, step):
+    traced(self, step)
+    if record.exists() and not kept:  # of the first render: this is the second one
+        kept.append(record.read_text())
+        Path(sys.argv[2]).write_text(kept[0])
+        os.kill(os.getpid(), signal.SIGINT)
+
+mitsuba_bdpt.run.rendering.Render._pass = interrupted
+sys.exit(endurance.main(["cornell_box", "--record", sys.argv[1], "--render-samples", str(1 << 21)]))
+"""
+
+
 def test_an_interrupted_run_goes_on(tmp_path):
-    """Expected: Ctrl-C in the middle of the second render (a real process) leaves a whole record, with that
-    render and the samples of its passes that were done beside those of the first one, and status 130; the
-    next run adds to it."""
-    path = tmp_path / "record.json"
-    command = [sys.executable, str(SCRIPT), "cornell_box", "--record", str(path)]
-    first = None
-    with (tmp_path / "log").open("w") as log:
-        process = subprocess.Popen(
-            [*command, "--render-samples", str(1 << 21)],
-            stdout=log,
-            stderr=log,
-            # A shell's background jobs ignore SIGINT, and Python keeps what it inherits.
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 (no threads here)
-        )
-        try:
-            deadline = time.monotonic() + 240
-            while process.poll() is None:
-                assert time.monotonic() < deadline, (tmp_path / "log").read_text()
-                if path.exists():
-                    first = json.loads(path.read_text())
-                    time.sleep(0.5)  # into the second render, which takes seconds
-                    process.send_signal(signal.SIGINT)
-                    process.wait(timeout=240)
-                time.sleep(0.05)
-            assert process.returncode == 130, (tmp_path / "log").read_text()
-        finally:
-            process.kill()
-            process.wait()
+    """Rationale: half a second after the first render the second one had not begun where the machine was
+    busy. Expected: Ctrl-C in the second render (a real process, which sends it to itself after a pass) leaves
+    a whole record, with that render and the samples of its passes that were done beside those of the first
+    one, and status 130; the next run adds to it."""
+    path, former = tmp_path / "record.json", tmp_path / "former.json"
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, str(path), str(former)],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(SCRIPT.parent), *sys.path])},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        # A shell's background jobs ignore SIGINT, and Python keeps what it inherits.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert done.returncode == 130, done.stdout + done.stderr
+    first = json.loads(former.read_text())
     before = json.loads(path.read_text())
     assert endurance.is_clean(before)
     (one,), (both,) = first["scenes"].values(), before["scenes"].values()
     assert both["renders"] == one["renders"] + 1 and both["samples"] > one["samples"] > 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "record.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["former.json", "record.json"]
     after, status = run(path, "--samples", endurance.samples_of(before) + 3000)
     assert status == 0
     assert endurance.samples_of(after) >= endurance.samples_of(before) + 3000

@@ -7,6 +7,7 @@ import time
 import make_notebook
 import nbformat
 from jupyter_client.manager import start_new_kernel
+from patience import PATIENCE
 
 
 def printed(cell):
@@ -24,7 +25,7 @@ def test_the_notebook_runs(monkeypatch):
     shows images and a plot.
     """
     monkeypatch.setenv("TUTORIAL_SIZE", "16")
-    made = make_notebook.run(make_notebook.notebook(), timeout=900)
+    made = make_notebook.run(make_notebook.notebook(), timeout=PATIENCE)
     text = "".join(map(printed, made.cells))
     for words in ("pilot: time to the same error", "estimated relMSE", "error of path over ours"):
         assert words in text
@@ -62,9 +63,9 @@ def test_the_stop_button_keeps_what_is_done():
     manager, client = start_new_kernel(kernel_name="python3")
     try:
         client.execute(textwrap.dedent(STOPPED))
-        text, asked, deadline = "", False, time.monotonic() + 120
+        text, asked, deadline = "", False, time.monotonic() + PATIENCE
         while "kept" not in text and time.monotonic() < deadline:
-            message = client.get_iopub_msg(timeout=120)
+            message = client.get_iopub_msg(timeout=PATIENCE)
             text += message["content"].get("text", "")
             assert message["msg_type"] != "error", message["content"]
             if "pass 3" in text and not asked:

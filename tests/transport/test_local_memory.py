@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from patience import PATIENCE
 
 CODE = """
 import mitsuba_bdpt, mitsuba as mi, numpy as np
@@ -20,7 +21,7 @@ for parameters in %s:
 
 def means(edit, parameters):
     code = CODE % (edit, repr(parameters))
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
     assert result.returncode == 0, result.stderr[-2000:]
     return [float(x) for x in result.stdout.split()]
 
