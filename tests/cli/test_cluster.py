@@ -84,7 +84,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
         crop=None,
         seed=0,
     )
-    scene, integrator = load(options)
+    scene, integrator, _ = load(options)
     job = cluster._job(scene, integrator, options, 256)
     assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]
     merged = cluster.Merged()
@@ -298,7 +298,7 @@ def test_a_farm_in_a_bad_night(tmp_path):
     assert len(seen) >= 24
     found, night = rendered.image(tmp_path / "night.exr", "RGB")
     options = build_parser().parse_args([*command])
-    scene, integrator = load(options)
+    scene, integrator, _ = load(options)
     merged, reports = cluster.Merged(), []
     decided = json.dumps(night["decisions"])
     integrator = mi.load_dict({"type": "bdpt", "max_depth": integrator.max_depth, "decisions": decided})
