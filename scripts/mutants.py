@@ -1147,10 +1147,24 @@ MUTANTS = (
     ),
     Mutant(
         "scene files: points of all lamps are asked of the first one's shape",
-        "emitters/surfaces.py",
-        "return dr.switch(number, [shape.sample_position for shape in shapes], time, u, active)",
-        "return shapes[0].sample_position(time, u, active)",
+        "emitters/tables.py",
+        "return dr.switch(number, methods, *arguments)",
+        "return methods[0](*arguments)",
         ("tests/emitters/test_lamps.py::test_textured_lamps_beside_shapes_without_points[None]",),
+    ),
+    Mutant(
+        "scale: points of textured disks are found by Mitsuba's rays of one unit of length",
+        "emitters/textured.py",
+        "return shape.shape_type() != mi.ShapeType.Rectangle.value or shape.has_flipped_normals()",
+        "return shape.shape_type() == mi.ShapeType.Sphere.value or shape.has_flipped_normals()",
+        ("tests/emitters/test_scales.py::test_lamps_of_any_size[textured]",),
+    ),
+    Mutant(
+        "scale: projectors are asked at one unit of length",
+        "emitters/projectors.py",
+        "far = (1 + np.abs(matrix[:3, 3]).max()) / np.linalg.norm(matrix[:3, 2])",
+        "far = 1.0",
+        ("tests/emitters/test_scales.py::test_lamps_of_any_size[at a point]",),
     ),
     Mutant(
         "scene files: inverses that are none are taken for right",

@@ -11,9 +11,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.emitters import area
+from mitsuba_bdpt.emitters import area, textured
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.geometry import mitsubas_choices, smooth_meshes
+from mitsuba_bdpt.geometry import mitsubas_choices, quadrics, smooth_meshes
 from mitsuba_bdpt.geometry.shape_facts import ShapeFacts
 from scene_parts import T, grey
 from scipy import stats
@@ -300,21 +300,33 @@ def dome(radiance, **keys):
     return {"type": "sphere", "flip_normals": True, "to_world": to_world, "emitter": emitter} | keys
 
 
-# What was once taken for Mitsuba's choice: the lamp, where, and what is said in its place.
+LOCAL = textured._local
+
+# What could be taken for Mitsuba's choice, or once was: the lamp, where, and what is said in its place.
 MISTAKEN = {
-    "inside of a textured sphere": (
-        lambda: dome(peaked(50)),
-        (area, "is_sampled_by_direction", lambda *_: True),
+    "inside of a sphere": (
+        lambda: dome(2.0),
+        (quadrics.Sphere, "inner_radius", property(lambda sphere: 3 * sphere.radius)),
         "% of the directions that Mitsuba .* samples of emitter",
+    ),
+    "map of a sphere": (
+        lambda: dome(peaked(50)),
+        (textured, "_local", lambda kind, uv: LOCAL(kind, mi.Point2f(1 - uv.x, uv.y))),
+        "% of the points that Mitsuba .* samples of emitter",
+    ),
+    "map of a disk": (
+        lambda: dome(peaked(50), type="disk"),
+        (textured, "_local", lambda kind, uv: LOCAL(kind, mi.Point2f(dr.sqrt(uv.x), uv.y))),
+        "% of the points that Mitsuba .* samples of emitter",
     ),
     "texture of a turned sphere": (
         lambda: dome(peaked(50), flip_normals=False, to_world=T().rotate([1, 0, 0], 130).scale(0.3)),
-        (mitsubas_choices, "_is_turned", lambda *_: False),
+        (area, "is_mapped", lambda shape: False),
         "% of the points that Mitsuba .* samples of emitter",
     ),
     "texture of a flipped rectangle": (
         lambda: dome(peaked(50), type="rectangle"),
-        (mitsubas_choices, "_is_sampled_from_behind", lambda *_: False),
+        (area, "is_mapped", lambda shape: False),
         "% of the points that Mitsuba .* samples of emitter",
     ),
 }
@@ -370,7 +382,9 @@ def test_nothing_is_sampled_where_nothing_is_repeated(monkeypatch):
     """Expected: the comparison with Mitsuba does not run for 64 rectangles, spheres that shine outwards or a
     cube; it runs once for each lamp that its texture samples."""
     seen = []
-    monkeypatch.setattr(area, "check_densities", lambda emitters, emitter, index: seen.append(index))
+    monkeypatch.setattr(
+        area, "check_densities", lambda emitters, emitter, index, by_mitsuba=True: seen.append(index)
+    )
     light = {"emitter": {"type": "area", "radiance": 2.0}}
     lamps = {
         f"lamp{i}": {"type": "rectangle", "to_world": T().translate([i, 0, 0])} | light for i in range(64)
@@ -404,7 +418,8 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
     dome = {"type": "sphere", "flip_normals": True, "emitter": {"type": "area", "radiance": texture}}
     emitters = Emitters(mi.load_dict({"type": "scene", "dome": dome}))
     (group,) = emitters.groups
-    assert group.by_texture.all
+    assert mitsubas_choices.is_sampled_by_texture(emitters.scene.emitters()[0])
+    assert group._textured.mask.all
 
 
 @pytest.mark.parametrize("emitter", [None, "timed_sunsky", "own_area"])

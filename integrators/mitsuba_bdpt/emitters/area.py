@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +27,7 @@ from .hit_only import HitOnlyEmitters
 from .records import Chosen, Direct, Emission, Hit
 from .surfaces import Surfaces, spheres_of
 from .tables import Mask, look_up, rows, table
+from .textured import TexturedPoints, is_mapped
 
 _CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
@@ -86,12 +88,36 @@ class _Table:
         return mi.Frame3f(self.s, self.t, self.n)
 
 
+class _Sampled(Enum):
+    """How points of a lamp are chosen.
+
+    ``BY_TEXTURE`` by Mitsuba; ``BY_MAP`` by the texture as well, in `TexturedPoints`; ``BY_SHAPE`` although
+    it is textured.
+    """
+
+    UNIFORMLY = 0
+    BY_TEXTURE = 1
+    BY_MAP = 2
+    BY_SHAPE = 3
+
+    @staticmethod
+    def of(emitter, ask_shapes: bool) -> _Sampled:
+        """That of an emitter; ``ask_shapes`` see `Context`."""
+        if not is_textured(emitter):
+            return _Sampled.UNIFORMLY
+        if not is_sampled_by_texture(emitter):
+            return _Sampled.BY_SHAPE
+        if is_mapped(emitter.get_shape()):
+            return _Sampled.BY_MAP
+        return _Sampled.BY_SHAPE if ask_shapes else _Sampled.BY_TEXTURE
+
+
 class AreaEmitters(Group):
     """Area lights.
 
-    Emission: y_0 uniform on the shape, or by the texture where Mitsuba samples that rightly (area measure),
+    Emission: y_0 uniform on the shape, or by the texture where its density is known (area measure),
     the direction by the cosine with the shading normal (solid angle). Next-event estimation is Mitsuba's, but
-    for textured lights that are sampled by shape and for spheres.
+    for textured lights whose points are chosen here and for spheres.
     """
 
     hittable = guidable = True
@@ -108,11 +134,14 @@ class AreaEmitters(Group):
         self._emitters = emitters
         spheres = spheres_of(emitters, context)
         pairs = list(zip(emitters, spheres, strict=True))
-        by_texture = [e and not context.ask_shapes and is_sampled_by_texture(e, s) for e, s in pairs]
-        by_shape = [e and is_textured(e) and not b for (e, _), b in zip(pairs, by_texture, strict=True)]
-        self.by_texture, self._by_shape = Mask(by_texture), Mask(by_shape)
+        how = rows(emitters, None, lambda e: _Sampled.of(e, context.ask_shapes))
+        mapped = rows(how, None, lambda h: h is _Sampled.BY_MAP)
+        by_shape = rows(how, None, lambda h: h is _Sampled.BY_SHAPE)
+        self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))
+        self._redrawn = Mask(rows(how, None, lambda h: h in (_Sampled.BY_MAP, _Sampled.BY_SHAPE)))
+        self._textured = TexturedPoints(emitters, spheres, mapped)
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
-        self._surfaces = Surfaces(emitters, context, spheres, self._by_shape)
+        self._surfaces = Surfaces(emitters, context, spheres, by_shape, self._textured)
         extent = 2 * scene_box(context.scene).bounding_sphere().radius
         found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
         self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
@@ -123,8 +152,8 @@ class AreaEmitters(Group):
         self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
         self._spheres = table(found)
         for index, (emitter, _) in enumerate(pairs):
-            if by_texture[index] or found[index].inner_radius > 0:
-                check_densities(self, emitter, index)
+            if how[index] in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or found[index].inner_radius > 0:
+                check_densities(self, emitter, index, how[index] is not _Sampled.BY_MAP)
 
     # -- densities of points ----------------------------------------------------------------
 
@@ -133,17 +162,25 @@ class AreaEmitters(Group):
 
         ``at`` has ``p`` and ``uv``; ``n`` is its normal.
         """
-        density = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
-        if not self.by_texture.any:
+        density = self._own_pdf_a(index, at.uv, active)
+        if not self._by_texture.any:
             return density
-        # A textured emitter samples its texture. It tells the area density only to a reference point
-        # at unit distance straight above.
-        textured = self.by_texture.at(index, active)
+        # Where Mitsuba samples the texture, it tells the area density only to a reference point at unit
+        # distance straight above.
+        textured = self._by_texture.at(index, active)
         it = dr.zeros(mi.Interaction3f)
         it.p = at.p + n
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p, ds.n, ds.uv, ds.d, ds.dist = at.p, n, at.uv, -mi.Vector3f(n), mi.Float(1)
         return dr.select(textured, emitter.pdf_direction(it, ds, textured), density)
+
+    def _own_pdf_a(self, index, uv, active):
+        """`pdf_a` of a lamp whose texture Mitsuba does not sample."""
+        density = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
+        if not self._textured.mask.any:
+            return density
+        mapped = self._textured.mask.at(index, active)
+        return dr.select(mapped, self._textured.pdf_a(index, uv, mapped), density)
 
     def direct_pdf_w(self, emitter, index, it, ds, active):
         """Density (solid angle) with which next-event estimation at ``it`` samples ``ds``.
@@ -165,11 +202,11 @@ class AreaEmitters(Group):
                 # From outside the near half is sampled alone, of one that glows inwards the dark one.
                 beyond = dr.dot(ds.p - sphere.center, ds.d) > 0
                 pdf_w = dr.select((sphere.inner_radius > 0) & ~inside & beyond, 0, pdf_w)
-        if self._by_shape.any:
-            by_area |= self._by_shape.at(index, active)
-        inv_area = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
+        if self._redrawn.any:
+            by_area |= self._redrawn.at(index, active)
         cos = dr.abs(dr.dot(ds.d, ds.n))
-        pdf_w = dr.select(by_area, inv_area * dr.square(ds.dist) / cos, pdf_w)
+        pdf_a = self._own_pdf_a(index, ds.uv, active)
+        pdf_w = dr.select(by_area, pdf_a * dr.square(ds.dist) / cos, pdf_w)
         if self._any_cone:
             narrow = self._cone_pdf_w(index, it.p, active)
             pdf_w = dr.select(narrow > 0, narrow, pdf_w)
@@ -180,9 +217,10 @@ class AreaEmitters(Group):
         sphere = look_up(self._spheres, index, active)
         return dr.select(active, cone_pdf_w(sphere.center, sphere.cone_radius, p), 0)
 
-    def upright(self, ps, index, active):
-        """`Surfaces.upright`."""
-        return self._surfaces.upright(ps, index, active)
+    def points(self, emitter, index, u):
+        """Sample points of the ``emitter`` with this ``index``, as emission does."""
+        active, shared = mi.Bool(True), dr.zeros(mi.Interaction3f)
+        return self._surfaces.sample(Chosen(emitter, index, mi.Float(1)), u, shared, active)[0]
 
     # -- directions of emission -------------------------------------------------------------
 
@@ -312,11 +350,11 @@ class AreaEmitters(Group):
         The density is over solid angle, with the cosine of the shading normal in its denominator.
         """
         emitter, index = chosen.emitter, chosen.index
-        if self._by_shape.any:
-            mask = self._by_shape.at(index, active)
-            ps = self._surfaces.sample_shape(chosen, u, si.time, mask)
-            by_shape, its_weight = _sample_shape(emitter, ps, si, mask)
-            ds, weight = dr.select(mask, by_shape, ds), dr.select(mask, its_weight, weight)
+        if self._redrawn.any:
+            mask = self._redrawn.at(index, active)
+            ps = self._surfaces.sample_own(index, si.time, u, mask)
+            redrawn, its_weight = _towards(emitter, ps, si, mask)
+            ds, weight = dr.select(mask, redrawn, ds), dr.select(mask, its_weight, weight)
         pdf_w = ds.pdf
         if self._any_cone:
             in_cone = self._cone_pdf_w(index, si.p, active)
@@ -337,8 +375,8 @@ class AreaEmitters(Group):
         return pdf_w * hit.to_area(ds), chosen.pmf * pdf_a, direction
 
 
-def _sample_shape(emitter, ps, si, active):
-    """Sample of next-event estimation by the uniform point ``ps`` of the emitter's shape, and its weight.
+def _towards(emitter, ps, si, active):
+    """Sample of next-event estimation by the point ``ps`` of the emitter's shape, and its weight.
 
     In Mitsuba's conventions: the density is over the cosine with the shading normal, the weight is radiance
     over density.

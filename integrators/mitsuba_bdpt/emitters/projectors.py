@@ -53,7 +53,9 @@ class _Projector:
     def __init__(self, emitter):
         check_angles(emitter)
         matrix = matrix_of(emitter)
-        probes = matrix @ np.array([[0, 0, 1, 1], [1, 0, 1, 1], [0, 1, 1, 1]], dtype=np.float64).T
+        # So far away that the rounding of the probes' coordinates does not count.
+        far = (1 + np.abs(matrix[:3, 3]).max()) / np.linalg.norm(matrix[:3, 2])
+        probes = matrix @ np.array([[0, 0, far, 1], [far, 0, far, 1], [0, far, far, 1]], dtype=np.float64).T
         it = dr.zeros(mi.Interaction3f, 3)
         it.p = mi.Point3f(*(mi.Float(row.tolist()) for row in probes[:3]))
         ds, _ = emitter.sample_direction(it, mi.Point2f(0.5))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from itertools import accumulate
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +15,8 @@ from ..geometry.smooth_meshes import SmoothMeshes
 from ..geometry.to_world import check_to_world, is_reversed
 from ..host.introspection import named
 from .group import Context
-from .tables import Mask, look_up, rows, table
+from .tables import Mask, look_up, rows, switch, table
+from .textured import TexturedPoints
 
 
 @dataclass
@@ -34,12 +34,13 @@ class Surfaces:
     """The shapes of a group of emitters.
 
     Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
-    are (`Sphere` or None), and ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
-    their shape here. ``inv_area`` of each shape, by its emitter's index; ``smooth``: whether one has
-    interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
+    are (`Sphere` or None), ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
+    their shape here (a list of flags, None where no lamp is of the group), and the ``textured`` points of
+    others. ``own``: the `Mask` of both. ``inv_area`` of each shape, by its emitter's index; ``smooth``:
+    whether one has interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
     """
 
-    def __init__(self, emitters, context: Context, spheres, by_shape: Mask | None = None):
+    def __init__(self, emitters, context: Context, spheres, by_shape=None, textured=None):
         for emitter in filter(None, emitters):
             context.facts.about("to_world", emitter.get_shape(), partial(_check_to_world, emitter))
         # Before areas are asked for: of a mesh whose faces have vertices that do not exist it is any number.
@@ -54,7 +55,16 @@ class Surfaces:
             )
         self.inv_area = dr.rcp(mi.Float(areas))
         dr.make_opaque(self.inv_area)
-        self._by_shape, self._context, self._emitters = by_shape, context, emitters
+        self._emitters, self._shape_errors = emitters, context.shape_errors
+        by_shape = by_shape or rows(emitters, None, lambda _: False)
+        self._textured = textured or TexturedPoints(emitters, spheres, rows(emitters, None, lambda _: False))
+        mapped = self._textured.chosen
+        self.own = Mask(
+            [
+                None if e is None else context.ask_shapes or s or m
+                for e, s, m in zip(emitters, by_shape, mapped, strict=True)
+            ]
+        )
         turned = [s is not None and s.turned for s in spheres]
         self._turned = None
         if any(turned):
@@ -67,20 +77,30 @@ class Surfaces:
 
         The point is a ``PositionSample3f``, its density over area.
         """
-        emitter, index = chosen.emitter, chosen.index
-        if self._context.ask_shapes:
-            ps = self._point(index, shared.time, u, active)
+        index = chosen.index
+        if self.own.all:
+            ps = self._own_point(index, shared.time, u, active)
         else:
-            ps, _ = emitter.sample_position(shared.time, u, active)
-            if self._by_shape is not None and self._by_shape.any:
-                mask = self._by_shape.at(index, active)
-                ps = dr.select(mask, self._point(index, shared.time, u, mask), ps)
-        ps = self.upright(ps, index, active)
+            ps, _ = chosen.emitter.sample_position(shared.time, u, active)
+            if self.own.any:
+                mask = self.own.at(index, active)
+                ps = dr.select(mask, self._own_point(index, shared.time, u, mask), ps)
+        ps = self._upright(ps, index, active)
         return ps, self.geometric_normal(ps, index, u, active)
 
-    def sample_shape(self, chosen, u, time, active):
-        """A point that the shape of each emitter samples, whatever the emitter would."""
-        return self.upright(self._point(chosen.index, time, u, active), chosen.index, active)
+    def sample_own(self, index, time, u, active):
+        """Sample a point of the emitter ``index``, by the map of its texture if it has one, else by shape."""
+        return self._upright(self._own_point(index, time, u, active), index, active)
+
+    def _own_point(self, index, time, u, active):
+        mapped = self._textured.mask
+        if mapped.all:
+            return self._textured.sample(index, time, u, active)
+        ps = self._point(index, time, u, active)
+        if not mapped.any:
+            return ps
+        mask = mapped.at(index, active)
+        return dr.select(mask, self._textured.sample(index, time, u, mask), ps)
 
     def _point(self, index, time, u, active):
         """A point that the shape of the emitter ``index`` samples uniformly.
@@ -88,15 +108,10 @@ class Surfaces:
         Of these shapes alone: Mitsuba's call on shapes visits all of the process, and instances, curves and
         grids have no ``sample_position``.
         """
-        shapes = [emitter.get_shape() for emitter in filter(None, self._emitters)]
-        if len(shapes) == 1:
-            return shapes[0].sample_position(time, u, active)
-        # How many are before each; the last, of all, belongs to no emitter.
-        numbers = accumulate((emitter is not None for emitter in self._emitters), initial=0)
-        number = dr.gather(mi.UInt32, mi.UInt32(list(numbers)), index, active)
-        return dr.switch(number, [shape.sample_position for shape in shapes], time, u, active)
+        shapes = [emitter and emitter.get_shape() for emitter in self._emitters]
+        return switch(shapes, "sample_position", index, time, u, active)
 
-    def upright(self, ps, index, active):
+    def _upright(self, ps, index, active):
         """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
         if self._turned is not None:
             sphere = look_up(self._turned, index, active)
@@ -117,7 +132,7 @@ class Surfaces:
 
     def anchor(self, chosen, p, n, reference, active) -> rays.Anchor:
         """Where rays to or from ``reference`` end or start at the point ``p`` with the normal ``n``."""
-        errors = self._context.shape_errors.at(chosen.emitter.get_shape(), active)
+        errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
         return rays.sampled_anchor(p, n, reference, errors)
 
 

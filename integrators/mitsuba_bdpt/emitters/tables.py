@@ -6,6 +6,7 @@ All have one row for each emitter of the scene, be it of the group that asks or 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import accumulate
 from typing import TypeVar
 
 import drjit as dr
@@ -41,6 +42,21 @@ def table(records: list[Record]) -> Record:
 def look_up(columns: Record, index: mi.UInt32, active: mi.Bool) -> Record:
     """The row ``index`` of a `table`."""
     return replace(columns, **{k: dr.gather(type(v), v, index, active) for k, v in vars(columns).items()})
+
+
+def switch(owners, method: str, index: mi.UInt32, *arguments):
+    """What ``method`` of the owner at ``index`` returns; the last of ``arguments`` is the mask of the lanes.
+
+    ``owners``: one for each emitter of the scene, None where there is none. Of these alone: Mitsuba's virtual
+    calls visit all objects in the process, some of which may not have the method.
+    """
+    methods = [getattr(owner, method) for owner in owners if owner is not None]
+    if len(methods) == 1:
+        return methods[0](*arguments)
+    # How many are before each; the last, of all, belongs to no emitter.
+    numbers = accumulate((owner is not None for owner in owners), initial=0)
+    number = dr.gather(mi.UInt32, mi.UInt32(list(numbers)), index, arguments[-1])
+    return dr.switch(number, methods, *arguments)
 
 
 class Mask:

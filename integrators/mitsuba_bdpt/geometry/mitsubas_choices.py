@@ -9,8 +9,10 @@ choice of Mitsuba's                           home                              
 ============================================  ===================================  =======================
 face of a mesh: by area, from ``sample.y``,   `smooth_meshes.SmoothMeshes`         points in the planes of
 on sums in single precision                                                        their faces, there
-points of textured area lights: by the        `is_sampled_by_texture`, here        `check_densities`, here
-texture on rectangles, disks, upright spheres
+points of textured rectangles: by the         `area.AreaEmitters.pdf_a`           `check_densities`, here
+texture
+texture coordinates of rectangles, disks and  `textured.TexturedPoints`            `check_densities`, here
+spheres
 spheres seen from inside: by area, up to      `quadrics.Sphere.inner_radius`,      `check_densities`, here
 ``RayEpsilon`` beyond the radius              `is_sampled_by_direction`, here
 spheres seen from outside: a uniform          `quadrics.cone_pdf_w`                none: Mitsuba's formula
@@ -40,11 +42,10 @@ import numpy as np
 from ..errors import UnsupportedError
 from ..host import renamed
 from ..host.introspection import children, named, number
-from .quadrics import Sphere, sphere_normal
 
-# Shapes whose textured radiance Mitsuba samples rightly. On a cylinder the points have other densities than
-# stated (0.4 to 1.6 times), on a mesh all faces with the same texture coordinates share one density but
-# only one face is sampled (a cube: a sixth).
+# Shapes whose textured radiance is sampled by the texture. Mitsuba does so on others too, but wrongly: on a
+# cylinder the points have other densities than stated (0.4 to 1.6 times), on a mesh all faces with the same
+# texture coordinates share one density but only one face is sampled (a cube: a sixth).
 TEXTURE_SAMPLED = {kind.value for kind in (mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere)}
 
 CHECKED = 4096  # samples of an emitter
@@ -69,15 +70,12 @@ def is_textured(emitter) -> bool:
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
-def is_sampled_by_texture(emitter, sphere: Sphere | None) -> bool:
-    """Whether Mitsuba chooses points of an area light by its texture, and rightly.
+def is_sampled_by_texture(emitter) -> bool:
+    """Whether points of a textured area light are chosen by its texture.
 
-    ``sphere``: its shape, if that is one: of a turned one the texture's map to the surface misses parts of
-    it. (With a texel that is not finite all densities are NaN.)
+    (With a texel that is not finite all densities are NaN.)
     """
-    if not is_textured(emitter) or emitter.get_shape().shape_type() not in TEXTURE_SAMPLED:
-        return False
-    if _is_turned(sphere) or _is_sampled_from_behind(emitter, sphere):
+    if emitter.get_shape().shape_type() not in TEXTURE_SAMPLED:
         return False
     try:
         return math.isfinite(number(children(emitter)["radiance"].mean()))
@@ -93,49 +91,22 @@ def is_sampled_by_direction(emitter) -> bool:
     return not is_textured(emitter)
 
 
-def _is_turned(sphere: Sphere | None) -> bool:
-    return sphere is not None and sphere.turned
-
-
-def _is_sampled_from_behind(emitter, sphere: Sphere | None) -> bool:
-    """Whether the points that Mitsuba samples by an emitter's texture have normals opposite to its shape's.
-
-    ``eval_parameterization`` of a rectangle knows nothing of ``flip_normals``.
-    """
-    if not emitter.get_shape().has_flipped_normals():  # of nearly all lamps: no kernel runs for them
-        return False
-    u = mi.Point2f(0.4, 0.6)
-    by_texture, _ = emitter.sample_position(0, u)
-    # A sphere's normals are compared at one point: those of two points may be opposite anyway.
-    if sphere is not None:
-        normal = sphere_normal(by_texture.p, sphere.center, sphere.outward)
-    else:
-        normal = emitter.get_shape().sample_position(0, u).n
-    return number(dr.dot(by_texture.n, normal)) < 0
-
-
-def check_densities(emitters, emitter, index: int):
+def check_densities(emitters, emitter, index: int, by_mitsuba: bool = True):
     """Check that the points of an area light have the densities that the group ``emitters`` states.
 
-    These are the densities of emission (area), where rays find the point and its front, and those of
-    next-event estimation (solid angle) from places about the emitter, inside and outside. ``emitters``: the
-    `area.AreaEmitters` that have ``emitter`` at ``index``. Raises ``UnsupportedError``.
+    These are the densities of emission (area), where rays find the point and its front, and, where points are
+    chosen ``by_mitsuba``, those of next-event estimation (solid angle) from places about the emitter, inside
+    and outside. ``emitters``: the `area.AreaEmitters` that have ``emitter`` at ``index``. Raises
+    ``UnsupportedError``.
     """
     if _is_rounded(emitter):
         return
     u, place = spread_points(CHECKED), dr.opaque(mi.UInt32, index)
-    ps, _ = emitter.sample_position(0, u)
-    ps = emitters.upright(ps, place, mi.Bool(True))
+    ps = emitters.points(emitter, place, u)
     seen = _seen(emitter.get_shape(), ps)
     stated = emitters.pdf_a(emitter, place, seen, seen.n, mi.Bool(True))
     of_points = _differ(ps.pdf, dr.select(dr.dot(seen.sh_frame.n, ps.n) > 0, stated, 0))
-    it = dr.zeros(mi.Interaction3f)
-    others, _ = emitter.sample_position(0, mi.Point2f(u.y, u.x))
-    it.p = _places(emitter.get_shape().bbox(), others.p)
-    ds, _ = emitter.sample_direction(it, u)
-    in_view = dr.abs(dr.dot(ds.n, ds.d)) > 0.01
-    stated = emitters.direct_pdf_w(emitter, place, it, ds, mi.Bool(True))
-    of_directions = _differ(dr.select(in_view, ds.pdf, 0), stated)
+    of_directions = _directions_differ(emitters, emitter, place, u) if by_mitsuba else of_points
     dr.eval(of_points, of_directions)  # one kernel
     for what, (differ, compared) in (("points", of_points), ("directions", of_directions)):
         some = np.mean(np.array(compared))  # 0: nothing can be compared, and so nothing differs
@@ -146,6 +117,17 @@ def check_densities(emitters, emitter, index: int):
                 f"{named(emitter)} have another density than is known here, so that the image would be "
                 "wrong; use integrator type 'path', and please report the scene"
             )
+
+
+def _directions_differ(emitters, emitter, place, u):
+    """`_differ` of the densities of next-event estimation."""
+    it = dr.zeros(mi.Interaction3f)
+    others, _ = emitter.sample_position(0, mi.Point2f(u.y, u.x))
+    it.p = _places(emitter.get_shape().bbox(), others.p)
+    ds, _ = emitter.sample_direction(it, u)
+    in_view = dr.abs(dr.dot(ds.n, ds.d)) > 0.01
+    stated = emitters.direct_pdf_w(emitter, place, it, ds, mi.Bool(True))
+    return _differ(dr.select(in_view, ds.pdf, 0), stated)
 
 
 def _is_rounded(emitter) -> bool:
