@@ -54,6 +54,16 @@ def sensor(film, **keys):
     return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film} | keys
 
 
+def bumps():
+    """A small wall with bumps, whose normals are not flipped to the side from which it is seen."""
+    bump = {"type": "bumpmap", "texture": {"type": "bitmap", "bitmap": bitmap(), "raw": True}, "scale": 20.0}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0.2, 0.4, 1.5]).rotate([0, 1, 0], -70).scale(0.3),
+        "bsdf": bump | {"flip_invalid_normals": False, "bsdf": {"type": "diffuse"}},
+    }
+
+
 def scene(sensor):
     """Textured, bumpy, hidden and glowing things before nothing."""
     t = mi.ScalarTransform4f()
@@ -81,6 +91,24 @@ def scene(sensor):
             "box": {
                 "type": "cube",
                 "to_world": t.translate([0.8, 0.3, 0.3]).rotate([0, 1, 0], 30).scale(0.3),
+                "bsdf": {
+                    "type": "normalmap",
+                    "normalmap": {"type": "bitmap", "bitmap": bitmap(), "raw": True},
+                    "flip_invalid_normals": False,
+                    "bsdf": {"type": "conductor"},
+                },
+            },
+            "bumps": bumps(),
+            "more bumps": {"type": "shapegroup", "id": "more bumps", "chip": bumps()},
+            "copy": {
+                "type": "instance",
+                "to_world": t.translate([1, 0.5, -1.5]).rotate([0, 1, 0], 40),
+                "more bumps": {"type": "ref", "id": "more bumps"},
+            },
+            "back": {
+                "type": "disk",
+                "to_world": t.translate([-1, 1, -1]).scale(0.8),
+                "bsdf": {"type": "twosided", "bsdf": bumps()["bsdf"]},
             },
             "lamp": {
                 "type": "sphere",

@@ -1,42 +1,78 @@
-"""Feature layers: what the first surface on a camera ray is like, by Mitsuba's own plugin ``aov``.
+"""Feature layers: what the first surface on a camera ray is like, as in Mitsuba's plugin ``aov``.
 
-The plugin is asked at each camera sample, with the ray that Mitsuba's sensor gives for the sample's film
-position. Features are thus filtered and normalised exactly as the image is, after every number of
-passes, and mean what they mean in ``aov``: they show emitters under ``hide_emitters``, and uv
-derivatives shrink with the square root of the samples per pixel. Two things differ. Albedo is RGB on
-every film: its wavelengths are drawn for that, where ``aov`` takes the sensor's and is wrong if these
-follow a response. And uv derivatives are 0 where there are none, as where a ray meets nothing; those of
-``aov`` are NaN, which its sums keep or lose as the number of channels is even or odd. Other features that are
-not finite count as 0 too, and are counted.
+Features are evaluated at each camera sample, with the ray that Mitsuba's sensor gives for the sample's film
+position. They are thus filtered and normalised exactly as the image is, after every number of passes, and
+mean what they mean in ``aov`` of Mitsuba 3.9.1: they show emitters under ``hide_emitters``, uv derivatives
+shrink with the square root of the samples per pixel, and shading normals of a bump map are in the shading
+frame. Two things differ. Albedo is RGB on every film: its wavelengths are drawn for that, where ``aov`` takes
+the sensor's and is wrong if these follow a response. And uv derivatives are 0 where there are none, as where
+a ray meets nothing; those of ``aov`` are NaN, which its sums keep or lose as the number of channels is even
+or odd. Other features that are not finite count as 0 too, and are counted.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import UsageError, did_you_mean
+from ..host import renamed
 from ..sampling.points import Purpose
+from ..scene.prepared import bsdfs
 from ..sensors.records import Region
 from .denoising import GUIDES
+from .mapped_normals import MappedNormals
 
-# What ``aov`` of Mitsuba 3.9.1 knows.
-KINDS = (
-    "albedo",
-    "depth",
-    "position",
-    "uv",
-    "geo_normal",
-    "sh_normal",
-    "dp_du",
-    "dp_dv",
-    "duv_dx",
-    "duv_dy",
-    "prim_index",
-    "shape_index",
-)
+
+@dataclass
+class _Hit:
+    """What a camera ray meets first: ``si`` there, its ``bsdf``, whether there is something (``active``)."""
+
+    si: mi.SurfaceInteraction3f
+    ray: mi.RayDifferential3f
+    bsdf: mi.BSDFPtr
+    active: mi.Bool
+    normals: MappedNormals
+
+
+def _albedo(hit: _Hit) -> mi.Color3f:
+    """Diffuse reflectance; in spectral variants of the wavelengths that `mi.sample_rgb_spectrum` samples."""
+    value = mi.unpolarized_spectrum(hit.bsdf.eval_diffuse_reflectance(hit.si, hit.active))
+    if mi.is_monochromatic:
+        return mi.Color3f(value.x)
+    if not mi.is_spectral:
+        return mi.Color3f(value)
+    pdf = mi.pdf_rgb_spectrum(hit.ray.wavelengths)
+    value *= dr.select(pdf != 0, dr.rcp(pdf), 0)
+    return mi.spectrum_to_srgb(value, hit.ray.wavelengths, hit.active)
+
+
+def _uv_partials(hit: _Hit) -> mi.SurfaceInteraction3f:
+    hit.si.compute_uv_partials(hit.ray)
+    return hit.si
+
+
+# The last parts of the names of a kind's layers, and their values.
+_KINDS: dict[str, tuple[str, Callable[[_Hit], object]]] = {
+    "albedo": ("RGB", _albedo),
+    "depth": ("T", lambda hit: [hit.si.t]),
+    "position": ("XYZ", lambda hit: hit.si.p),
+    "uv": ("UV", lambda hit: hit.si.uv),
+    "geo_normal": ("XYZ", lambda hit: hit.si.n),
+    "sh_normal": ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active)),
+    "dp_du": ("XYZ", lambda hit: hit.si.dp_du),
+    "dp_dv": ("XYZ", lambda hit: hit.si.dp_dv),
+    "duv_dx": ("UV", lambda hit: _uv_partials(hit).duv_dx),
+    "duv_dy": ("UV", lambda hit: _uv_partials(hit).duv_dy),
+    "prim_index": ("I", lambda hit: [mi.Float(hit.si.prim_index)]),
+    "shape_index": ("I", lambda hit: [mi.Float(dr.reinterpret_array(mi.UInt32, hit.si.shape))]),
+}
+
+KINDS = tuple(_KINDS)
 
 
 def check_syntax(aovs: str):
@@ -57,23 +93,17 @@ def check_syntax(aovs: str):
 
 def feature_names(aovs: str) -> list[str]:
     """Names of the layers that the parameter ``aovs`` asks for."""
-    return _plugin(aovs).aov_names() if pairs(aovs) else []
+    return [f"{name}.{part}" for name, kind in _asked(aovs) for part in _KINDS[kind][0]]
 
 
-def _may_be_undefined(aovs: str) -> list[bool]:
-    """Whether each layer is one of uv derivatives, which are NaN where there are none."""
-    kinds = (pair.partition(":")[2] for pair in pairs(aovs))
-    return [kind.startswith("duv_") for kind in kinds for _ in feature_names(f"x:{kind}")]
+def _asked(aovs: str) -> list[tuple[str, str]]:
+    """Name and kind of each feature."""
+    return [(name, kind) for name, _, kind in (pair.partition(":") for pair in pairs(aovs))]
 
 
 def pairs(aovs: str) -> list[str]:
     """The pairs ``name:kind`` of a parameter ``aovs``, also of Mitsuba's."""
     return [pair for pair in re.split("[, ]+", aovs) if pair]
-
-
-def _plugin(aovs: str):
-    # Not in parallel: this may run on a thread that itself loads a scene.
-    return mi.load_dict({"type": "aov", "aovs": aovs}, parallel=False)
 
 
 class FeatureLayers:
@@ -84,10 +114,11 @@ class FeatureLayers:
 
     def __init__(self, scene, sensor, aovs: str, spp: int, guides: bool = False):
         asked = f"{aovs},{GUIDES}" if guides else aovs
-        self._scene, self._sensor, self._plugin = scene, sensor, _plugin(asked)
+        self._scene, self._sensor = scene, sensor
+        self._kinds = [kind for _, kind in _asked(asked)]
         self.names, self.guides = feature_names(aovs), guides
-        self.count = len(self._plugin.aov_names())
-        self._may_be_undefined = _may_be_undefined(asked)
+        self.count = len(feature_names(asked))
+        self._normals = MappedNormals(bsdfs(scene) if "sh_normal" in self._kinds else [])
         self._region = Region(sensor.film())
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
 
@@ -103,8 +134,13 @@ class FeatureLayers:
         if mi.is_spectral:
             u = points.draw_1d("camera", stream, Purpose.WAVELENGTH)
             ray.wavelengths, _ = mi.sample_rgb_spectrum(mi.sample_shifted(u))
-        _, _, values = self._plugin.sample(self._scene, self._sensor.sampler(), ray, active=active)
-        finite = mi.Bool(True)
-        for value, undefined in zip(values, self._may_be_undefined, strict=True):
-            finite &= undefined | dr.isfinite(value)
-        return [dr.select(dr.isfinite(value), value, 0) for value in values], finite
+        si = self._scene.ray_intersect(ray, renamed.hit_flags(), coherent=True, active=active)
+        met = active & si.is_valid()
+        hit = _Hit(si, ray, si.bsdf(ray), met, self._normals)
+        layers, finite = [], mi.Bool(True)
+        for kind in self._kinds:
+            for value in _KINDS[kind][1](hit):
+                value = dr.select(met, value, 0)
+                finite &= kind.startswith("duv_") | dr.isfinite(value)
+                layers.append(dr.select(dr.isfinite(value), value, 0))
+        return layers, finite

@@ -1,0 +1,92 @@
+"""Shading normals of bump and normal maps, which Mitsuba's BSDFs do not return to Python.
+
+Those of Mitsuba 3.9.1's ``aov``: `BumpMap` in the coordinates of the shading frame, `NormalMap` in the
+world's, and only where the map is the shape's own BSDF, not nested in another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..host.introspection import children, own_parameters
+
+_CLASSES = {"BumpMap": "bumpmap", "NormalMap": "normalmap"}
+
+# Directions by which a map is compared with another one, see `_flips`.
+_COMPARED = 1 << 12
+
+
+class MappedNormals:
+    """The shading normals of hits of a scene whose shapes have these ``bsdfs``."""
+
+    def __init__(self, bsdfs: Iterable[mi.BSDF]):
+        found = {id(b): b for b in bsdfs if b.class_name() in _CLASSES}
+        self._maps = [_Map(bsdf) for bsdf in found.values()]
+
+    def at(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Normal3f:
+        """The shading normal at ``si``, whose shape has this ``bsdf``."""
+        normal = mi.Normal3f(si.sh_frame.n)
+        for one in self._maps:
+            here = active & (bsdf == mi.BSDFPtr(one.bsdf))
+            normal = dr.select(here, one.normal(si, here), normal)
+        return normal
+
+
+class _Map:
+    """A bump or normal map."""
+
+    def __init__(self, bsdf: mi.BSDF):
+        self.bsdf, self._flips = bsdf, _flips(bsdf)
+        self._bumps = bsdf.class_name() == "BumpMap"
+        self._texture = children(bsdf)["nested_texture" if self._bumps else "normalmap"]
+        self._scale = own_parameters(bsdf)["scale"] if self._bumps else 1
+
+    def normal(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
+        """The normal at ``si``."""
+        local = self._bumped(si, active) if self._bumps else self._read(si, active)
+        if self._flips:  # to the side from which the surface is seen
+            away = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.wi, local) <= 0
+            local = dr.select(away, mi.Normal3f(-local.x, -local.y, local.z), local)
+        return local if self._bumps else mi.Normal3f(si.to_world(dr.normalize(local)))
+
+    def _bumped(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
+        """The normal of the displaced surface, in the shading frame."""
+        slope, n = self._scale * self._texture.eval_1_grad(si, active), si.sh_frame.n
+        along_u = si.dp_du + n * (slope.x - dr.dot(n, si.dp_du))
+        along_v = si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv))
+        normal = dr.normalize(dr.cross(along_u, along_v))
+        return mi.Normal3f(si.to_local(dr.select(dr.dot(si.n, normal) < 0, -normal, normal)))
+
+    def _read(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
+        """The normal that the texture holds, in the shading frame."""
+        return mi.Normal3f(self._texture.eval_3(si, active) * 2 - 1)
+
+
+def _flips(bsdf: mi.BSDF) -> bool:
+    """Whether ``flip_invalid_normals`` is set, which Mitsuba keeps to itself.
+
+    A copy of the map that does is compared with it, by the directions that they sample at grazing incidence,
+    where normals are flipped.
+    """
+    rng = np.random.default_rng(1)
+    u, turn = rng.random((3, _COMPARED)), 2 * np.pi * rng.random(_COMPARED)
+    z = 0.5 * rng.random(_COMPARED) ** 4 * rng.choice([-1, 1], _COMPARED)
+    si = dr.zeros(mi.SurfaceInteraction3f, _COMPARED)
+    si.uv = mi.Point2f(u[:2])
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0), mi.Vector3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    si.wi = mi.Vector3f(np.stack([np.cos(turn) * np.sqrt(1 - z**2), np.sin(turn) * np.sqrt(1 - z**2), z]))
+
+    def sampled(one: mi.BSDF) -> np.ndarray:
+        sample, _ = one.sample(mi.BSDFContext(), si, mi.Float(u[2]), mi.Point2f(u[1:]))
+        return np.array(sample.wo)
+
+    nested = {name: value for name, value in children(bsdf).items() if isinstance(value, mi.Object)}
+    copy = {"type": _CLASSES[bsdf.class_name()], **nested, **own_parameters(bsdf)}
+    flipped = mi.load_dict(copy | {"flip_invalid_normals": True}, parallel=False)
+    return bool(np.array_equal(sampled(bsdf), sampled(flipped), equal_nan=True))
