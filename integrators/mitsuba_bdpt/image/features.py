@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -57,7 +58,7 @@ def _uv_partials(hit: _Hit) -> mi.SurfaceInteraction3f:
 
 
 # The last parts of the names of a kind's layers, and their values.
-_KINDS: dict[str, tuple[str, Callable[[_Hit], object]]] = {
+_KINDS: dict[str, tuple[str, Callable[[_Hit], Any]]] = {
     "albedo": ("RGB", _albedo),
     "depth": ("T", lambda hit: [hit.si.t]),
     "position": ("XYZ", lambda hit: hit.si.p),
