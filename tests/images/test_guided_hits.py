@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
@@ -265,7 +266,10 @@ def test_the_pilot_guides_where_it_pays():
     found = method.statistics
     assert found["decisions"][0]["guided"] in GUIDED and found["unbiased"]
     assert found["rays"]["photon"] and found["rays"]["guided"]
-    assert "used: guided s=0" in method.explain(scene, spp=16)
+    text = method.explain(scene, spp=16)
+    assert "used: guided s=0" in text
+    better = [row for row in text.splitlines() if re.match(r" +0\.\d+  light_paths=", row)]
+    assert better and all("; not chosen: without guided s=0" in row for row in better)
     again = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": json.dumps(found["decisions"])})
     np.testing.assert_allclose(np.array(mi.render(scene, integrator=again, spp=16)), image, **ROUNDING)
     never = mi.load_dict({"type": "bdpt", "max_depth": 6, "photon_guiding": "never"})

@@ -75,15 +75,46 @@ def test_calls_of_few_questions_and_of_all(monkeypatch):
 
 
 def test_pilots_of_rooms():
-    """Rationale: in scenes of many BSDFs the pilot's kernel takes a second to compile, longer than a preview.
-    Expected: none is asked where 2^17 samples are more than enough with fewer BSDFs, and it is said why; from
-    2^22 on one is, also there."""
+    """Rationale: in scenes of many BSDFs the pilot's kernel takes up to seconds to compile, longer than a
+    preview. Expected: none is asked where 2^17 samples are more than enough with fewer BSDFs, and it is said
+    why; from `budget.least_samples` on one is, also there, and predicts no guided s = 0, which would take two
+    more kernels; from twice that on it does."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
     few, many = (mi.load_dict(room(n, 128)) for n in (bsdf.MANY - 2, bsdf.MANY))  # the lamp has one more
+    found = bsdf.Traits.of([shape.bsdf() for shape in many.shapes()])
+    least = budget.least_samples(found)
+    assert (1 << 18) < least < (1 << 21)
     assert len(integrator.decide(few, spp=8)) == 1
-    assert integrator.decide(many, spp=255) == []
-    assert str(budget.LEAST_OF_MANY) in integrator.statistics["no_pilot"]
-    assert len(integrator.decide(many, spp=256)) == 1
+    assert integrator.decide(many, spp=least // 128**2) == []
+    assert str(least) in integrator.statistics["no_pilot"]
+    for kernels, guided in ((1, False), (2, True)):
+        assert len(integrator.decide(many, spp=kernels * least // 128**2 + 1)) == 1
+        text = str(integrator.statistics["skipped"])
+        assert ("too short for the kernels" in text) == (not guided)
+
+
+def test_rooms_of_many_bsdfs_ask_a_pilot():
+    """Expected: a render of 256 x 144 pixels and 64 samples each does, in a room of 40 materials, the most
+    that `room` makes, of all its kinds."""
+    scene = mi.load_dict(room(40, 16))
+    traits = bsdf.Traits.of([shape.bsdf() for shape in scene.shapes()])
+    assert traits.asked.kinds == len(KINDS) + 1  # and that of the lamp, which is not two-sided
+    assert budget.least_samples(traits) <= 256 * 144 * 64
+
+
+def test_kinds_of_bsdfs_share_functions(kernels):
+    """Rationale: how long a kernel compiles depends on the number of functions in it, and BSDFs that differ
+    in numbers alone share theirs. Expected: a room of twice as many BSDFs of the same kinds is as many kinds,
+    and has at most a tenth more functions."""
+    counts = []
+    for materials in (len(KINDS), 2 * len(KINDS)):
+        scene = mi.load_dict(room(materials, 16))
+        render(scene)
+        traits = bsdf.Traits.of([shape.bsdf() for shape in scene.shapes()])
+        counts.append((traits.asked.kinds, functions(max(kernels, key=len))))
+        kernels.clear()
+    (kinds, few), (same, many) = counts
+    assert kinds == same and few <= many <= 1.1 * few
 
 
 def test_bitmaps_do_not_cut_kernels(kernels):

@@ -19,10 +19,10 @@ PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 
-# The least number in scenes of many BSDFs (`bsdf.MANY`), where the pilot's kernel takes 1.5 seconds to
-# compile: a preview of 256^2 pixels at 32 samples each takes no longer. (In a room of 27 materials a pilot
-# changed the efficiency of 2^17 samples by 1.06 and of 2^19 by 0.88, once nothing had to be compiled.)
-LEAST_OF_MANY = 1 << 22
+# In a scene of many BSDFs (`bsdf.MANY`) a kernel takes about as long to compile for each kind of BSDF, and to
+# record for each BSDF, as path tracing takes for so many samples. Renders whose samples take longer than that
+# ask a pilot (docs/development/experiments.md, "Pilots in rooms").
+SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 17, 1 << 11
 
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
@@ -47,9 +47,15 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 
-def least_samples(traits: Traits) -> int:
-    """How many samples a render needs for a pilot; `bsdf.Traits` of its scene."""
-    return LEAST_OF_MANY if traits.asked.many else LEAST_SAMPLES
+def least_samples(traits: Traits, kernels: int = 1) -> int:
+    """How many samples a render needs for a pilot that compiles so many ``kernels``.
+
+    ``traits``: those of its scene's BSDFs.
+    """
+    asked = traits.asked
+    if not asked.many:
+        return LEAST_SAMPLES
+    return kernels * (SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count)
 
 
 def lanes(samples: int) -> int:

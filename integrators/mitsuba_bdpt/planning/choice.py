@@ -141,7 +141,7 @@ def _guided(
     candidates differ.
     """
     lit = next((row for row in table if row.candidate.light_paths), None)
-    if not alternatives.guidable or lit is None:
+    if not alternatives.guidable or lit is None or not moments.isolated.size:
         return []
     alone, *guided = _calm_mean(moments.isolated).tolist()
     before = table[0].cost * (table[0].variance + alone)
@@ -262,6 +262,27 @@ def _robust_mean(values: np.ndarray) -> np.ndarray:
     most = np.sort(least)[len(least) * 3 // 4 - 1]
     scale = np.where(least > most, most / np.where(least > most, least, 1), 1)
     return (values * scale[:, None]).mean(axis=0)
+
+
+def why_not(row: Prediction, chosen: Prediction) -> str:
+    """Why ``row`` of the table of `choose` is not the ``chosen``, though it would take less time; else empty.
+
+    The reasons are the rules of `choose`, in the order in which they have the last word.
+    """
+    gain = chosen.time / row.time
+    if gain <= 1:
+        return ""
+    if chosen.candidate.guided and not row.candidate.guided:
+        return "without guided s=0 it has the outliers of isolated (SDS) paths, which are in no figure here"
+    if not chosen.candidate.light_paths and row.candidate.light_paths:
+        return f"light subpaths have to gain {LIGHT_GAIN:g}x, and gain {gain:.2f}x"
+    if chosen.candidate.connections != row.candidate.connections:
+        return f"connections={row.candidate.connections} has to gain {KERNEL_TIE:g}x, and gains {gain:.2f}x"
+    more = row.candidate.light_paths / chosen.candidate.light_paths
+    return (
+        f"{more:g} times as many light subpaths have to gain {MORE_GAIN ** math.log2(more):.3g}x, and gain "
+        f"{gain:.2f}x"
+    )
 
 
 def left_out(table: list[Prediction], guided: float = 0.0, name: str = "guided s=0") -> list[dict[str, str]]:

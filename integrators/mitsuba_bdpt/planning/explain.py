@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
-from .choice import LIGHT_GAIN, Prediction
+from .choice import LIGHT_GAIN, Prediction, why_not
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 _STARTS = {Start.DELTA_EMITTER: "delta emitter, delta surfaces", Start.BEAM: "directionalarea"}
@@ -123,9 +123,10 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
             continue
         shown.add(key)
         light = f"light_paths=1/{served}" if candidate.light_paths else "light_paths=0"
+        why = why_not(row, table[0])
         lines.append(
             f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections}{guided} "
-            f"({row.cost:.2f}, {row.variance:.3g})"
+            f"({row.cost:.2f}, {row.variance:.3g})" + (f"; not chosen: {why}" if why else "")
         )
     if table[0].candidate.guided:
         lines.append(

@@ -66,8 +66,8 @@ class Moments:
     part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
     weighting, is what the points of a net leave of the rest of ``base``. ``isolated``, shape (`GROUPS`,
     numbers): the variance of paths on which s = 0 can be guided, which are in no other, if it is not, and
-    with each of `plan.GUIDED` numbers of samples. ``emission``: what was heard of emissions, see
-    `_of_tiles` (nothing: no cells). ``mean`` of the image (mean of the
+    with each of `plan.GUIDED` numbers of samples (no numbers: not measured). ``emission``: what was heard of
+    emissions, see `_of_tiles` (nothing: no cells). ``mean`` of the image (mean of the
     colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
     ``rays`` and connections per camera sample and kind, with one light subpath each, the number of ``bsdfs``,
     ``far``, the share of light subpaths that start at infinity, and the sky's ``evenness``, its mean radiance
@@ -124,7 +124,10 @@ class Moments:
             return share * a + (1 - share) * b
 
         rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
-        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean")}
+        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean") if n != "isolated"}
+        means["isolated"] = self.isolated if self.isolated.size else other.isolated
+        if self.isolated.size and other.isolated.size:
+            means["isolated"] = mean(self.isolated, other.isolated)
         return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
 
 

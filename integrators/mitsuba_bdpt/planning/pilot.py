@@ -291,10 +291,13 @@ def measure(
     seed: mi.UInt32,
     lanes: int,
     stands_for: float = RAREST,
+    guiding: bool = True,
 ) -> Moments:
     """Run a pilot of about ``lanes`` camera samples, spread over the image.
 
-    Each of them ``stands_for`` so many of the render.
+    Each of them ``stands_for`` so many of the render. ``guiding``: whether the gain of guided s = 0 is
+    predicted where it is possible, which takes two more kernels. Light that could be guided is in no sample
+    either way, since its outliers would hide how candidates differ.
     """
     everything = replace(
         plan,
@@ -308,9 +311,10 @@ def measure(
     )
     asked, kernel = lanes, Kernel(prepared, everything, settings, mis.ByClass())
     found = None
-    if everything.guidable:
+    guiding = guiding and everything.guidable
+    if guiding:
         found = isolated.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
-        kernel.without_isolated = found is not None
+    kernel.without_isolated = found is not None or (everything.guidable and not guiding)
     region, listener = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
         kernel.emitters, kernel.tells_emission = kernel.emitters.placed(), True
@@ -330,6 +334,8 @@ def measure(
     pilot.evaluate(counts)
     counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))
     found = pilot.moments(counted, found)
+    if everything.guidable and not guiding:
+        found = replace(found, isolated=found.isolated[:, :0])
     known = {"bsdfs": prepared.traits.asked.count, "far": prepared.emitters.far_share}
     contrast = prepared.emitters.contrast
     known["media"] = float(prepared.space is not None)

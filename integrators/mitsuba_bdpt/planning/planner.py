@@ -51,6 +51,15 @@ JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 # Tables that a later pilot has taught replace earlier ones if they leave this part of what those leave.
 BETTER_TABLES = 0.95
 
+# Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
+UNMEASURED = (
+    {
+        "class": "guided s=0",
+        "level": "not worth its cost here",
+        "why": "with so many BSDFs the render is too short for the kernels that would predict its gain",
+    },
+)
+
 # Why a pilot that was asked decides nothing.
 SAW_NOTHING = "it saw nothing, or no finite value"
 
@@ -173,6 +182,7 @@ class Planner:
             name = "merging" if self.full.merging else "guided s=0"
             left_out = (
                 *choice.left_out(table, gain, name),
+                *UNMEASURED * (self.full.guidable and not moments.isolated.size),
                 *emission.left_out(table[0].candidate, learnt),
             )
         return _Answer(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)
@@ -242,14 +252,15 @@ class Planner:
         self.decided = replace(self.decided, pilots=pilots)
         stands_for = samples / count
         plan = replace(self.full, emission=tables)
+        guiding = self.full.merging or samples >= budget.least_samples(self._prepared.traits, kernels=2)
 
         def trace() -> Moments:
             seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.asked)
             flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
             with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
-                return pilot.measure(self._prepared, plan, self._settings, seed, count, stands_for)
+                return pilot.measure(self._prepared, plan, self._settings, seed, count, stands_for, guiding)
 
-        key = self._settings, self.pilot_seed, pilots.asked, count, stands_for, tables
+        key = self._settings, self.pilot_seed, pilots.asked, count, stands_for, tables, guiding
         found, is_known = self._findings.find("pilots", key, trace)
         pilots = pilots._replace(remembered=pilots.remembered + is_known)
         self.decided = replace(self.decided, pilots=pilots)
@@ -319,9 +330,10 @@ class Planner:
             return f"it says nothing about films of fewer than {budget.FEW_PIXELS} pixels", None
         samples = self._expected(passes)
         whole = sum(passes) * self._pixels + samples
-        if decision := even_sky.decision(self._prepared, self.full, self._settings, whole):
+        least = budget.least_samples(self._prepared.traits)
+        if decision := even_sky.decision(self._prepared, self.full, self._settings, whole, least):
             return "the scene alone decides in a render as short as this", decision
-        if samples < (least := budget.least_samples(self._prepared.traits)):
+        if samples < least:
             return f"{samples} samples are too few, it takes {least}", None
         return "", None
 

@@ -129,6 +129,11 @@ class Asked:
         """How many there are."""
         return len(self.bsdfs)
 
+    @property
+    def kinds(self) -> int:
+        """How many structures they have; BSDFs of one structure share the functions of a kernel."""
+        return len({draws.structure(bsdf) for bsdf in self.bsdfs})
+
     def __call__(self, bsdf, question, *args):
         """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -205,3 +206,9 @@ def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
     for bsdf in found:  # grows on the way
         found += [value for value in children(bsdf).values() if isinstance(value, mi.BSDF)]
     return found
+
+
+def structure(plugin: mi.Object) -> tuple[Any, ...]:
+    """The class of ``plugin`` and the structures of what it holds (BSDFs, textures), by name."""
+    held = {name: value for name, value in children(plugin).items() if isinstance(value, mi.Object)}
+    return plugin.class_name(), *((name, structure(held[name])) for name in sorted(held))
