@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test lint gallery pictures docs package references benchmark slow sweep stress same endurance mutants
+.PHONY: render test lint gallery pictures notebook docs package references benchmark slow sweep stress same endurance mutants
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -51,6 +51,11 @@ pictures: $(INSTALLED)
 		"bdpt skip=none heuristic=power" "bdpt skip=none heuristic=balance"
 	$(VENV)/bin/python scripts/strategies.py veach_bidir -o renders/pyramid.exr
 	cp renders/pyramid_weighted.png renders/pyramid_unweighted.png docs/images
+
+# The tutorial of docs/user/tutorial.py as a notebook that was run, some minutes.
+notebook: $(INSTALLED)
+	$(VENV)/bin/jupytext --quiet --to ipynb --set-kernel python3 docs/user/tutorial.py
+	$(VENV)/bin/jupyter execute --inplace docs/user/tutorial.ipynb
 
 # The documentation as a site, in build/site.
 docs: $(INSTALLED)

@@ -2,6 +2,7 @@
 
 import io
 import re
+import sys
 from types import SimpleNamespace
 
 import mitsuba as mi
@@ -39,6 +40,35 @@ def test_a_bar_is_drawn_on_terminals_alone():
             bar(report(done))
         assert ("50/100 spp" in stream.getvalue()) == is_terminal
         bar.close()  # once more does nothing
+
+
+def test_a_bar_under_a_cell_needs_no_widgets(monkeypatch):
+    """Rationale: rich draws in notebooks with ipywidgets, and warns and shows nothing where they are missing,
+    as in a plain Jupyter. Expected: one output for each render, replaced after each pass, as text and HTML.
+    """
+    monkeypatch.setitem(sys.modules, "ipywidgets", None)
+    outputs = []
+
+    class Handle:
+        def __init__(self, shown):
+            outputs.append([shown])
+
+        def update(self, shown):
+            outputs[-1].append(shown)
+
+    monkeypatch.setattr("IPython.display.display", lambda shown, display_id: Handle(shown))
+    bar = progress.Bar(console=Console(file=io.StringIO(), force_jupyter=True))
+    for done in (50, 100, 25, 100):  # of two renders
+        bar(report(done))
+    assert [len(shown) for shown in outputs] == [2, 2]
+    texts = [table._repr_mimebundle_((), ()) for shown in outputs for table in shown]
+    assert [re.search(r"\d+/100 spp", text["text/plain"])[0] for text in texts] == [
+        "50/100 spp",
+        "100/100 spp",
+        "25/100 spp",
+        "100/100 spp",
+    ]
+    assert all("<pre" in text["text/html"] for text in texts)
 
 
 def test_lines_come_now_and_then(monkeypatch):

@@ -1,82 +1,67 @@
 # %% [markdown]
 # # Tutorial
 #
-# A notebook (`docs/user/tutorial.ipynb`) and a script of the same cells, in a checkout of the repository, whose scenes it renders:
+# This page is a notebook, [tutorial.ipynb](tutorial.ipynb), which runs in Jupyter and in Colab and needs no other file:
 #
-#     pip install 'mitsuba-bdpt[measure]' jupyterlab
-#     jupyter lab docs/user/tutorial.ipynb
-#     python docs/user/tutorial.py                   # some minutes; images in renders/tutorial
-#     TUTORIAL_SIZE=32 python docs/user/tutorial.py  # a quick look
+#     pip install mitsuba-bdpt matplotlib jupyterlab
+#     jupyter lab tutorial.ipynb
 
 # %%
 import json
-import os
-from pathlib import Path
+import time
 
 import matplotlib.pyplot as plt
 import mitsuba_bdpt  # before mitsuba: it chooses the LLVM library that Dr.Jit loads
 import numpy as np
-from mitsuba_bdpt.progress import Bar
 
 import mitsuba as mi  # isort: skip
 
-SIZE = int(os.environ.get("TUTORIAL_SIZE", "128"))  # width of the images
-here = Path(globals().get("__file__", ".")).resolve()
-ROOT = next(folder for folder in (here, *here.parents) if (folder / "scenes").is_dir())
-OUT = ROOT / "renders" / "tutorial"
-OUT.mkdir(parents=True, exist_ok=True)
 mi.set_variant("llvm_ad_rgb")
-print("mitsuba-bdpt", mitsuba_bdpt.__version__)
+SIZE = 128  # width of the images
 
 
-def scene(name, **values):
-    """A scene of scenes/ at our size."""
-    return mi.load_file(str(ROOT / "scenes" / f"{name}.xml"), resolution=SIZE, **values)
+def show(images, columns=5):
+    """Show images (height, width, 3) in linear colours side by side, by their titles."""
+    rows = -(-len(images) // columns)
+    width = min(len(images), columns)
+    axes = plt.subplots(rows, width, figsize=(2.6 * width, 2.9 * rows), squeeze=False)[1]
+    for axis, (title, image) in zip(axes.flat, images.items(), strict=True):
+        axis.imshow(mi.util.convert_to_bitmap(np.array(image, dtype=np.float32)[..., :3]))
+        axis.set_title(title, fontsize=9)
+        axis.set_axis_off()
+    plt.show()
 
 
 def rel_mse(image, reference):
     """Mean of (x - r)^2 / (r^2 + 0.01 mean(r)^2)."""
     x, r = (np.array(a, dtype=np.float64)[..., :3] for a in (image, reference))
-    return ((x - r) ** 2 / (r**2 + 0.01 * r.mean() ** 2)).mean()
-
-
-def show(name, **images):
-    """Images side by side, in the notebook and in a file."""
-    figure, axes = plt.subplots(1, len(images), figsize=(3.2 * len(images), 3.2), squeeze=False)
-    for axis, (title, image) in zip(axes[0], images.items(), strict=True):
-        colours = np.array(
-            mi.Bitmap(image).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
-        )
-        axis.imshow(colours)
-        axis.set_title(title)
-        axis.set_axis_off()
-    keep(figure, name)
-
-
-def keep(figure, name):
-    """Write a figure to a file, and show it in a notebook."""
-    figure.savefig(OUT / f"{name}.png", bbox_inches="tight", dpi=100)
-    if "get_ipython" in globals():
-        plt.show()
-    plt.close(figure)
+    return float(((x - r) ** 2 / (r**2 + 0.01 * r.mean() ** 2)).mean())
 
 
 # %% [markdown]
 # ## A first render
 #
-# A point light inside cut glass. `path` would have to hit the light by chance or to connect to it through the glass,
-# and can do neither: black. Light subpaths leave the lamp, pass the glass, and are connected to the camera subpaths.
+# Mitsuba's Cornell box, and the same box with a point light inside a ball of glass. `path` would have to hit the light by
+# chance or to connect to it through the glass, and can do neither: black. Light subpaths leave the lamp, pass the glass,
+# and are connected to the camera subpaths.
 
 # %%
-lamp = scene("lamp_behind_glass")
-integrators = {name: mi.load_dict({"type": name, "max_depth": 12}) for name in ("bdpt", "path")}
-bdpt = integrators["bdpt"]
-images = {name: mi.render(lamp, integrator=made, spp=64) for name, made in integrators.items()}
-for name, image in images.items():
-    print(f"{name}: mean {np.array(image)[..., :3].mean():.3f}")
-show("lamp_behind_glass", **images)
-assert np.array(images["path"])[..., :3].max() == 0
-assert np.array(images["bdpt"])[..., :3].mean() > 0.01
+cornell_box = mi.cornell_box()
+cornell_box["sensor"]["film"].update(width=SIZE, height=SIZE)
+box = mi.load_dict(cornell_box)
+ball_lamp = {
+    "ball": {"type": "sphere", "center": [0, 0.5, 0], "radius": 0.08, "bsdf": {"type": "dielectric"}},
+    "point": {"type": "point", "position": [0, 0.5, 0.02], "intensity": 1.0},
+}
+glass = mi.load_dict({name: part for name, part in cornell_box.items() if name != "light"} | ball_lamp)
+bdpt = mi.load_dict({"type": "bdpt", "max_depth": 8})
+path = mi.load_dict({"type": "path", "max_depth": 8})
+images = {
+    "point in glass, path": mi.render(glass, integrator=path, spp=64),
+    "point in glass, bdpt": mi.render(glass, integrator=bdpt, spp=64),
+}
+show(images)
+assert np.array(images["point in glass, path"]).max() == 0
 
 # %% [markdown]
 # ## Reading `explain`
@@ -86,19 +71,20 @@ assert np.array(images["bdpt"])[..., :3].mean() > 0.01
 # scene, "not worth its cost here" from the pilot.
 
 # %%
-print(bdpt.explain(lamp, spp=4096))
-box = scene("cornell_box")
+print(bdpt.explain(glass, spp=4096))
+
+# %%
 print(bdpt.explain(box, spp=4096))
 
 # %% [markdown]
-# After a render `statistics` has the same in numbers; its decisions can be repeated in another process, or by an
+# After a render `statistics` has the same in numbers. Its decisions can be repeated in another process, or by an
 # artist who wants the same image tomorrow.
 
 # %%
-bdpt.render(box, spp=4096 if SIZE < 64 else 256, seed=1, develop=False)
+bdpt.render(box, spp=256, seed=1, develop=False)
 decisions = bdpt.statistics["decisions"]
-print({key: bdpt.statistics[key] for key in ("seconds", "rays", "passes")})
-again = mi.load_dict({"type": "bdpt", "max_depth": 12, "decisions": json.dumps(decisions)})
+print({key: bdpt.statistics[key] for key in ("rays", "passes", "peak_memory")})
+again = mi.load_dict({"type": "bdpt", "max_depth": 8, "decisions": json.dumps(decisions)})
 again.render(box, spp=16, seed=1, develop=False)
 assert again.statistics["decisions"] == decisions
 
@@ -114,29 +100,31 @@ assert again.statistics["decisions"] == decisions
 # * `variance=true`: error bars, and `target_error` to stop at one.
 
 # %%
-bars = mi.load_dict({"type": "bdpt", "max_depth": 6, "variance": True, "target_error": 0.02})
+bars = mi.load_dict({"type": "bdpt", "max_depth": 8, "variance": True, "target_error": 0.02})
 image = bars.render(box, spp=4096, seed=3)
+reference = bdpt.render(box, spp=2048, seed=9)
 done, error = sum(bars.statistics["passes"]), bars.statistics["error"]
-reference = mi.render(box, integrator=mi.load_dict({"type": "bdpt", "max_depth": 6}), spp=8192, seed=9)
-print(f"{done} spp; estimated relMSE {error:.3g}, found {rel_mse(image, reference):.3g}")
+print(f"{done} spp; relMSE estimated {error:.3g}, measured {rel_mse(image, reference):.3g}")
 assert error <= 0.02
 
 # %% [markdown]
 # ## Strategy images
 #
-# A path of k edges can be sampled by k + 2 strategies (s, t). Each has its own image: weighted, what it adds to the
-# result; unweighted, its estimate alone. `scripts/strategies.py` makes the pyramid of all of them.
+# A path of k edges can be sampled by k + 2 strategies (s, t), with s vertices on a light subpath and t on a camera
+# subpath. Each has its own images: *unweighted*, its estimate alone, and *weighted*, what it adds to the result. Here
+# those of paths with three edges. `mitsuba-bdpt pyramid SCENE` writes an image of all lengths.
 
 # %%
-shown = mi.load_dict({"type": "bdpt", "max_depth": 3, "strategy_images": True})
-layers = np.array(shown.render(box, spp=64))
-layers = layers[..., -len(shown.aov_names()) :]
-three_edges = {}
-for s in range(5):
-    t = 4 - s
-    at = shown.aov_names().index(f"weighted.s{s}t{t}.R")
-    three_edges[s, t] = layers[..., at : at + 3].mean()
-print("paths of three edges, by strategy:", {key: f"{value:.4f}" for key, value in three_edges.items()})
+layered = mi.load_dict({"type": "bdpt", "max_depth": 3, "strategy_images": True})
+film = np.array(layered.render(box, spp=256))
+names = layered.aov_names()
+layers = film[..., -len(names) :]
+pyramid = {}
+for kind in ("unweighted", "weighted"):
+    for s in range(5):
+        first = names.index(f"{kind}.s{s}t{4 - s}.R")
+        pyramid[f"{kind}, s = {s}, t = {4 - s}"] = layers[..., first : first + 3]
+show(pyramid)
 
 # %% [markdown]
 # ## A caustic of one's own
@@ -145,47 +133,77 @@ print("paths of three edges, by strategy:", {key: f"{value:.4f}" for key, value 
 # camera subpaths that happen to hit the lamp through the ball.
 
 # %%
+pair = {"path": path, "bdpt": bdpt}
 at = mi.ScalarTransform4f()
-own = mi.load_dict(
-    {
-        "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "fov": 35,
-            "to_world": at.look_at(origin=[0, -6, 4], target=[0, 0, 0.5], up=[0, 0, 1]),
-            "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
-        },
-        "floor": {
-            "type": "rectangle",
-            "to_world": at.scale(4),
-            "bsdf": {"type": "diffuse", "reflectance": 0.6},
-        },
-        "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 1, "bsdf": {"type": "dielectric"}},
-        "lamp": {
-            "type": "sphere",
-            "center": [1.5, 1, 5],
-            "radius": 0.1,
-            "emitter": {"type": "area", "radiance": 300.0},
-        },
-    }
-)
-made = {
-    "path": mi.load_dict({"type": "path", "max_depth": 8}),
-    "bdpt": mi.load_dict({"type": "bdpt", "max_depth": 8}),
+dictionary = {
+    "type": "scene",
+    "sensor": {
+        "type": "perspective",
+        "fov": 35,
+        "to_world": at.look_at(origin=[0, -6, 4], target=[0, 0, 0.5], up=[0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}},
+    },
+    "floor": {
+        "type": "rectangle",
+        "to_world": at.scale(4),
+        "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.6}},
+    },
+    "ball": {"type": "sphere", "center": [0, 0, 1], "radius": 1, "bsdf": {"type": "dielectric"}},
+    "lamp": {
+        "type": "sphere",
+        "center": [1.5, 1, 5],
+        "radius": 0.1,
+        "emitter": {"type": "area", "radiance": 1000.0},
+    },
 }
-images = {name: mi.render(own, integrator=integrator, spp=64) for name, integrator in made.items()}
-show("own_caustic", **images)
-print(made["bdpt"].explain(own, spp=64))
+caustic = mi.load_dict(dictionary)
+show({name: mi.render(caustic, integrator=made, spp=64) for name, made in pair.items()})
+
+# %% [markdown]
+# ## Comparing at equal time
+#
+# A sample of `bdpt` takes longer than one of `path`, so equal numbers of samples compare unequal work. Below each gets the
+# samples that it traces in the same time, after a first render that compiles and runs the pilot; errors are means over
+# three seeds. The time is the processor's, which other programs disturb less than the clock's. (`mitsuba-bdpt equal-time SCENE`
+# compares a file's image in this way.)
+
+# %%
+SPP = 64
+
+
+def timed(integrator, spp, seed):
+    """An image of the Cornell box and the processor's seconds that it took."""
+    start = time.process_time()
+    image = np.array(mi.render(box, integrator=integrator, spp=spp, seed=seed))
+    return image, time.process_time() - start
+
+
+def seconds_per_sample(integrator):
+    """The least of three renders, after one that compiles."""
+    return min([timed(integrator, SPP, seed)[1] for seed in range(4)][1:]) / SPP
+
+
+per_sample = {name: seconds_per_sample(made) for name, made in pair.items()}
+budget = SPP * max(per_sample.values())
+equal, errors = {}, {}
+for name, integrator in pair.items():
+    spp = max(1, round(budget / per_sample[name]))
+    renders = [timed(integrator, spp, seed) for seed in range(3)]
+    errors[name] = np.mean([rel_mse(image, reference) for image, _ in renders])
+    seconds = np.mean([seconds for _, seconds in renders])
+    equal[f"{name}: {spp} spp, {seconds:.2g} s,\nrelMSE {errors[name]:.2g}"] = renders[0][0]
+show(equal)
+print(f"at equal time the error of path is {errors['path'] / errors['bdpt']:.2g} times that of bdpt")
 
 # %% [markdown]
 # ## Long renders
 #
 # A bar under the cell, or on a terminal. The stop button of a notebook, Ctrl-C and `integrator.cancel()` end a render after
-# the pass that is running; what is done is in the film. (`docs/user/long_renders.md` has checkpoints. `mi.render` would wrap the
-# interruption in an error of its own; the integrator's method does not.)
+# the pass that is running; what is done is in the film. ([Long renders](long_renders.md) has checkpoints. `mi.render` would
+# wrap the interruption in an error of its own; the integrator's method does not.)
 
 # %%
-bdpt.on_pass = Bar()
+bdpt.on_pass = mitsuba_bdpt.Bar()
 try:
     image = bdpt.render(box, spp=256)
 except KeyboardInterrupt:
@@ -194,54 +212,25 @@ bdpt.on_pass = None
 print(sum(bdpt.statistics["passes"]), "samples per pixel")
 
 # %% [markdown]
-# ## Sweeps
-#
-# `presets/small.toml` names scenes, integrators and samples; a sweep is
-#
-#     python scripts/sweep.py presets/small.toml -o results/small
-#     python scripts/report.py results/small      # tables and plots
-#     python scripts/page.py results/small        # one HTML file to send around
-#
-# In a script of one's own, compare at equal time, not at equal samples, and more than one seed. Twice the samples, half the
-# error; bdpt's points make it fall somewhat faster.
-
-# %%
-counts = [4, 16, 64, 256] if SIZE >= 64 else [4, 16]
-plain = mi.load_dict({"type": "path", "max_depth": 6})
-ours = mi.load_dict({"type": "bdpt", "max_depth": 6})
-figure, axis = plt.subplots(figsize=(4.5, 3.2))
-for name, integrator in (("path", plain), ("bdpt", ours)):
-    sweep = []
-    for spp in counts:
-        renders = [mi.render(box, integrator=integrator, spp=spp, seed=seed) for seed in range(3)]
-        sweep.append(np.mean([rel_mse(image, reference) for image in renders]))
-    axis.loglog(counts, sweep, "o-", label=name)
-    print(name, [f"{error:.3g}" for error in sweep])
-axis.set_xlabel("samples per pixel")
-axis.set_ylabel("relMSE")
-axis.legend()
-keep(figure, "sweep")
-
-# %% [markdown]
 # ## Limits
 #
-# In `pool` a small lamp shines over wavy water. The wall (sensor 0) gets its caustics by light tracing (t = 1), which
-# `path` does not have. The floor seen from above (sensor 2) is behind water for the lamp *and* for the camera: no vertex of
-# such a path can be connected to a neighbour, and only camera subpaths that happen to hit the lamp (s = 0) find it.
+# The floor of a basin: the lamp shines on it through water, and the camera sees it through water. Such a path
+# (specular-diffuse-specular, SDS) has no edge that can be connected, and only camera subpaths that happen to hit the lamp
+# find it: fireflies. By default photons guide them where a pilot finds that it pays (`photon_guiding`). Vertex merging,
+# which is photon mapping for these paths alone, finds the light of point lamps too, is biased by a blur of about a pixel, and
+# converges to the right image ([the method](../method/method.md#vertex-merging-of-sds-paths)).
 
 # %%
-pool = scene("pool")
-for sensor, view in ((0, "wall"), (2, "floor through water")):
-    long_render = mi.render(pool, integrator=bdpt, sensor=sensor, spp=1024, seed=5)
-    errors = {}
-    for name, made in integrators.items():
-        image = mi.render(pool, integrator=made, sensor=sensor, spp=64, seed=6)
-        errors[name] = rel_mse(image, long_render)
-        print(f"{view}, {name}: relMSE {errors[name]:.3g} at 64 samples per pixel")
-    print(f"{view}: error of path over ours: {errors['path'] / errors['bdpt']:.3g}")
-    assert view != "wall" or errors["path"] > 3 * errors["bdpt"]
-
-# %% [markdown]
-# On the floor a few fireflies determine the relMSE of both, the long render's too: no figure there means much, which
-# is typical of paths that are found by chance only. With `merging=True` it comes out smooth, blurred by about a pixel
-# (docs/reports/merging.md); `scenes/pool_floor.xml` has the sun in place of the lamp, and nothing else finds it.
+water = {
+    "type": "rectangle",
+    "to_world": at.translate([0, 0, 0.7]).scale(4),
+    "bsdf": {"type": "dielectric", "int_ior": 1.33},
+}
+basin = mi.load_dict(dictionary | {"water": water})
+ways = {
+    "path": path,
+    "photon_guiding=never": mi.load_dict({"type": "bdpt", "max_depth": 8, "photon_guiding": "never"}),
+    "bdpt": bdpt,
+    "merging=true": mi.load_dict({"type": "bdpt", "max_depth": 8, "merging": True}),
+}
+show({name: mi.render(basin, integrator=made, spp=64) for name, made in ways.items()})

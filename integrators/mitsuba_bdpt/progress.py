@@ -2,7 +2,7 @@
 
 A display is a function that a render calls with a `run.rendering.PassReport` after each pass::
 
-    integrator.on_pass = mitsuba_bdpt.progress.Bar()  # on a terminal or in a notebook
+    integrator.on_pass = mitsuba_bdpt.Bar()  # on a terminal or in a notebook
     mi.render(scene, integrator=integrator, spp=4096)
 
 Each knows by ``limit`` (seconds; None without one) when a render will be stopped for time.
@@ -99,9 +99,9 @@ class Display:
 
 
 class Bar(Display):
-    """A bar, on standard error of a terminal or under the cell of a notebook; silent elsewhere.
+    """A bar on standard error of a terminal, or under the cell of a notebook; shows nothing elsewhere.
 
-    ``console``: where else. `close` ends it; the last pass of a render does so too.
+    ``console``: another place. The last pass of a render takes the bar off a terminal, and so does `close`.
     """
 
     def __init__(
@@ -112,18 +112,18 @@ class Bar(Display):
 
         super().__init__(limit, open_ended)
         console = console or Console(stderr=True)
-        shown = console.is_terminal or console.is_jupyter
         columns = BarColumn(), TextColumn("{task.description}")
+        # In notebooks rich draws with ipywidgets, which a plain Jupyter does not have: `_CellOutput` does it.
+        self._cell = _CellOutput() if console.is_jupyter else None
+        shown = console.is_terminal and not console.is_jupyter
         # Nothing is drawn between passes: a thread would go on for ever after a render that was interrupted.
-        self._bar = Progress(
-            *columns, console=console, transient=not console.is_jupyter, auto_refresh=False, disable=not shown
-        )
+        self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not shown)
         self._task = self._bar.add_task("rendering", total=1.0)
         self._begun = False
 
     @property
     def description(self) -> str:
-        """What stands beside the bar."""
+        """The text beside the bar."""
         return self._bar.tasks[0].description
 
     @property
@@ -139,13 +139,36 @@ class Bar(Display):
         text = in_words(report, self._limit, self._open_ended)
         self._bar.update(self._task, completed=done, description=text)
         self._bar.refresh()
+        if self._cell is not None:
+            self._cell.show(self._bar.make_tasks_table(self._bar.tasks))
         if report.spp_done >= report.spp_total:
             self.close()
 
     def close(self) -> None:
         if self._begun:
             self._bar.stop()
+        if self._cell is not None:
+            self._cell = _CellOutput()  # the next render's, of another cell
         self._begun = False
+
+
+class _CellOutput:
+    """One output of a notebook's cell, which is replaced by the next that is shown.
+
+    By IPython's display identifiers, which Jupyter, Colab and editors support without an extension.
+    """
+
+    def __init__(self):
+        self._handle = None
+
+    def show(self, shown: object) -> None:
+        """Show an object, as IPython displays it, in the place of the one before."""
+        if self._handle is None:
+            from IPython.display import display
+
+            self._handle = display(shown, display_id=True)
+        else:
+            self._handle.update(shown)
 
 
 class Lines(Display):
