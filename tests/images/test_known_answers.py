@@ -286,6 +286,20 @@ def test_all_bounces_in_the_unit_sphere_add_up_to_one(kind, parameters):
     check(np.concatenate([images.mean(1), images.mean(2)], axis=1), 1, 2e-2)
 
 
+@pytest.mark.parametrize("connections", ["one", "all"])
+def test_many_stored_vertices(connections):
+    """Rationale: in dark rooms few light subpaths have more than a dozen vertices. In a white sphere whose
+    centre is a point lamp light that was reflected m times has the radiance 1, for every m. Expected: of
+    paths of up to 60 edges 59, with a light subpath of 58 stored vertices among which one is drawn, and with
+    all of them. Tolerance: the confidence interval, below 1e-2. Statistic: t-test over 16 seeds.
+    """
+    lamp = {"type": "point", "intensity": float(np.pi)}
+    wall = {"type": "sphere", "bsdf": diffuse(1.0)}
+    scene = mi.load_dict({"type": "scene", "sensor": camera(size=8), "wall": wall, "lamp": lamp})
+    bdpt = integrator(max_depth=60, rr_depth=100, skip="impossible", light_paths=1, connections=connections)
+    check(render(scene, bdpt, range(16), 16)[..., :3].mean((1, 2, 3)), 59.0, 1e-2)
+
+
 @pytest.mark.parametrize("depth", [2, 3, 4])
 @pytest.mark.parametrize("parameters", [{}, {"stored_vertices": 2}], ids=["default", "K=2"])
 def test_partial_sums_with_drawn_connections_and_roulette(depth, parameters):

@@ -612,10 +612,10 @@ def test_merges_do_not_outweigh_what_is_better(monkeypatch):
     assert 0 < a < 1.3 * b
 
 
-def strategy_images(scene, spp, seeds):
+def strategy_images(scene, spp, seeds, **more):
     """Images and layers of the first colour by name, each (seeds, height, width)."""
     parameters = {"type": "bdpt", "max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
-    method = mi.load_dict(parameters | {"strategy_images": True})
+    method = mi.load_dict(parameters | {"strategy_images": True} | more)
     found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
     found = np.array(found, dtype=np.float64)
     names = method.aov_names()

@@ -1,0 +1,167 @@
+"""SDS paths by vertex merging and guided s = 0: their lengths, weights and photons where others differ.
+
+The scenes of `test_merging` have paths of an even number of edges, one diffuse vertex on each SDS path, and
+discs of nearly one size.
+"""
+
+from types import SimpleNamespace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import views
+import welch as st
+from mitsuba_bdpt.sampling import sobol
+from mitsuba_bdpt.transport import merging, photon_guide, photons
+from mitsuba_bdpt.transport.merge_radius import Footprints
+from snapshots import ROUNDING
+from test_merging import ball, images, matte, point, strategy_images, transform, under_glass
+
+import drjit as dr  # isort: skip
+
+
+def through_the_plate():
+    """The camera sees the floor through the plate: paths of six edges."""
+    return under_glass(ball())
+
+
+def by_a_mirror():
+    """The camera is below the plate and sees the floor in a mirror alone: paths of five edges."""
+    to_world = transform().translate([-1.5, 0, 0.2]).rotate([0, 1, 0], 90).scale([0.2, 1, 1])
+    mirror = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
+    scene = under_glass(ball(), mirror=mirror)
+    scene["sensor"] = views.camera(origin=(0, 0, 0.3), target=(-1.5, 0, 0.3), fov=16, size=16)
+    return scene
+
+
+@pytest.mark.parametrize("way", [{"merging": True}, {"photon_guiding": "always"}], ids=["merging", "guided"])
+@pytest.mark.parametrize(
+    "described, edges", [(through_the_plate, 6), (by_a_mirror, 5)], ids=["plate", "mirror"]
+)
+def test_no_path_is_longer_than_max_depth(described, edges, way):
+    """Rationale: the edges of a merged path are those of a photon and of a camera vertex, those of a guided
+    path those of two subpaths. Expected: with ``max_depth`` one less than the shortest SDS path the image of
+    the same seed without merging and guiding, to the rounding of sums; another one from there on.
+    """
+    scene = mi.load_dict(described())
+    for depth in (edges - 1, edges):
+        settings = {"max_depth": depth, "skip": "impossible"}
+        a, b = (images(scene, 16, 1, **settings, **w) for w in (way, {"photon_guiding": "never"}))
+        assert np.allclose(a, b, **ROUNDING) == (depth < edges)
+
+
+def test_merges_beyond_stored_vertices_have_no_other_strategy():
+    """Rationale: t = 0 makes no path of more than ``stored_vertices`` edges. Expected: under a point lamp and
+    with a wide lens merges have all of the weight with ``stored_vertices=1`` (to the rounding of sums), and a
+    part of it without.
+    """
+    scene = under_glass(point(), kind="thinlens")
+    scene["sensor"] |= {"aperture_radius": 0.8}
+    scene = mi.load_dict(scene)
+    for more, alone in (({"stored_vertices": 1}, True), ({}, False)):
+        _, layers = strategy_images(scene, 32, 1, merging_radius=0.5, skip="impossible", **more)
+        weighted, unweighted = (layers[f"{of}.merged"] for of in ("weighted", "unweighted"))
+        assert weighted.any() and np.allclose(weighted, unweighted, **ROUNDING) == alone
+
+
+def random_photons(count, seed=1):
+    """Photons on the floor z = 0 between -4 and 4, of random flux, as arrays."""
+    rng = np.random.default_rng(seed)
+    found = merging.Photon.zeros(count)
+    found.p = mi.Point3f(*rng.uniform(-4, 4, (2, count)), 0)
+    found.n = mi.Normal3f(dr.zeros(mi.Float, count), 0, 1)
+    found.flux = mi.Spectrum(mi.Float(rng.exponential(size=count)))
+    found.edges = mi.UInt32(1 + rng.integers(0, 4, count).astype(np.uint32))
+    found.lane = dr.arange(mi.UInt32, count)
+    return found
+
+
+def test_all_photons_of_a_disc_are_found():
+    """Rationale: photons lie in grids whose cells double in size with the radius, and a disc meets photons of
+    several grids where the radius grows quickly. Expected: with the steepest radius the total flux in each of
+    4,096 discs about random points is that of a search among all photons, up to the paths' length; the
+    radii of the photons of a hundred discs at least are of two grids.
+    """
+    n, most = 4096, 5
+    radius = Footprints((0.0, 0.0, 0.3), 0.0, 0.1, 0.2).radius(4.0)
+    found = random_photons(n)
+    of_pass = merging.Merging(radius, mi.Float(n), mi.Float(1), None)
+    of_pass.photons = photons._sorted(of_pass, found, n)
+    rng = np.random.default_rng(2)
+    p, edges = rng.uniform(-3, 3, (2, n)), rng.integers(1, 4, n)
+    z = SimpleNamespace(
+        si=SimpleNamespace(p=mi.Point3f(*p, 0), n=mi.Normal3f(dr.zeros(mi.Float, n), 0, 1)),
+        edges=mi.UInt32(edges.astype(np.uint32)),
+    )
+    kernel = SimpleNamespace(merging=of_pass, max_depth=dr.opaque(mi.UInt32, most))
+    _, total = merging._draw(kernel, z, sobol.mix(dr.arange(mi.UInt32, n)), None)
+
+    off = np.array(found.p)[:2, None, :] - p[:, :, None]
+    r = np.array(radius.at(z.si.p))
+    near = (off**2).sum(0) < r[:, None] ** 2
+    near &= np.array(found.edges) + edges[:, None] <= most
+    np.testing.assert_allclose(np.array(total), near @ np.array(found.flux)[0], rtol=1e-4)
+    level = np.array(merging.level_of(radius, radius.at(found.p)))
+    assert sum(len(set(level[row])) > 1 for row in near) > 100
+
+
+def lit_by_a_wall():
+    """A floor that a lamp lights by a wall, and a wide lens above it; surfaces between all of these.
+
+    The lamp does not shine at the floor and the lens does not see the wall, so that the SDS paths of seven
+    edges, all that there are, have two diffuse vertices. The surfaces are delta ones that change nothing.
+    """
+
+    def square(at, axis, angle, size, bsdf):
+        to_world = transform().translate(at).rotate(axis, angle).scale(size)
+        return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+    clear = {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0}
+    lens = {"size": 4, "aperture_radius": 0.8, "focus_distance": 1.2}
+    lamp = square([0, 0, 1.7], [0, 1, 0], -90, 0.5, matte(0.0))
+    parts = {
+        "wall": square([-1, 0, 1.5], [0, 1, 0], 90, 1.5, matte(0.9)),
+        "before the wall": square([-0.9, 0, 1.5], [0, 1, 0], 90, 3, clear),
+        "lamp": lamp | {"emitter": {"type": "area", "radiance": 10.0}},
+        "floor": square([1, 0, 0], [0, 0, 1], 0, 1, matte(0.9)),
+        "above the floor": square([2, 0, 0.1], [0, 0, 1], 0, 2.8, clear),
+        "sensor": views.camera("thinlens", origin=(1, 0, 1.2), target=(1, 0, 0), **lens),
+    }
+    return mi.load_dict({"type": "scene", **parts})
+
+
+def test_light_subpaths_with_two_diffuse_vertices(monkeypatch):
+    """Rationale: guided s = 0 makes a path at the last vertex from the camera whose event is not delta, so of
+    the diffuse vertices of a light subpath t = 0 has to count it at the first alone. The guide makes
+    directions at the floor alone, where none of them leads to the lamp, and t = 0 has a third of the weight.
+    Expected: the image of the same seed without guiding, to the rounding of sums.
+    """
+
+    def draw(guide, p, found, u1, u2):
+        return mi.warp.square_to_uniform_sphere(u2), p.x > -0.5
+
+    def density(guide, p, found, d):
+        return dr.select(p.x > -0.5, dr.inv_four_pi, 0)
+
+    scene = lit_by_a_wall()
+    settings = {"skip": "none", "max_depth": 7}
+    expected = images(scene, 256, 1, photon_guiding="never", **settings)
+    monkeypatch.setattr(photon_guide, "draw", draw)
+    monkeypatch.setattr(photon_guide, "density", density)
+    found = images(scene, 256, 1, photon_guiding="always", **settings)
+    np.testing.assert_allclose(found, expected, **ROUNDING)
+    assert (expected > 0).sum() > 8
+
+
+def test_a_sun_with_hide_emitters():
+    """Rationale: what is hidden is the sky that a camera ray meets first, not what guided subpaths find. An
+    `envmap` that is black but for a sun of 11 degrees, which the plate does not mirror into the camera.
+    Expected: the same tiles with guiding and without.
+    """
+    pixels = np.zeros((33, 64, 3), dtype=np.float32)
+    pixels[10:12, 8:10] = 200.0
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": transform().rotate([1, 0, 0], 90)}
+    scene = mi.load_dict(under_glass(sky))
+    a = images(scene, 32, 6, photon_guiding="always", hide_emitters=True)
+    b = images(scene, 32, 6, first=100, photon_guiding="never", hide_emitters=True)
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
