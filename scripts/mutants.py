@@ -49,6 +49,48 @@ class Mutant:
 
 MUTANTS = (
     Mutant(
+        "features: normals of maps are flipped without being asked",
+        "image/mapped_normals.py",
+        "        if self._flips:",
+        "        if True:",
+        ("tests/image/test_aovs.py::test_features_are_those_of_aov[plain]",),
+    ),
+    Mutant(
+        "features: the normals of a bump map are the surface's",
+        "image/mapped_normals.py",
+        "here = active & (bsdf == mi.BSDFPtr(one.bsdf))",
+        "here = mi.Bool(False)",
+        ("tests/image/test_aovs.py::test_features_are_those_of_aov[plain]",),
+    ),
+    Mutant(
+        "lost light: a pilot's share near the limit is said",
+        "planning/lost_light.py",
+        "share >= 2 * WORTH_A_WORD",
+        "share >= WORTH_A_WORD",
+        ("tests/planning/test_lost_light.py::test_a_share_near_the_limit_waits_for_the_image",),
+    ),
+    Mutant(
+        "lost light: said after the last pass",
+        "run/rendering.py",
+        "                    self._predict_lost_light()",
+        "                    pass",
+        ("tests/planning/test_lost_light.py::test_it_is_said_before_the_samples_are_traced[pilot]",),
+    ),
+    Mutant(
+        "sensors: views of a batch are not checked",
+        "sensors/checks.py",
+        "            check_sensor(view, of_scene)",
+        "            pass",
+        ("tests/sensors/test_checks.py::test_what_a_sensor_lacks_is_said[batch of a distant]",),
+    ),
+    Mutant(
+        "Mitsuba 3.10: the first key frame stands for all",
+        "host/renamed.py",
+        "if value.is_animated():",
+        "if False:",
+        ("tests/host/test_renamed.py::test_what_is_animated_is_refused",),
+    ),
+    Mutant(
         "small arrays are not kept",
         "host/edits.py",
         "kept.append(dr.copy(value))",
@@ -600,7 +642,7 @@ MUTANTS = (
     Mutant(
         "polarized: Stokes vectors of an upright sensor",
         "image/stokes.py",
-        "sensor.world_transform() @ mi.Vector3f(0, 1, 0)",
+        "world_transform(sensor) @ mi.Vector3f(0, 1, 0)",
         "mi.Vector3f(0, 1, 0)",
         ("tests/images/test_polarized.py::test_stokes_vectors_are_mitsubas[rough metal and plastic]",),
     ),

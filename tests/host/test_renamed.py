@@ -4,7 +4,9 @@ from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_bdpt.host import renamed
+import pytest
+from mitsuba_bdpt.errors import UnsupportedError
+from mitsuba_bdpt.host import introspection, renamed
 from mitsuba_bdpt.host.introspection import own_parameters
 
 
@@ -60,3 +62,88 @@ def test_flags_of_hits(monkeypatch):
     assert renamed.hit_flags() == mi.RayFlags.All
     monkeypatch.setattr(mi, "RayFlags", SimpleNamespace(Default=7))
     assert renamed.hit_flags() == 7
+
+
+class Transform:
+    """``to_world`` of 3.10: transformations by time, those of its branch ``motion_blur``."""
+
+    def __init__(self, *frames):
+        self.frames = frames
+
+    def is_animated(self):
+        return len(self.frames) > 1
+
+    def eval(self, time):
+        return self.frames[0]
+
+
+MOVED = mi.ScalarTransform4f().translate([1, 2, 3])
+TURNED = mi.ScalarTransform4f().rotate([0, 1, 0], 90)
+
+
+@pytest.fixture
+def of_3_10(monkeypatch):
+    """Mitsuba has 3.10's transformations."""
+    monkeypatch.setattr(mi, "AnimatedTransform4f", Transform, raising=False)
+
+
+def owner(*frames):
+    """Something whose ``traverse`` reports ``to_world`` as 3.10 does, or without frames as 3.9 does."""
+    held = Transform(*frames) if frames else MOVED
+    return SimpleNamespace(
+        traverse=lambda callback: callback.put("to_world", held, 0),
+        world_transform=lambda: held,
+        class_name=lambda: "Sphere",
+        id=lambda: "ball",
+    )
+
+
+def test_to_world_of_both_versions(of_3_10):
+    """Expected: matrices of a parameter and of an endpoint are the same from 3.10's object as from 3.9's
+    value.
+    """
+    expected = np.array(MOVED.matrix, dtype=np.float64)
+    for one in (owner(), owner(MOVED)):
+        assert introspection.matrix_of(one).tolist() == expected.tolist()
+        assert introspection.inverse_of(one).tolist() == np.linalg.inv(expected).tolist()
+        assert introspection.world_matrix(one).tolist() == expected.tolist()
+    introspection.check_not_animated([owner(), owner(MOVED)])
+
+
+def test_what_is_animated_is_refused(of_3_10):
+    """Expected: an error that names the object, wherever its transformation is read."""
+    moving = owner(MOVED, TURNED)
+    for read in (
+        introspection.matrix_of,
+        introspection.world_matrix,
+        lambda one: introspection.check_not_animated([owner(MOVED), one]),
+    ):
+        with pytest.raises(
+            UnsupportedError, match="bdpt: to_world of Sphere 'ball' is animated.*without key"
+        ):
+            read(moving)
+
+
+class MovingLamp(mi.Emitter):
+    """A lamp that moves while the shutter is open."""
+
+    def traverse(self, callback):
+        callback.put("to_world", Transform(MOVED, TURNED), mi.ParamFlags.NonDifferentiable)
+
+
+class MovingCamera(mi.Sensor):
+    """A camera that moves while the shutter is open."""
+
+    def traverse(self, callback):
+        callback.put("to_world", Transform(MOVED, TURNED), mi.ParamFlags.NonDifferentiable)
+
+
+@pytest.mark.parametrize("moving", ["lamp", "eye"])
+def test_animated_scenes_are_refused(of_3_10, moving):
+    """Expected: a render of a scene with a lamp or a camera that moves is refused, with its name."""
+    mi.register_emitter("moving_lamp", MovingLamp)
+    mi.register_sensor("moving_camera", MovingCamera)
+    scene = {"type": "scene", "eye": {"type": "perspective"}, "lamp": {"type": "point"}}
+    scene[moving] = {"type": "moving_lamp" if moving == "lamp" else "moving_camera"}
+    with pytest.raises(UnsupportedError, match=f"bdpt: to_world of .* '{moving}' is animated"):
+        mi.load_dict({"type": "bdpt"}).render(mi.load_dict(scene), spp=1)

@@ -23,10 +23,12 @@ def test_imports_go_one_way(capsys):
 
 
 def test_one_module_knows_what_mitsuba_renames():
-    """Rationale: Mitsuba 3.10 calls data of meshes differently and has other flags of rays. Expected: one
-    module alone names them, `host.renamed`.
+    """Rationale: Mitsuba 3.10 calls data of meshes differently, and has other flags of rays and animated
+    transformations. Expected: one module alone names them, `host.renamed`.
     """
-    names = re.compile(r"vertex_(positions|normals|texcoords)|RayFlags\.All|[\"']faces[\"']")
+    names = re.compile(
+        r"vertex_(positions|normals|texcoords)|RayFlags\.All|[\"']faces[\"']|AnimatedTransform|is_animated"
+    )
     package = Path(mitsuba_bdpt.__path__[0])
     found = {str(p.relative_to(package)) for p in package.rglob("*.py") if names.search(p.read_text())}
     assert found == {"host/renamed.py"}

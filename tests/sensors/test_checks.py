@@ -105,7 +105,7 @@ def test_what_a_sensor_lacks_is_said(name):
 def test_a_distant_sensor_beside_the_scene_is_refused():
     """Rationale: Mitsuba tells the sensors of a scene where it is; others start their rays at the origin.
     Expected: said in words; as a sensor of the scene, also in a batch, it sees the scene from outside: the
-    ball, of reflectance 1/2 under a sky of radiance 1, and beside it nothing of the sky's lower half.
+    ball, of reflectance 1/2 under a sky of radiance 1, in both pixels.
     """
     parts = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
     loose = mi.load_dict(distant(target=[0, 0, 0]))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+
+from . import renamed
 
 
 def number(x) -> float:
@@ -59,14 +62,17 @@ def own_parameters(owner) -> dict:
     return {
         name: _value(value, collector.types[name], owner)
         for name, value in found.items()
-        if value is not None and not isinstance(value, mi.Object)
+        if value is not None and (not isinstance(value, mi.Object) or renamed.is_transform(value))
     }
 
 
 def _value(value, cpptype, owner):
     """The parameter itself, as ``mi.traverse`` reads it.
 
-    A plugin in Python puts the value, one of Mitsuba's a pointer to a value of this C++ type."""
+    A plugin in Python puts the value, one of Mitsuba's a pointer to a value of this C++ type. Raises
+    ``UnsupportedError`` if it is an animated transformation."""
+    if renamed.is_transform(value):
+        return renamed.transform(value, _called(owner))
     return value if cpptype is None else mi.get_property(value, cpptype, owner)
 
 
@@ -90,6 +96,26 @@ def all_parameters(owners):
 def matrix_of(owner) -> np.ndarray:
     """The matrix of the parameter ``to_world`` of ``owner``: (4, 4), in double precision."""
     return _entries(own_parameters(owner)["to_world"].matrix)
+
+
+def world_transform(endpoint: mi.Emitter | mi.Sensor):
+    """The transformation of an emitter or a sensor; raises ``UnsupportedError`` if it is animated."""
+    return renamed.transform(endpoint.world_transform(), _called(endpoint))
+
+
+def world_matrix(endpoint: mi.Emitter | mi.Sensor) -> np.ndarray:
+    """The matrix of `world_transform`: (4, 4), in double precision."""
+    return _entries(world_transform(endpoint).matrix)
+
+
+def check_not_animated(owners: Iterable):
+    """Raise ``UnsupportedError`` if one of ``owners`` moves while the shutter is open."""
+    for owner in owners if renamed.may_be_animated() else ():
+        own_parameters(owner)
+
+
+def _called(owner) -> str:
+    return f"{owner.class_name()} {named(owner)}"
 
 
 def inverse_of(owner) -> np.ndarray:

@@ -1,7 +1,10 @@
-"""What Mitsuba 3.9 and 3.10 have under different names: meshes, and how much is computed of a hit.
+"""What Mitsuba 3.9 and 3.10 have under different names: meshes, hits, and ``to_world``.
 
 No other module asks for it, so that both work. (Tested with 3.9; of 3.10, which is in development, the names
-are those of its release notes, tested with parameters of that shape.)
+are those of its release notes and of its branch ``motion_blur``, tested with parameters of that shape.)
+
+``to_world`` is a transformation in 3.9. In 3.10 it is an object, ``AnimatedTransform4f``, which holds a
+transformation for each key frame, within the shutter.
 """
 
 from __future__ import annotations
@@ -12,6 +15,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UnsupportedError
+
 # Names of 3.9, one number after the other, and of 3.10, tensors.
 POSITIONS = ("vertex_positions", "positions")
 NORMALS = ("vertex_normals", "normals")
@@ -21,6 +26,32 @@ COORDINATES = ("vertex_texcoords", "texcoords")
 _INDEX = {POSITIONS: "position_index", NORMALS: "normal_index"}
 
 Parameters = Mapping[str, Any]
+
+
+def is_transform(value: Any) -> bool:
+    """Whether ``value`` is the object that is a ``to_world`` of 3.10."""
+    kind = getattr(mi, "AnimatedTransform4f", None)
+    return kind is not None and isinstance(value, kind)
+
+
+def may_be_animated() -> bool:
+    """Whether the installed Mitsuba has animated transformations."""
+    return hasattr(mi, "AnimatedTransform4f")
+
+
+def transform(value: Any, owner: str) -> Any:
+    """The transformation that ``value`` is in 3.9 and holds in 3.10.
+
+    Raises ``UnsupportedError`` if it has several key frames; ``owner`` is whose it is, for the message.
+    """
+    if not is_transform(value):
+        return value
+    if value.is_animated():
+        raise UnsupportedError(
+            f"to_world of {owner} is animated, which is not supported; give it a transformation without key "
+            "frames, or render with path"
+        )
+    return value.eval(0.0)
 
 
 def hit_flags() -> mi.RayFlags:

@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry.polarization import basis
+from ..host.introspection import world_transform
 
 NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")
 """Of the layers."""
@@ -22,7 +23,7 @@ class Stokes:
     """
 
     def __init__(self, sensor: mi.Sensor, rgb):
-        self._vertical = sensor.world_transform() @ mi.Vector3f(0, 1, 0)
+        self._vertical = world_transform(sensor) @ mi.Vector3f(0, 1, 0)
         dr.make_opaque(self._vertical)
         self._rgb = rgb
 

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..host.introspection import matrix_of, world_matrix
 from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
 
 KINDS = {
@@ -172,12 +173,11 @@ def _lamp(emitter, probability) -> Lamp:
         cutoff = np.deg2rad(float(np.array(mi.traverse(emitter)["cutoff_angle"]).ravel()[0]))
         lamp.cone = 2 * np.pi * (1 - np.cos(cutoff))
     if name == "EnvironmentMapEmitter":
-        to_world = np.array(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-        lamp.pole = to_world[:3, 1]
+        lamp.pole = matrix_of(emitter)[:3, 1]
     if shape is not None:
         lamp.area = float(np.array(shape.surface_area()).ravel()[0])
         if shape.class_name() == "Sphere":
-            matrix = np.array(mi.traverse(shape)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+            matrix = matrix_of(shape)
             if _faces_outwards(shape, matrix[:3, 3]):
                 lamp.center, lamp.radius = matrix[:3, 3], np.linalg.norm(matrix[:3, 0])
     return lamp
@@ -207,7 +207,7 @@ class Camera:
         across = 2 * np.tan(np.deg2rad(float(np.array(params["x_fov"]).ravel()[0])) / 2)
         lens = sensor.class_name() == "ThinLensCamera"
         radius = float(np.array(params["aperture_radius"]).ravel()[0]) if lens else 0.0
-        axis = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 2]
+        axis = world_matrix(sensor)[:3, 2]
         return Camera(axis / np.linalg.norm(axis), across**2 * height / width, radius)
 
     def density(self, d):

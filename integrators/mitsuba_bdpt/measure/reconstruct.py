@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..host.introspection import world_matrix
 from ..transport import draws
 from . import endpoints, oracle
 from .scenes import has_media
@@ -251,7 +252,7 @@ def _densities(scene, path, events, source):
     lens, lens_pdf = sensor.class_name() == "ThinLensCamera", 1.0
     if lens:
         lens_pdf = 1 / (np.pi * float(mi.traverse(sensor)["aperture_radius"][0]) ** 2)
-    axis = np.array(sensor.world_transform().matrix, dtype=float).reshape(4, 4)[:3, 2]
+    axis = world_matrix(sensor)[:3, 2]
     cos_sensor = abs(axis @ _direction(path, 0)) / np.linalg.norm(axis)
     k = len(path.p) - 1
     dist2 = [np.sum((path.p[i + 1] - path.p[i]) ** 2) for i in range(k)]

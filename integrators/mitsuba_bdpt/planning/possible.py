@@ -11,6 +11,7 @@ import numpy as np
 from ..emitters.emission_tables import MOST_CELLS, SIDES, side_of
 from ..emitters.emitters import Emitters
 from ..geometry.boxes import scene_box
+from ..host.introspection import world_matrix
 from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
@@ -224,9 +225,9 @@ def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
     """Whether the scene's box reaches behind the far plane of a sensor that has one."""
     if not isinstance(sensor, mi.ProjectiveCamera) or not prepared.surfaces:
         return False
-    box, to_world = scene_box(prepared.scene), np.array(sensor.world_transform().matrix, dtype=np.float64)
+    box, to_world = scene_box(prepared.scene), world_matrix(sensor)
     corners = np.array([[*box.corner(i)] for i in range(8)], dtype=np.float64).reshape(8, 3)
-    forwards, origin = to_world.reshape(4, 4)[:3, 2:].T
+    forwards, origin = to_world[:3, 2:].T
     return bool(((corners - origin) @ forwards / np.linalg.norm(forwards) > sensor.far_clip()).any())
 
 

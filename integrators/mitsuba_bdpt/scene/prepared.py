@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..emitters.emitters import Emitters
 from ..errors import UnsupportedError
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import all_shapes, children, is_instance, named
+from ..host.introspection import all_shapes, check_not_animated, children, is_instance, named
 from ..media.media import Media, Space
 from ..sensors.checks import check_sensor
 from ..sensors.kinds import prepare
@@ -28,6 +28,7 @@ class PreparedScene:
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
+        check_not_animated([*all_shapes(scene), *scene.emitters(), sensor])
         self.scene = scene
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene, ShapeFacts.of(scene, sensor))

@@ -20,8 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import rays
-from ..host.introspection import number, own_parameters
-from . import checks
+from ..host.introspection import number, own_parameters, world_matrix
 from .checks import inverse, rays_of
 from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
 
@@ -226,7 +225,7 @@ class Camera(Sensor):
 def _numbers(sensor, share: float):
     """What `_View.of` takes; ``share`` see `Region`."""
     lens = sensor.class_name() == KINDS[1]
-    to_world = checks.to_world(sensor)
+    to_world = world_matrix(sensor)
     to_film, origin = _film_map(sensor, to_world)
     # Area at z = 1 that one crop window covers, times the share that a border adds.
     area = 1 / abs(np.linalg.det(to_film)) * share

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import UnsupportedError, UsageError
 from ..geometry.to_world import check_to_world
-from ..host.introspection import children, named, number, own_parameters
+from ..host.introspection import children, named, number, own_parameters, world_matrix
 
 _NAMES = {
     "PerspectiveCamera": "perspective camera",
@@ -82,7 +82,7 @@ def _check_numbers(sensor: mi.Sensor):
     for name, value in _numbers(sensor).items():
         if not math.isfinite(value):
             raise UsageError(f"{name}={value} of {called(sensor)} must be finite; give another number")
-    matrix = to_world(sensor)
+    matrix = world_matrix(sensor)
     if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:3, :3]) < 3:
         raise UsageError(
             f"to_world of {called(sensor)} is not finite, or cannot be inverted ({_rows(matrix)}); give it a "
@@ -94,11 +94,6 @@ def _check_numbers(sensor: mi.Sensor):
             f"focus_distance={focus:g} of {called(sensor)} must be greater than 0: it is the "
             "distance of the plane that is in focus"
         )
-
-
-def to_world(sensor: mi.Sensor) -> np.ndarray:
-    """The sensor's ``to_world``: (4, 4), in double precision."""
-    return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
 
 
 def _numbers(sensor: mi.Sensor) -> dict[str, float]:
@@ -136,7 +131,7 @@ def inverse(matrix: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
 def _parameters(sensor: mi.Sensor) -> str:
     """The sensor's numbers and its ``to_world``, for messages."""
     numbers = [f"{name}={value:g}" for name, value in _numbers(sensor).items()]
-    return ", ".join([*numbers, f"to_world=({_rows(to_world(sensor))})"])
+    return ", ".join([*numbers, f"to_world=({_rows(world_matrix(sensor))})"])
 
 
 def check_rays(sensor: mi.Sensor):

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry.boxes import scene_box
+from ..host.introspection import world_matrix
 
 # Camera rays by which a scene is asked for the size of its pixels: so many columns and rows of them.
 _PROBES = 64
@@ -81,7 +82,7 @@ class Footprints:
         median, angle = float(np.median(size[found])), float(np.median(np.array(spread)))
         if not isinstance(sensor, mi.ProjectiveCamera) or angle == 0:  # of one size, or from several places
             return Footprints((0.0, 0.0, 0.0), median, 0.0, median)
-        centre = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+        centre = world_matrix(sensor)[:3, 3]
         return Footprints(tuple(centre.tolist()), 0.0, angle, median)
 
     @staticmethod
