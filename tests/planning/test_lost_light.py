@@ -193,36 +193,46 @@ def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
         assert lost_light.WORTH_A_WORD < share <= 1
 
 
+def said_before(integrator, scene, spp, monkeypatch):
+    """Samples per pixel of each pass, and how many warnings there were before it; and all warnings."""
+    begun, trace = [], Render._pass
+    with Warned() as warnings, monkeypatch.context() as patch:
+        patch.setattr(
+            Render, "_pass", lambda self, step: begun.append((step.size, len(warnings))) or trace(self, step)
+        )
+        integrator.render(scene, spp=spp)
+    return begun, warnings
+
+
 @pytest.mark.parametrize(
-    "parameters, spp, first",
-    [({}, 64, 0), ({}, 4, 1), ({"skip": "none"}, 4, 1), ({"light_paths": 0, "skip": "none"}, 4, 1)],
+    "parameters, spp, passes",
+    [
+        ({}, 64, [(64, 1)]),
+        ({}, 4, [(1, 0), (3, 1)]),
+        ({"skip": "none"}, 4, [(1, 0), (3, 1)]),
+        ({"light_paths": 0, "skip": "none"}, 4, [(1, 0), (3, 1)]),
+    ],
     ids=["pilot", "no pilot", "all strategies", "path tracing"],
 )
-def test_it_is_said_before_the_samples_are_traced(parameters, spp, first):
+def test_it_is_said_before_the_samples_are_traced(parameters, spp, passes, monkeypatch):
     """Rationale: the warning came after the last pass, when the time was spent. Expected: before the first
     pass where a pilot knows how bright the image is, else after a first pass of one sample per pixel, and not
     again; the share that is stated is that of the whole image, within a fifth (both have the same estimate of
     what is lost; noise of the image's mean, of 1,024 samples at least).
     """
-    scene, integrator, said = scene_of(LAMPS["point"], block=BLOCK), bdpt(**parameters), []
-    with Warned() as warnings:
-        integrator.on_pass = lambda report: said.append((report.spp_done, len(warnings)))
-        integrator.render(scene, spp=spp)
-    assert bool(integrator.statistics["decisions"]) == (first == 0)
-    assert said[0] == (first or spp, 1) and len(warnings) == 1
+    scene, integrator = scene_of(LAMPS["point"], block=BLOCK), bdpt(**parameters)
+    begun, warnings = said_before(integrator, scene, spp, monkeypatch)
+    assert begun == passes and len(warnings) == 1
     share = float(re.search("about ([0-9]+) %", warnings[0])[1]) / 100
     assert share == pytest.approx(sum(integrator.statistics["lost_light"].values()), rel=0.2)
 
 
-def test_given_decisions_know_the_share():
+def test_given_decisions_know_the_share(monkeypatch):
     """Expected: before the first pass too where the decisions of another render are given."""
-    scene, first = scene_of(LAMPS["point"], block=BLOCK), bdpt()
-    decisions = json.dumps(first.decide(scene, spp=64))
-    integrator, said = bdpt(decisions=decisions), []
-    with Warned() as warnings:
-        integrator.on_pass = lambda report: said.append((report.spp_done, len(warnings)))
-        integrator.render(scene, spp=8)
-    assert said == [(8, 1)] and len(warnings) == 1
+    scene = scene_of(LAMPS["point"], block=BLOCK)
+    decisions = json.dumps(bdpt().decide(scene, spp=64))
+    begun, warnings = said_before(bdpt(decisions=decisions), scene, 8, monkeypatch)
+    assert begun == [(8, 1)] and len(warnings) == 1
 
 
 def test_a_share_near_the_limit_waits_for_the_image():
