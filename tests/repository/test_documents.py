@@ -41,3 +41,15 @@ def test_the_page_of_the_parameters_is_made_from_them():
 def test_the_readme_is_short():
     """Expected: 120 lines at most; the rest is in docs/."""
     assert (ROOT / "README.md").read_text().count("\n") <= 120
+
+
+def test_the_readme_names_what_is_searched_for():
+    """Expected: the field's words for what the package does, before the first command; beside every render
+    that it shows the time and the memory that it takes."""
+    text = (ROOT / "README.md").read_text()
+    for words in ("Bidirectional path tracing", "SDS", "vertex merging", "photon mapping"):
+        assert words in text[: text.index("## Install")]
+    commands = re.findall(r"^    (?:make render|python -m mitsuba_bdpt) .*", text, re.MULTILINE)
+    commands += re.findall(r"^print\(integrator.statistics\).*", text, re.MULTILINE)
+    assert len(commands) >= 8
+    assert not [line for line in commands if not re.search(r"\b\d+ (?:s|min|h), [\d.]+ GB", line)]
