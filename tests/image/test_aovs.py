@@ -227,6 +227,31 @@ def test_uv_derivatives_of_misses_are_zero():
     assert np.all(finite)  # a miss is no error
 
 
+@pytest.mark.parametrize("kind", ["bumpmap", "normalmap"])
+def test_denoisers_are_told_normals_of_the_world(kind):
+    """Rationale: Mitsuba's `aov` has normals of bump maps in the shading frame: (0, 0, 1) on every flat bump.
+    Expected: a map without any effect on a wall that is turned by 40 degrees has the wall's normal;
+    `sh_normal` of the bump map is still that of `aov`.
+    """
+    maps = {
+        "bumpmap": {
+            "type": "bumpmap",
+            "texture": {"type": "bitmap", "bitmap": bitmap(), "raw": True},
+            "scale": 0.0,
+        },
+        "normalmap": {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.5, 0.5, 1]}},
+    }
+    wall = {"type": "rectangle", "to_world": T().rotate([0, 1, 0], 40).scale(9)}
+    wall["bsdf"] = maps[kind] | {"bsdf": {"type": "diffuse"}}
+    target = mi.load_dict({"type": "scene", "sensor": sensor(film()), "wall": wall})
+    features = FeatureLayers(target, target.sensors()[0], "nn:sh_normal", 4, guides=True)
+    values, _ = features.sample(None, None, mi.Point2f(6, 5), mi.Point2f(0.5), 0.0, True)
+    turned = [np.sin(np.deg2rad(40)), 0, np.cos(np.deg2rad(40))]
+    found = np.array(mi.ArrayXf(values)).ravel()
+    assert found[-3:] == pytest.approx(turned, abs=1e-5)
+    assert found[:3] == pytest.approx([0, 0, 1] if kind == "bumpmap" else turned, abs=1e-5)
+
+
 def test_the_image_is_the_same_with_features():
     """Expected: the image of a render without `aovs`, sample by sample (1e-4: atomic sums)."""
     target = scene(sensor(film(rfilter="gaussian")))
@@ -291,6 +316,7 @@ def test_spectral_albedo():
         (":depth", "':depth' is not a pair"),
         ("dd:", "'dd:' is not a pair"),
         ("a:b:depth", "'b:depth' is not a kind of feature"),
+        ("nn:world_normal", "'world_normal' is not a kind of feature"),
         ("dd:dept", "'dept' is not a kind of feature; did you mean depth.*shape_index"),
         ("a:uv,a:duv_dx", "two layers a.U; give the feature another name"),
         ("variance:albedo", "two layers variance.R"),

@@ -13,8 +13,10 @@ import numpy as np
 
 from ..errors import UsageError
 
-# What `FeatureLayers` is asked for, beside what a user asks for: pairs of Mitsuba's ``aov``.
-GUIDES = "bdpt_albedo:albedo,bdpt_normal:sh_normal"
+# What `FeatureLayers` is asked for, beside what a user asks for: pairs as of Mitsuba's ``aov``, whose normals
+# of bump maps are not in the world's coordinates.
+WORLD_NORMAL = "world_normal"
+GUIDES = f"bdpt_albedo:albedo,bdpt_normal:{WORLD_NORMAL}"
 
 # Channels of these.
 ALBEDO, NORMAL = slice(0, 3), slice(3, 6)

@@ -25,7 +25,7 @@ from ..host import renamed
 from ..sampling.points import Purpose
 from ..scene.prepared import bsdfs
 from ..sensors.records import Region
-from .denoising import GUIDES
+from .denoising import GUIDES, WORLD_NORMAL
 from .mapped_normals import MappedNormals
 
 
@@ -64,7 +64,7 @@ _KINDS: dict[str, tuple[str, Callable[[_Hit], Any]]] = {
     "position": ("XYZ", lambda hit: hit.si.p),
     "uv": ("UV", lambda hit: hit.si.uv),
     "geo_normal": ("XYZ", lambda hit: hit.si.n),
-    "sh_normal": ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active)),
+    "sh_normal": ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active, of_aov=True)),
     "dp_du": ("XYZ", lambda hit: hit.si.dp_du),
     "dp_dv": ("XYZ", lambda hit: hit.si.dp_dv),
     "duv_dx": ("UV", lambda hit: _uv_partials(hit).duv_dx),
@@ -74,6 +74,9 @@ _KINDS: dict[str, tuple[str, Callable[[_Hit], Any]]] = {
 }
 
 KINDS = tuple(_KINDS)
+
+# For denoisers, who are told normals in the world's coordinates.
+_KINDS[WORLD_NORMAL] = ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active, of_aov=False))
 
 
 def check_syntax(aovs: str):
@@ -119,7 +122,8 @@ class FeatureLayers:
         self._kinds = [kind for _, kind in _asked(asked)]
         self.names, self.guides = feature_names(aovs), guides
         self.count = len(feature_names(asked))
-        self._normals = MappedNormals(bsdfs(scene) if "sh_normal" in self._kinds else [])
+        has_normals = {"sh_normal", WORLD_NORMAL}.intersection(self._kinds)
+        self._normals = MappedNormals(bsdfs(scene) if has_normals else [])
         self._region = Region(sensor.film())
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
 

@@ -1,7 +1,7 @@
 """Shading normals of bump and normal maps, which Mitsuba's BSDFs do not return to Python.
 
-Those of Mitsuba 3.9.1's ``aov``: `BumpMap` in the coordinates of the shading frame, `NormalMap` in the
-world's, and only where the map is the shape's own BSDF, not nested in another one.
+Where the map is the shape's own BSDF, as in ``aov`` of Mitsuba 3.9.1; one that is nested in another BSDF is
+not looked for.
 """
 
 from __future__ import annotations
@@ -27,12 +27,17 @@ class MappedNormals:
         found = {id(b): b for b in bsdfs if b.class_name() in _CLASSES}
         self._maps = [_Map(bsdf) for bsdf in found.values()]
 
-    def at(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Normal3f:
-        """The shading normal at ``si``, whose shape has this ``bsdf``."""
+    def at(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, of_aov: bool) -> mi.Normal3f:
+        """The shading normal at ``si``, whose shape has this ``bsdf``.
+
+        In the world's coordinates; as ``of_aov`` those of bump maps are in the coordinates of the frame.
+        """
         normal = mi.Normal3f(si.sh_frame.n)
         for one in self._maps:
             here = active & (bsdf == mi.BSDFPtr(one.bsdf))
-            normal = dr.select(here, one.normal(si, here), normal)
+            local = one.normal(si, here)
+            mapped = local if of_aov and one.bumps else mi.Normal3f(si.to_world(local))
+            normal = dr.select(here, mapped, normal)
         return normal
 
 
@@ -41,20 +46,20 @@ class _Map:
 
     def __init__(self, bsdf: mi.BSDF):
         self.bsdf, self._flips = bsdf, _flips(bsdf)
-        self._bumps = bsdf.class_name() == "BumpMap"
-        self._texture = children(bsdf)["nested_texture" if self._bumps else "normalmap"]
-        self._scale = own_parameters(bsdf)["scale"] if self._bumps else 1
+        self.bumps = bsdf.class_name() == "BumpMap"
+        self._texture = children(bsdf)["nested_texture" if self.bumps else "normalmap"]
+        self._scale = own_parameters(bsdf)["scale"] if self.bumps else 1
 
     def normal(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
-        """The normal at ``si``."""
-        local = self._bumped(si, active) if self._bumps else self._read(si, active)
+        """The normal at ``si``, in the shading frame."""
+        local = self._bumped(si, active) if self.bumps else self._read(si, active)
         if self._flips:  # to the side from which the surface is seen
             away = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.wi, local) <= 0
             local = dr.select(away, mi.Normal3f(-local.x, -local.y, local.z), local)
-        return local if self._bumps else mi.Normal3f(si.to_world(dr.normalize(local)))
+        return dr.normalize(local)
 
     def _bumped(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
-        """The normal of the displaced surface, in the shading frame."""
+        """The normal of the displaced surface."""
         slope, n = self._scale * self._texture.eval_1_grad(si, active), si.sh_frame.n
         along_u = si.dp_du + n * (slope.x - dr.dot(n, si.dp_du))
         along_v = si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv))
@@ -62,7 +67,7 @@ class _Map:
         return mi.Normal3f(si.to_local(dr.select(dr.dot(si.n, normal) < 0, -normal, normal)))
 
     def _read(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
-        """The normal that the texture holds, in the shading frame."""
+        """The normal that the texture holds."""
         return mi.Normal3f(self._texture.eval_3(si, active) * 2 - 1)
 
 
