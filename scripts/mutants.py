@@ -72,8 +72,8 @@ MUTANTS = (
     Mutant(
         "lost light: said after the last pass",
         "run/rendering.py",
-        "                    self._predict_lost_light()",
-        "                    pass",
+        "messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())",
+        "pass",
         ("tests/planning/test_lost_light.py::test_it_is_said_before_the_samples_are_traced[pilot]",),
     ),
     Mutant(

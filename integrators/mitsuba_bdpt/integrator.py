@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
-from .errors import UnsupportedError, UsageTypeError
+from .errors import UnsupportedError, UsageError, UsageTypeError
 from .host import tracebacks
 from .image.features import feature_names
 from .image.layers import layer_names
@@ -191,6 +191,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         certainty = planner.certainty(render.passes) if table else 0.0
         lost = planner.lost_by_pilots()
         text = explain(render.prepared, render.plan, self.settings, table, certainty, lost)
+        if loss := render.predicted_loss():
+            text += f"\nlost light: {loss.removeprefix(UsageError.prefix)}"
         if spp is None and is_open(render.plan, self.settings):
             return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
         return text if table or spp is None else f"{text}\n{planner.why_no_pilot()}"

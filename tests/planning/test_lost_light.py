@@ -227,6 +227,15 @@ def test_it_is_said_before_the_samples_are_traced(parameters, spp, passes, monke
     assert share == pytest.approx(sum(integrator.statistics["lost_light"].values()), rel=0.2)
 
 
+def test_explain_knows_the_share():
+    """Expected: with a pilot the text of the warning, without one only that such paths are not sampled."""
+    scene = scene_of(LAMPS["point"], block=BLOCK)
+    said = "lost light: point light 'lamp' shines through glass or mirrors on what is seen through 'block'"
+    assert said in bdpt().explain(scene, spp=64)
+    without = bdpt().explain(scene)
+    assert "lost: delta emitter" in without and said not in without
+
+
 def test_given_decisions_know_the_share(monkeypatch):
     """Expected: before the first pass too where the decisions of another render are given."""
     scene = scene_of(LAMPS["point"], block=BLOCK)

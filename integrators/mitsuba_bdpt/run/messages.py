@@ -9,8 +9,6 @@ import mitsuba as mi
 
 from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
-from ..planning import lost_light
-from ..planning.lost_light import LostLight
 from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
 
 # Culprits that a message names, at most.
@@ -88,9 +86,9 @@ def warn_of_media(prepared, sensor):
         )
 
 
-def warn_of_lost_light(prepared, plan, shares: dict[int, float], lost: LostLight):
-    """Warn once, for a scene and ``plan``, of light that is not sampled, if its ``shares`` are large."""
-    if text := lost_light.in_words(prepared, plan, shares, lost.through):
+def warn_of_lost_light(prepared, plan, text: str):
+    """Warn once, for a scene and ``plan``, of light that is not sampled, unless the ``text`` is empty."""
+    if text:
         warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
 
 

@@ -138,7 +138,7 @@ class Render:
                     break
                 self._decide_again()
                 if not number:
-                    self._predict_lost_light()
+                    messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())
                 self._pass(step)
                 if not number:
                     self.lost_light()
@@ -362,7 +362,8 @@ class Render:
         if lost is None:
             return {}
         shares = lost_light.shares(lost, number(self.accumulator.mean()))
-        messages.warn_of_lost_light(self.prepared, self.plan, shares, lost)
+        text = lost_light.in_words(self.prepared, self.plan, shares, lost.through)
+        messages.warn_of_lost_light(self.prepared, self.plan, text)
         return shares
 
     def _lost(self) -> LostLight | None:
@@ -377,14 +378,17 @@ class Render:
         lost, _ = self.findings.find("lost light", (plan.splat, plan.direct, max_depth), look)
         return lost if lost.colours else None
 
-    def _predict_lost_light(self):
-        """Warn before the first pass of light that is not sampled, if a decision knows the image's mean."""
+    def predicted_loss(self) -> str:
+        """The warning about light that is not sampled, before the first pass; empty if there is none.
+
+        Empty too where no decision knows the image's mean.
+        """
         made = self.planner.decided.decisions
-        if (lost := self._lost()) is None:
-            return
-        if made and made[-1].mean > 0:
-            shares = lost_light.predicted_shares(lost, made[-1].mean)
-            messages.warn_of_lost_light(self.prepared, self.plan, shares, lost)
+        lost = self._lost() if made and made[-1].mean > 0 else None
+        if lost is None:
+            return ""
+        shares = lost_light.predicted_shares(lost, made[-1].mean)
+        return lost_light.in_words(self.prepared, self.plan, shares, lost.through)
 
 
 def raise_interrupt(error: BaseException):
