@@ -17,6 +17,7 @@ from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
 from .light_media import LightMedia, medium_at_far_plane
+from .plugin_claims import check_plugins
 
 
 class PreparedScene:
@@ -30,6 +31,7 @@ class PreparedScene:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
         check_not_animated([*all_shapes(scene), *scene.emitters(), sensor])
         self.scene = scene
+        check_plugins(scene, sensor)
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene, ShapeFacts.of(scene, sensor))
         check_sensor(sensor, scene.sensors())
