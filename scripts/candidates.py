@@ -113,7 +113,7 @@ def lines(name: str, depth: int) -> list:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")

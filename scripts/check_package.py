@@ -64,7 +64,7 @@ def mistakes(path: Path) -> list[str]:
 
 def main(arguments=None) -> int:
     """Print what is wrong, and return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("folder", type=Path)
     paths = sorted(parser.parse_args(arguments).folder.glob("mitsuba_bdpt-*"))
     found = [f"{path.name}: {text}" for path in paths for text in mistakes(path)]

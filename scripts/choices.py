@@ -231,7 +231,7 @@ def shown(row: dict) -> list[str]:
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="*", help="names in scenes/, also small_casters/NAME")
     parser.add_argument("--all", action="store_true", help="the benchmark's scenes and all of small_casters")

@@ -54,7 +54,7 @@ def errors(name: str, spp: int, seeds: int) -> list[str]:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
     parser.add_argument("--spp", type=number(int, 1), default=16)
     parser.add_argument("--seeds", type=number(int, 1), default=3)

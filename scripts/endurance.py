@@ -299,7 +299,7 @@ def is_clean(record: dict) -> bool:
 def main(arguments=None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     known = repository.PROJECT.scene_names()
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; default: all")

@@ -20,7 +20,7 @@ import mitsuba as mi  # isort: skip
 
 def main(arguments=None) -> int:
     """Print the ratio per scene."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("scene", nargs="+")
     parser.add_argument("--rounds", type=number(int, 1), default=5)
     parser.add_argument("--path", action="store_true", help="of Mitsuba's path, over the same floor")

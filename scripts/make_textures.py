@@ -89,7 +89,7 @@ def make_all(folder=FOLDER):
 
 def main(arguments=None):
     """Makes them in the folder that the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__.split(":")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split(":")[0])
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
     make_all(parser.parse_args(arguments).folder)
 

@@ -1510,7 +1510,7 @@ def run(mutants: list[Mutant], bug: bool) -> int:
 def main(arguments=None) -> int:
     """Run the tests of the mutants, or print these."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("words", nargs="*", help="only mutants with one of these words in their name")
     parser.add_argument("--list", action="store_true", help="print names and what is replaced, run nothing")

@@ -175,7 +175,7 @@ def measure_small(name: str) -> list[list[str]]:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
     parser.add_argument("--short", action="store_true", help="renders of 4 and 16 samples per pixel")
     parser.add_argument("--small", action="store_true", help="renders of 64^2 at 8 samples per pixel")

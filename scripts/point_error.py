@@ -44,7 +44,7 @@ def error(name: str, parameters: dict, points: str, sampler: str, spp: int) -> f
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
     names = parser.parse_args(arguments).scenes
     mi.set_variant("llvm_ad_rgb")

@@ -175,7 +175,7 @@ def pictures(folder: Path, spp: int) -> None:
 def main() -> None:
     """As the command line says."""
     layout = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__, formatter_class=layout)
     parser.add_argument("what", choices=("table", "pictures"))
     parser.add_argument("folder", nargs="?", type=Path, default=repository.ROOT / "docs" / "images")
     parser.add_argument("--spp", type=int, default=512, help="of pictures")

@@ -277,7 +277,9 @@ def measured(options: Namespace, folder: Path) -> tuple[Findings, bool]:
 
 def parser() -> argparse.ArgumentParser:
     """That of the command line."""
-    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made = argparse.ArgumentParser(
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add = made.add_argument
     add("folder", type=Path, metavar="FOLDER", help="folder with scenes")
     add("-o", "--output", type=Path, help="folder; default: results/public_FOLDER of the repository")

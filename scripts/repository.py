@@ -8,7 +8,8 @@ from pathlib import Path
 from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.files.texts import read_toml
 from mitsuba_bdpt.measure import reference
-from mitsuba_bdpt.measure.project import RESOLUTION, Project  # noqa: F401 (RESOLUTION: for the scripts)
+from mitsuba_bdpt.measure.options import RESOLUTION  # noqa: F401 (for the scripts)
+from mitsuba_bdpt.measure.project import Project
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = Project(ROOT)

@@ -140,7 +140,7 @@ def error_table() -> list[str]:
 
 def main(arguments=None) -> int:
     """Print both tables."""
-    argparse.ArgumentParser(description=__doc__.split("\n\n")[0]).parse_args(arguments)
+    argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0]).parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     mi.set_log_level(mi.LogLevel.Error)  # samplers warn of each count that they round
     print("\n".join([*correlation_table(), "", *error_table()]))

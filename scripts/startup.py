@@ -82,7 +82,7 @@ print(taken[0][0], taken[0][1] - taken[1][1])
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     materials = number(int, 0, MOST)
     parser.add_argument("--rooms", type=materials, nargs="+", help="numbers of materials; 0: the Cornell box")
     count = number(int, 1)

@@ -47,7 +47,7 @@ def line(name: str, error: float, renders: int) -> str:
 def main() -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--target-error", type=number(float, 1e-9), default=0.01)

@@ -56,7 +56,7 @@ def lines(name: str) -> list:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
     names = parser.parse_args(arguments).scenes
     mi.set_variant("llvm_ad_rgb")

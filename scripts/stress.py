@@ -178,7 +178,7 @@ def changes(record: list[dict], before: list[dict]) -> list[str]:
 def main(arguments=None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     known = {case.name: case for case in cases()}
     parser.add_argument(

@@ -145,7 +145,7 @@ def _named(decisions: list) -> str:
 def main(arguments=None) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("checkout", type=Path, help="the folder of the other one")
     parser.add_argument("--scenes", nargs="+", help="names in scenes/ that have references")

@@ -313,7 +313,7 @@ def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
         reference_of(project, 2)
     making.make(job(2, seconds=0))
     monkeypatch.setattr(scenes, "digest", lambda *paths: "another file")
-    with pytest.raises(ValueError, match=f"another cornell_box.xml, mesh or texture; {command}"):
+    with pytest.raises(ValueError, match=f"another cornell_box, mesh or texture; {command}"):
         reference_of(project, 2)
     with pytest.raises(ValueError, match="scene='nowhere' is neither a scene file nor the name of one"):
         project.scene("nowhere")
@@ -479,7 +479,7 @@ def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
     reference.write(path, replace(kept, provenance=kept.provenance | {"scene_sha256": "of another"}))
     before = path.read_bytes()
     monkeypatch.setattr(sweep, "measure", None)
-    with pytest.raises(ValueError, match="was made of another cornell_box.xml, mesh or texture; mitsuba"):
+    with pytest.raises(ValueError, match="was made of another cornell_box, mesh or texture; mitsuba"):
         swept(*words)
     assert path.read_bytes() == before
 

@@ -6,6 +6,7 @@ The room `measure` is imported when one of them runs, since it needs packages th
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 import sys
 from argparse import Namespace
@@ -13,30 +14,26 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import CommandError
+from ..measure import options
 from . import mistakes
-from .values import number, property_
+from .values import property_
 
 NEEDED = ("colour", "flip_evaluator", "matplotlib", "pyarrow", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
 
-RESOLUTION = 128
-"""Width of a reference unless said, as in `measure.project`."""
 
-WHOLE = number(int, 1)
-
-
-def run(options: Namespace) -> int:
+def run(asked: Namespace) -> int:
     """Run a subcommand and return its exit status."""
     try:
-        return mistakes.answered(lambda: _run(options))
+        return mistakes.answered(lambda: _run(asked))
     except KeyboardInterrupt:
         print("interrupted; what was finished is kept", file=sys.stderr)
         return mistakes.INTERRUPTED
 
 
-def _run(options: Namespace) -> int:
-    check_installed(options.command)
-    return options.measuring(options)
+def _run(asked: Namespace) -> int:
+    check_installed(asked.command)
+    return asked.measuring(asked)
 
 
 def check_installed(command: str) -> None:
@@ -71,43 +68,39 @@ def parameters(text: str) -> dict:
     return integrator(text)[1]
 
 
-def _resolution(text: str) -> int:
-    """An argparse type: a width that the tiles of a bias check divide."""
-    value = WHOLE(text)
-    if value % 4:
-        raise argparse.ArgumentTypeError(f"got {text!r}, which must be divisible by 4")
-    return value
+def declare(parser: argparse.ArgumentParser, kind: type) -> None:
+    """Declare the options of a measurement, a dataclass of `measure.options`."""
+    for field in options.options_of(kind):
+        given = dict(field.metadata["declared"])
+        bounds, short = field.metadata["bounds"], given.pop("short", None)
+        name = f"--{field.name.replace('_', '-')}"
+        given["choices" if isinstance(bounds, options.Choice) else "type"] = _parsed(bounds)
+        names = [short, name] if short else [name]
+        parser.add_argument(*names, default=field.default, help=field.metadata["text"], **given)
 
 
-def _depth(text: str) -> int:
-    """An argparse type: a number of edges, or -1 for no limit."""
-    value = number(int, -1)(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError("got '0', which must be at least 1, or -1 for no limit")
-    return value
+def _parsed(bounds):
+    """What argparse takes for these bounds: choices, or a type."""
+    if isinstance(bounds, options.Choice):
+        return bounds.names
+    if isinstance(bounds, type):
+        return bounds
 
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if bounds.holds(value := bounds.kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must be {bounds}")
 
-def _add_reference_seconds(parser) -> None:
-    text = "that making a reference may take where there is none, per scene; default: %(default)g"
-    kind = number(float, 0)
-    parser.add_argument("--reference-seconds", type=kind, default=600.0, metavar="SECONDS", help=text)
-
-
-def _add_resolution(parser, default: int | None = RESOLUTION) -> None:
-    text = f"width of image and reference; default: {RESOLUTION}"
-    parser.add_argument("--resolution", type=_resolution, default=default, metavar="PIXELS", help=text)
+    return parse
 
 
 SCENES = "scene files, or names in PROJECT/scenes"
 
 
 def _declare_sweep(parser) -> None:
-    add = parser.add_argument
-    add("preset", help="TOML file, or a name in PROJECT/presets: what is rendered")
-    add("-o", "--output", type=Path, help="folder; default: PROJECT/results/NAME_OF_PRESET")
-    add("--scenes", nargs="+", help="these of the preset alone; other rows stay as they are")
-    add("--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster to render on (extra [cluster])")
-    _add_reference_seconds(parser)
+    parser.add_argument("preset", help="TOML file, or a name in PROJECT/presets: what is rendered")
+    declare(parser, options.Sweep)
 
 
 def _declare_report(parser) -> None:
@@ -121,118 +114,81 @@ def _declare_page(parser) -> None:
 
 
 def _declare_reference(parser) -> None:
-    add = parser.add_argument
-    add("scenes", nargs="*", help=SCENES)
-    add("--all", action="store_true", help="all scenes of PROJECT/scenes")
-    add("--spp", type=WHOLE, default=64, help="of the renders to judge; default: %(default)s")
-    add("--seconds", type=number(float, 0), default=600.0, help="per scene; default: %(default)g")
-    _add_resolution(parser)
-    add("--max-depth", type=_depth, help="default: that of presets/benchmark.toml, else of the scene's file")
-    text = (
-        "what renders it, path (with media: volpath) only where that converges, merging (bdpt with it) where "
-        "nothing else finds all light; default: as references/scenes.toml says, else bdpt"
-    )
-    add("--by", choices=("path", "bdpt", "merging"), help=text)
+    parser.add_argument("scenes", nargs="*", help=SCENES)
+    parser.add_argument("--all", action="store_true", help="all scenes of PROJECT/scenes")
+    declare(parser, options.MakeReference)
 
 
 def _declare_compare(parser) -> None:
-    add = parser.add_argument
     text = "TYPE KEY=VALUE …, in quotes; sampler=TYPE is the sensor's sampler"
-    add("sides", nargs=2, type=parameters, metavar="SIDE", help=text)
-    add("--scenes", nargs="+", required=True, help=SCENES)
-    add("--spp", type=WHOLE, nargs="+", default=[64], help="default: 64")
-    add("--pairs", type=WHOLE, default=12, help="default: %(default)s")
-    _add_resolution(parser)
-    _add_reference_seconds(parser)
+    parser.add_argument("sides", nargs=2, type=parameters, metavar="SIDE", help=text)
+    parser.add_argument("--scenes", nargs="+", required=True, help=SCENES)
+    declare(parser, options.Compare)
 
 
 def _declare_equal_time(parser) -> None:
-    add = parser.add_argument
-    add("scene", help="a scene file, or a name in PROJECT/scenes")
-    add("--spp", type=WHOLE, default=64, help="of the last integrator; default: %(default)s")
+    parser.add_argument("scene", help="a scene file, or a name in PROJECT/scenes")
     text = "TYPE KEY=VALUE …, each in quotes; default: path (with media: volpath) and bdpt"
-    add("-i", "--integrators", nargs="+", type=integrator, default=[], help=text)
-    add("--sampler", help="type of the sensor's sampler; default: the file's")
-    text = "image to take errors against, at its own size; default: a reference of the project"
-    add("--reference", type=Path, metavar="EXR", help=text)
-    _add_resolution(parser, None)
-    _add_reference_seconds(parser)
-    add("-o", "--output", type=Path, help="default: PROJECT/renders/equal_time_SCENE.png")
+    parser.add_argument("-i", "--integrators", nargs="+", type=integrator, default=[], help=text)
+    declare(parser, options.EqualTime)
 
 
 def _declare_pyramid(parser) -> None:
-    add = parser.add_argument
-    add("scene", help="a scene file, or a name in PROJECT/scenes")
-    text = "EXR file to write, PNGs come beside it; default: PROJECT/renders/pyramid_SCENE.exr"
-    add("-o", "--output", type=Path, help=text)
-    add("--max-depth", type=WHOLE, default=5, help="longest path in edges; default: %(default)s")
-    add("--spp", type=WHOLE, default=64, help="default: %(default)s")
-    add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
-    add("--resolution", type=WHOLE, help="width of the image; default: the file's")
-    add("--heuristic", default="balance", help="default: %(default)s")
-    add("--exposure", type=number(float, -100, 100), default=0.0, help="stops, of the pictures")
+    parser.add_argument("scene", help="a scene file, or a name in PROJECT/scenes")
+    declare(parser, options.Pyramid)
 
 
 def _declare_fireflies(parser) -> None:
-    add = parser.add_argument
-    add("scenes", nargs="+", help=SCENES)
-    add("--seeds", type=WHOLE, default=5, help="renders of each scene; default: %(default)s")
-    add("--spp", type=WHOLE, default=64, help="default: %(default)s")
-    _add_resolution(parser)
-    add("--max-depth", type=WHOLE, help="default: that of presets/benchmark.toml, else of the scene's file")
-    text = "values of its pixel by which a sample is off; default: %(default)s"
-    add("--level", type=number(float, 1e-9), default=0.5, help=text)
-    add("--top", type=WHOLE, default=12, help="samples examined of each render; default: %(default)s")
-    add("--lines", type=WHOLE, default=6, help="kinds of paths of each scene; default: %(default)s")
-    _add_reference_seconds(parser)
+    parser.add_argument("scenes", nargs="+", help=SCENES)
+    declare(parser, options.Fireflies)
 
 
-def _sweep(options: Namespace) -> int:
+def _sweep(asked: Namespace) -> int:
     from ..measure import sweep
 
-    return sweep.run(options)
+    return sweep.run(asked)
 
 
-def _report(options: Namespace) -> int:
+def _report(asked: Namespace) -> int:
     from ..measure import report
 
-    return report.run(options)
+    return report.run(asked)
 
 
-def _page(options: Namespace) -> int:
+def _page(asked: Namespace) -> int:
     from ..measure import page
 
-    return page.run(options)
+    return page.run(asked)
 
 
-def _reference(options: Namespace) -> int:
+def _reference(asked: Namespace) -> int:
     from ..measure import making
 
-    return making.run(options)
+    return making.run(asked)
 
 
-def _compare(options: Namespace) -> int:
+def _compare(asked: Namespace) -> int:
     from ..measure import compare
 
-    return compare.run(options)
+    return compare.run(asked)
 
 
-def _equal_time(options: Namespace) -> int:
+def _equal_time(asked: Namespace) -> int:
     from ..measure import equal_time
 
-    return equal_time.run(options)
+    return equal_time.run(asked)
 
 
-def _pyramid(options: Namespace) -> int:
+def _pyramid(asked: Namespace) -> int:
     from ..measure import pyramid
 
-    return pyramid.run(options)
+    return pyramid.run(asked)
 
 
-def _fireflies(options: Namespace) -> int:
+def _fireflies(asked: Namespace) -> int:
     from ..measure import fireflies
 
-    return fireflies.run(options)
+    return fireflies.run(asked)
 
 
 COMMANDS: dict[str, tuple[str, Callable, Callable[[Namespace], int]]] = {

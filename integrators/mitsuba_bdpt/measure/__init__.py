@@ -1,7 +1,23 @@
 """Measuring: errors, bias and speed of renders, references, sweeps and what they show.
 
-Needs the extra ``[measure]``. Nothing but the commands import it (see `cli.measuring`).
+Each command that measures is a function here, of the same options under the same names, which takes a scene
+as a dictionary (that of ``mi.load_dict``) where the command takes a file::
 
+    from mitsuba_bdpt import measure
+
+    scene = mi.cornell_box()
+    print(measure.compare_integrators(scene, "bdpt", "path", spp=16, resolution=64))
+    reference = measure.make_reference(scene, resolution=64, seconds=60)  # .image, .error
+    ways = ["path", {"type": "bdpt", "skip": "none"}]
+    for shot in measure.compare_at_equal_time(scene, ways, resolution=64):
+        print(shot.caption)
+
+References, pictures and rows lie in the folder ``project``. They are kept by the scene's name; a dictionary
+gets one that says what is in it, unless it is given as ``measure.SceneDict(name, dictionary)``.
+
+Needs the extra ``[measure]``. Within the package nothing but the commands import it (see `cli.measuring`).
+
+* For Python: `api`; options, their defaults and bounds: `options`.
 * What is measured: `metrics` (errors, colour differences), `agreement` (bias), `efficiency`, `timing`.
 * What of: `project` (the user's folder), `scenes` (any scene file, at any size).
 * Against what: `reference` (stored ones), `making` and `halves` (how they come about).
@@ -12,3 +28,23 @@ Needs the extra ``[measure]``. Nothing but the commands import it (see `cli.meas
 * What a terminal shows meanwhile: `showing`.
 * Kernels: `floor`.
 """
+
+from .api import (
+    SceneDict,
+    compare_at_equal_time,
+    compare_integrators,
+    find_fireflies,
+    make_reference,
+    render_pyramid,
+    run_sweep,
+)
+
+__all__ = [
+    "SceneDict",
+    "compare_at_equal_time",
+    "compare_integrators",
+    "find_fireflies",
+    "make_reference",
+    "render_pyramid",
+    "run_sweep",
+]

@@ -10,6 +10,7 @@ here: see `agreement`.
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -19,6 +20,7 @@ from ..errors import CommandError
 from .analysis import Refused
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse
+from .options import Compare
 from .project import Project
 from .reference import Reference
 from .scenes import check_plugins, integrator_of
@@ -103,12 +105,12 @@ def ratios(sides: list[Side], target: Reference, spp: int, pairs: int, on_render
     ]
 
 
-def run(options: Namespace) -> int:
-    """Print the table that the command line ``options`` ask for."""
-    mi.set_variant("llvm_ad_rgb")
-    project = Project(options.project)
-    scenes = [project.scene(name) for name in options.scenes]
-    for side in map(dict, options.sides):
+def lines(
+    project: Project, names: Sequence[str], ways: Sequence[dict], options: Compare | Namespace
+) -> list[list[str]]:
+    """The rows of the table of two ``ways`` to render the scenes with these ``names``."""
+    scenes = [project.scene(name) for name in names]
+    for side in map(dict, ways):
         if "max_depth" in side:
             raise CommandError(
                 f"max_depth={side['max_depth']} of {side.get('type')!r} would compare different images; "
@@ -117,12 +119,18 @@ def run(options: Namespace) -> int:
     rows = []
     for scene in scenes:
         job = Job(project, scene, options.resolution, None, max(options.spp), options.reference_seconds)
-        for side in options.sides:
+        for side in ways:
             own = dict(side)
             sampler = own.pop("sampler", None)
             check_plugins(str(own.get("type")), own, sampler, job.depth)
         target = obtained(job)
-        made = [Side.of(side, job) for side in options.sides]
+        made = [Side.of(side, job) for side in ways]
         rows += [line(scene.name, made, target, spp, options.pairs) for spp in options.spp]
-    print(table(HEADS, rows))
+    return rows
+
+
+def run(options: Namespace) -> int:
+    """Print the table that the command line ``options`` ask for."""
+    mi.set_variant("llvm_ad_rgb")
+    print(table(HEADS, lines(Project(options.project), options.scenes, options.sides, options)))
     return 0

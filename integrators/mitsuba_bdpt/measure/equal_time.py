@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +24,9 @@ from ..files.loading import choose_sensor
 from ..files.whole import replacing
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
-from .project import RESOLUTION, Project
-from .scenes import SceneFile, depth_of, integrator_of, path_tracers
+from .options import RESOLUTION, EqualTime
+from .project import Project
+from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers
 from .showing import steps
 from .timing import timed
 
@@ -55,7 +57,7 @@ class Shot:
         return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.rel_mse:.2g} (trimmed)"
 
 
-def subject(project: Project, file: SceneFile, options: Namespace):
+def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespace):
     """Scene, image to take errors against, and ``max_depth``, as the command line ``options`` say."""
     if options.reference is None:
         seconds = options.reference_seconds
@@ -68,7 +70,7 @@ def subject(project: Project, file: SceneFile, options: Namespace):
     if target.shape[:2] != (height, width):
         raise CommandError(
             f"reference={str(options.reference)!r} has {target.shape[1]} x {target.shape[0]} pixels, the "
-            f"film of {str(file.file)!r} {width} x {height}; render it from this file"
+            f"film of {file.called} {width} x {height}; render it from this scene"
         )
     return scene, target, depth_of(scene.integrator())
 
@@ -148,19 +150,25 @@ def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
     plt.close(figure)
 
 
+def pictured(
+    project: Project, scene: str, integrators: Mapping[str, dict], options: EqualTime | Namespace
+) -> tuple[Path, list[Shot]]:
+    """Draw a scene rendered by these integrators; the picture's file, and the renders."""
+    file = project.scene(scene)
+    output = options.output or project.renders / f"equal_time_{file.name}.png"
+    check_output(output, ".png")
+    loaded, target, depth = subject(project, file, options)
+    ways = dict(integrators) or {kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")}
+    found = shots(loaded, target, ways, depth, options.spp)
+    draw(found, target, f"{file.name}, equal time", output)
+    return output, found
+
+
 def run(options: Namespace) -> int:
     """Draw what the command line ``options`` ask for."""
     mi.set_variant("llvm_ad_rgb")
-    project = Project(options.project)
-    file = project.scene(options.scene)
-    output = options.output or project.renders / f"equal_time_{file.name}.png"
-    check_output(output, ".png")
-    scene, target, depth = subject(project, file, options)
-    ways = dict(options.integrators) or {
-        kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")
-    }
-    found = shots(scene, target, ways, depth, options.spp)
-    draw(found, target, f"{file.name}, equal time", output)
+    integrators = dict(options.integrators)
+    output, found = pictured(Project(options.project), options.scene, integrators, options)
     print(output)
     for shot in found:
         print(shot.caption.replace("\n", ", "))

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -31,8 +32,9 @@ import numpy as np
 from . import oracle, reconstruct, recording
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon
+from .options import Fireflies
 from .project import Project
-from .scenes import SceneFile, integrator_of
+from .scenes import MeasuredScene, integrator_of
 from .showing import steps
 from .tables import table
 
@@ -203,7 +205,7 @@ HEAD = [
 ]
 
 
-def lines(project: Project, file: SceneFile, options: Namespace) -> tuple[list, str]:
+def lines(project: Project, file: MeasuredScene, options: Fireflies | Namespace) -> tuple[list, str]:
     """The rows of a scene, those with most error first, and what its renders were like."""
     name, seconds = file.name, options.reference_seconds
     job = Job(project, file, options.resolution, options.max_depth, options.spp, seconds)
@@ -227,14 +229,17 @@ def lines(project: Project, file: SceneFile, options: Namespace) -> tuple[list, 
     ], f"`{name}`: {pairs}, found anew {anew} of {examined}"
 
 
-def run(options: Namespace) -> int:
-    """Print the table that the command line ``options`` ask for, and the renders' errors, raw and trimmed."""
-    mi.set_variant("llvm_ad_rgb")
-    project = Project(options.project)
+def text(project: Project, names: Sequence[str], options: Fireflies | Namespace) -> str:
+    """The table of the scenes with these ``names``, and the renders' errors, raw and trimmed."""
     rows, said = [], []
-    for scene in [project.scene(name) for name in options.scenes]:
+    for scene in [project.scene(name) for name in names]:
         more, errors = lines(project, scene, options)
         rows, said = rows + more, [*said, errors]
-    print(table(HEAD, rows))
-    print("relMSE of the renders (trimmed): " + "; ".join(said))
+    return f"{table(HEAD, rows)}\nrelMSE of the renders (trimmed): {'; '.join(said)}"
+
+
+def run(options: Namespace) -> int:
+    """Print what the command line ``options`` ask for."""
+    mi.set_variant("llvm_ad_rgb")
+    print(text(Project(options.project), options.scenes, options))
     return 0

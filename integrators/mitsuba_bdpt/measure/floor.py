@@ -20,7 +20,7 @@ from ..image import sink
 from ..run import rendering, schedule
 from ..sampling import points
 from ..transport.kernel import trace
-from .project import RESOLUTION
+from .options import RESOLUTION
 from .scenes import SceneFile, integrator_of
 
 SPP = 16

@@ -36,9 +36,10 @@ from .agreement import FEWEST_RUNS, TILES, Means
 from .efficiency import REFERENCE_SHARE
 from .halves import PASS_SPP, Halves
 from .metrics import TRIM, rel_mse
+from .options import REFERENCE_SECONDS
 from .project import Project
 from .reference import Reference, load_reference, make_command, reference_path, write
-from .scenes import SceneFile, integrator_of, path_tracers
+from .scenes import MeasuredScene, integrator_of, path_tracers
 from .showing import amount
 
 EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"}
@@ -67,7 +68,6 @@ WINDOW_PASSES = 4  # in one render of a window
 TRIALS = 3  # renders of bdpt that say what it has to judge
 TWICE = 2  # samples of `path` in the time of one of `bdpt`, roughly
 MARGIN = 0.9  # of the share that a reference may carry
-SECONDS = 600.0  # that a reference may take
 
 
 def _is_number(value) -> bool:
@@ -143,11 +143,11 @@ class Job:
     """
 
     project: Project
-    scene: SceneFile
+    scene: MeasuredScene
     resolution: int
     max_depth: int | None = None
     spp: int = 64
-    seconds: float = SECONDS
+    seconds: float = REFERENCE_SECONDS
     by: str | None = None
     rounds: int = 1
 
@@ -231,7 +231,7 @@ def check_size(job: Job) -> None:
     )
 
 
-def nearest_width(scene: SceneFile, wanted: float) -> int | None:
+def nearest_width(scene: MeasuredScene, wanted: float) -> int | None:
     """The width next to the one ``wanted`` of images that a bias check divides into tiles; None if far."""
     own_width, own_height = scene.size()
     widths = range(TILES, max(math.ceil(4 * wanted), TILES + 1), TILES)
@@ -280,7 +280,7 @@ class Aim:
         )
 
 
-def _way(scene: SceneFile, by: str, merging_radius: float = MERGING_RADIUS) -> dict:
+def _way(scene: MeasuredScene, by: str, merging_radius: float = MERGING_RADIUS) -> dict:
     """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`.
 
     ``merging_radius``: that of "merging", in pixels.

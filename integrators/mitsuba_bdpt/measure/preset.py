@@ -44,7 +44,7 @@ from ..files.texts import list_of, read_toml, table_of, text_of, whole_of
 from . import probes
 from .agreement import TILES
 from .project import Project, depth_in
-from .scenes import SceneFile
+from .scenes import MeasuredScene
 
 MATCHES = ("seconds", "spp")
 
@@ -66,7 +66,7 @@ class Method:
     media: bool | None
     seeds: int | None
 
-    def takes_part_in(self, scene: SceneFile) -> bool:
+    def takes_part_in(self, scene: MeasuredScene) -> bool:
         """Whether it renders a scene."""
         if self.scenes is not None and scene.name not in self.scenes:
             return False
@@ -77,7 +77,7 @@ class Method:
 class Subject:
     """A scene of a preset: ``max_depth``, samples per pixel of each budget, number of seeds of each."""
 
-    scene: SceneFile
+    scene: MeasuredScene
     max_depth: int
     spp: tuple
     seeds: tuple

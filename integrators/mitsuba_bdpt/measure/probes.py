@@ -12,7 +12,9 @@ import sys
 import tempfile
 from pathlib import Path
 
+from ..errors import CommandError
 from .project import Project
+from .scenes import SceneFile
 
 # One or two camera subpaths per light subpath: with 16 the replay is cut into so many small kernels that it
 # is no floor.
@@ -92,9 +94,17 @@ def memory(project: Project, rounds: int) -> dict:
     return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
 
 
+def _file(project: Project, name: str) -> Path:
+    """The file of a scene; raises ``CommandError`` for a dictionary, which another process cannot load."""
+    scene = project.scene(name)
+    if not isinstance(scene, SceneFile):
+        raise CommandError(f"the probe floor renders {name!r} in another process: it has to be a file")
+    return scene.file
+
+
 def kernel_floor(project: Project, rounds: int) -> dict:
     """Kernel time over that of its rays alone, by scene, a value per round."""
-    files = {name: str(project.scene(name).file.resolve()) for name in FLOOR_SCENES}
+    files = {name: str(_file(project, name).resolve()) for name in FLOOR_SCENES}
     return {name: numbers(FLOOR, file, str(rounds)) for name, file in files.items()}
 
 

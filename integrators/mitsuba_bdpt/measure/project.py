@@ -12,15 +12,13 @@ None of these folders has to be there.
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..errors import CommandError, did_you_mean
 from ..files.texts import read_toml, table_of, whole_of
-from .scenes import SceneFile
-
-RESOLUTION = 128
-"""Width of references, and of what is judged by them, unless said."""
+from .scenes import DictionaryScene, MeasuredScene, SceneFile
 
 LISTED = 30
 """Names of scenes that a message lists, at most."""
@@ -31,6 +29,8 @@ class Project:
     """The folder ``root``, see above."""
 
     root: Path
+    given: Mapping[str, DictionaryScene] = field(default_factory=dict, compare=False)
+    """Scenes that are given as dictionaries, by their names."""
 
     @property
     def scenes(self) -> Path:
@@ -51,11 +51,13 @@ class Project:
         """The scenes that can be called by name."""
         return sorted(path.stem for path in self.scenes.glob("*.xml"))
 
-    def scene(self, name: str) -> SceneFile:
+    def scene(self, name: str) -> MeasuredScene:
         """A scene by its name, or by its file, seen from here or from the project's folder.
 
         Raises ``CommandError`` that says what there is if there is none.
         """
+        if name in self.given:
+            return self.given[name]
         for file in (Path(name), self.scenes / f"{name}.xml", self.root / name):
             if file.is_file():
                 return SceneFile(file.stem, file)
@@ -64,9 +66,10 @@ class Project:
             f"give the path of an XML file{self._names_for(name)}"
         )
 
-    def called(self, scene: SceneFile) -> str:
+    def called(self, scene: MeasuredScene) -> str:
         """What `scene` finds a scene by."""
-        return scene.name if scene.file == self.scenes / f"{scene.name}.xml" else str(scene.file)
+        named = self.scenes / f"{scene.name}.xml"
+        return str(scene.file) if isinstance(scene, SceneFile) and scene.file != named else scene.name
 
     def command(self, *words: str | Path) -> str:
         """A command line of this project, as a message quotes it for a shell."""
@@ -87,7 +90,7 @@ class Project:
         text = f", or a name; there are {', '.join(known[:LISTED])}{more}; {did_you_mean(name, known)}"
         return text.rstrip("; ")
 
-    def depth(self, scene: SceneFile) -> int:
+    def depth(self, scene: MeasuredScene) -> int:
         """The ``max_depth`` at which a scene is rendered unless said.
 
         That of presets/benchmark.toml if there is one, else that of the scene's file.
@@ -108,7 +111,7 @@ class Project:
         return named if named.exists() and not given.exists() else given
 
 
-def depth_in(file: Path, preset: dict, scene: SceneFile) -> int:
+def depth_in(file: Path, preset: dict, scene: MeasuredScene) -> int:
     """The ``max_depth`` at which a preset, as read from a TOML ``file``, renders a scene.
 
     Its own, else that of all scenes, else that of the scene's file. Raises ``CommandError`` for what is no

@@ -23,8 +23,9 @@ from ..files.images import check_channels, check_output, write_images
 from ..files.loading import choose_sensor
 from ..files.whole import replacing
 from .metrics import tone_map
+from .options import Pyramid
 from .project import Project
-from .scenes import SceneFile, integrator_of
+from .scenes import MeasuredScene, integrator_of
 from .showing import amount
 
 matplotlib.use("Agg")
@@ -50,7 +51,7 @@ def technique_images(image, names: list, kind: str) -> dict:
     return found
 
 
-def render(file: SceneFile, options: Namespace):
+def render(file: MeasuredScene, options: Pyramid | Namespace):
     """The film after a render with technique images, and these, weighted and unweighted."""
     scene = file.load(options.resolution)
     parameters = {"type": "bdpt", "strategy_images": True, "heuristic": options.heuristic}
@@ -104,13 +105,13 @@ def draw(found: dict, path: Path, exposure: float):
     plt.close(figure)
 
 
-def run(options: Namespace) -> int:
-    """Render, write, say what was written, as the command line ``options`` say."""
+def pictured(
+    project: Project, scene: str, options: Pyramid | Namespace
+) -> tuple[dict[str, Path], dict[str, dict]]:
+    """Render and write the pyramids of a scene: files of the pictures, images of the strategies, by kind."""
     if options.max_depth < SHORTEST:
         raise CommandError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
-    mi.set_variant("llvm_ad_rgb")
-    project = Project(options.project)
-    file = project.scene(options.scene)
+    file = project.scene(scene)
     image = options.output or project.renders / f"pyramid_{file.name}.exr"
     pictures = {kind: image.with_name(f"{image.stem}_{kind}.png") for kind in KINDS}
     check_output(image, ".exr")
@@ -121,5 +122,12 @@ def run(options: Namespace) -> int:
     write_images(film, image, {"heuristic": options.heuristic}, options.exposure)
     for kind, path in pictures.items():
         draw(shown[kind], path, options.exposure)
-        print(path)
+    return pictures, images
+
+
+def run(options: Namespace) -> int:
+    """Render, write, say what was written, as the command line ``options`` say."""
+    mi.set_variant("llvm_ad_rgb")
+    pictures, _ = pictured(Project(options.project), options.scene, options)
+    print(*pictures.values(), sep="\n")
     return 0

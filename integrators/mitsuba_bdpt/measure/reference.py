@@ -18,7 +18,7 @@ from ..files.images import read_layers, write_layers
 from .agreement import Means, Sample
 from .metrics import reference_rel_mse, rel_mse
 from .project import Project
-from .scenes import SceneFile, digest
+from .scenes import MeasuredScene, digest
 
 HALF_MAX = 65504.0
 """The largest number in half precision."""
@@ -66,12 +66,21 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
 
 
 def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
-    """The command line that makes the reference of the scene that is ``called`` so, or goes on with it."""
+    """The command line that makes the reference of the scene that is ``called`` so, or goes on with it.
+
+    Of a dictionary, the call in Python. ``more``: further options and their values.
+    """
+    if called in project.given:
+        options = {"resolution": resolution, "max_depth": max_depth} | dict(
+            zip((name.strip("-") for name in more[::2]), more[1::2], strict=True)
+        )
+        said = "".join(f", {name}={value}" for name, value in options.items())
+        return f"mitsuba_bdpt.measure.make_reference(SceneDict({called!r}, ...){said})"
     words = ["reference", called, "--resolution", str(resolution), "--max-depth", str(max_depth), *more]
     return project.command(*words)
 
 
-def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
+def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_depth: int) -> Reference:
     """The stored reference; raises ``CommandError`` with the command that makes it if it cannot serve.
 
     That is if there is none, or if it was made of another version of the scene's file.
@@ -88,7 +97,7 @@ def load_reference(project: Project, scene: SceneFile, resolution: int, max_dept
         raise CommandError(f"{error}, by {make}") from error
     if found.provenance["scene_sha256"] != scene.sha256:
         raise CommandError(
-            f"the reference {path.name} was made of another {scene.name}.xml, mesh or texture; {make}"
+            f"the reference {path.name} was made of another {scene.name}, mesh or texture; {make}"
         )
     return found
 

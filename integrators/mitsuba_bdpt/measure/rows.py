@@ -20,7 +20,7 @@ from .cells import FIRST_SEED, Cell, Cells
 from .preset import Preset
 from .project import Project
 from .reference import Reference, load_reference, reference_path
-from .scenes import SceneFile, digest
+from .scenes import MeasuredScene, digest
 
 
 def cell_file(output: Path, cell: Cell) -> Path:
@@ -33,7 +33,7 @@ def image_file(output: Path, cell: Cell) -> Path:
     return output / "images" / cell.scene / f"{cell.key}.exr"
 
 
-def judge_of(project: Project, scene: SceneFile, resolution: int, depth: int):
+def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
     """A reference, and the SHA-256 of its file, taken before.
 
     Should another one replace it meanwhile, the next run takes the errors anew.

@@ -1,15 +1,19 @@
-"""Scene files as measurements load them: at any size, with any sampler, whatever parameters they have."""
+"""Scenes as measurements load them, from files and dictionaries: at any size, with any sampler."""
 
 from __future__ import annotations
 
 import hashlib
 import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
 from ..errors import CommandError, message
 from ..files.loading import choose_sensor, in_proportion, parameters
@@ -26,31 +30,64 @@ class _Look:
     size: tuple[int, int] | CommandError
 
 
-@dataclass(frozen=True)
-class SceneFile:
-    """A scene by its ``name``, under which references and rows are kept, and its XML ``file``."""
+class MeasuredScene(ABC):
+    """A scene by its ``name``, under which references and rows are kept."""
 
     name: str
-    file: Path
+
+    @property
+    @abstractmethod
+    def called(self) -> str:
+        """What messages call it."""
+
+    @property
+    @abstractmethod
+    def sha256(self) -> str:
+        """SHA-256 of all that it consists of, files that it names among it."""
+
+    @property
+    @abstractmethod
+    def _parameters(self) -> Mapping[str, str]:
+        """Parameters that definitions can set, with their defaults."""
+
+    @abstractmethod
+    def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
+        """What Mitsuba's parser makes of it."""
+
+    def _plain(self, definitions: dict) -> mi.Scene:
+        """The scene with its own film and sampler."""
+        return self._instantiated(definitions, None)
+
+    def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
+        """The scene, its first sensor's sampler, which keeps its sample count, replaced by another type."""
+        config = mi.parser.ParserConfig(mi.variant())
+        config.parallel = False
+        state = self._parsed(config, definitions)
+        if sampler is not None:
+            sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
+            if not sensors:
+                raise CommandError(f"scene={self.called} has no sensor; add one to it.")
+            _replace_sampler(state.nodes, sensors[0], sampler)
+        mi.parser.transform_all(config, state)
+        # The stub says object.
+        return mi.parser.instantiate(config, state)  # pyright: ignore[reportReturnType]
 
     def load(self, resolution: int | None = None, sampler: str | None = None, **definitions):
         """The ``mi.Scene`` with an image so many pixels wide and a sampler of the type ``sampler``.
 
-        The image keeps the film's proportions, the sampler is the first sensor's; what is None stays as in
-        the file.
+        The image keeps the film's proportions, the sampler is the first sensor's; what is None stays as it
+        is.
 
-        Where the file has parameters ``$resolution`` and ``$sampler`` these are set, as are those of
+        Where a file has parameters ``$resolution`` and ``$sampler`` these are set, as are those of
         ``definitions``; else film and sampler are changed. Raises ``CommandError`` for a scene without
-        sensor, ``RuntimeError`` (of Mitsuba) for a file that cannot be loaded.
+        sensor, ``RuntimeError`` (of Mitsuba) for one that cannot be loaded.
         """
-        asked = {"resolution": resolution, "sampler": sampler}
-        known = parameters(self.file)
+        asked, known = {"resolution": resolution, "sampler": sampler}, self._parameters
         definitions |= {key: value for key, value in asked.items() if value is not None and key in known}
-        definitions = in_proportion(self.file, definitions)
         if sampler is None or "sampler" in known:
-            scene = mi.load_file(str(self.file), parallel=False, **definitions)
+            scene = self._plain(definitions)
         else:
-            scene = _with_sampler(self.file, sampler, definitions)
+            scene = self._instantiated(definitions, sampler)
         if resolution is not None and "resolution" not in known:
             _resize(scene, resolution)
         return scene
@@ -65,18 +102,18 @@ class SceneFile:
             raise own
         if resolution is None:
             return own
-        if "resolution" not in parameters(self.file):
+        if "resolution" not in self._parameters:
             return _widened(own, resolution)
-        return _size_of(self.load(resolution), self.file)  # the file may set any size by its parameter
+        return _size_of(self.load(resolution), self.called)  # the file may set any size by its parameter
 
     @cached_property
     def max_depth(self) -> int:
-        """That of the file's integrator; -1 (no limit) without one."""
+        """That of the scene's integrator; -1 (no limit) without one."""
         return depth_of(self._look.integrator)
 
     @cached_property
     def tells_depth(self) -> bool:
-        """Whether the file's integrator has a ``max_depth``."""
+        """Whether the scene's integrator has a ``max_depth``."""
         made = self._look.integrator
         return hasattr(made, "max_depth") or "max_depth" in str(made)
 
@@ -87,18 +124,125 @@ class SceneFile:
 
     @cached_property
     def _look(self) -> _Look:
-        """What one loading of the file, which may take long, tells of it."""
+        """What one loading, which may take long, tells of the scene."""
         scene = self.load()
         try:
-            size = _size_of(scene, self.file)
+            size = _size_of(scene, self.called)
         except CommandError as error:  # matters to those alone who ask for it
             size = error
         return _Look(scene.integrator(), has_media(scene), size)
 
+
+@dataclass(frozen=True)
+class SceneFile(MeasuredScene):
+    """A scene in an XML ``file``."""
+
+    name: str
+    file: Path
+
+    @property
+    def called(self) -> str:
+        return repr(str(self.file))
+
     @property
     def sha256(self) -> str:
-        """SHA-256 of the file and of the meshes and textures that it names."""
         return digest(self.file, *named_files(self.file))
+
+    @property
+    def _parameters(self) -> Mapping[str, str]:
+        return parameters(self.file)
+
+    def _plain(self, definitions: dict) -> mi.Scene:
+        return mi.load_file(str(self.file), parallel=False, **in_proportion(self.file, definitions))
+
+    def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
+        with _names_resolved_beside(self.file):
+            return super()._instantiated(definitions, sampler)
+
+    def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
+        return mi.parser.parse_file(config, str(self.file), **in_proportion(self.file, definitions))
+
+
+class DictionaryScene(MeasuredScene):
+    """A scene as the ``dictionary`` that ``mi.load_dict`` takes.
+
+    Films and samplers are measured at other sizes and of other types than the dictionary's own: it has to
+    hold sensors and films as dictionaries, too. Raises ``CommandError`` for one that does not.
+    """
+
+    def __init__(self, name: str, dictionary: Mapping[str, Any]):
+        if not isinstance(dictionary, Mapping) or dictionary.get("type") != "scene":
+            raise CommandError(f"scene={name!r} must be a dictionary of type 'scene', as of mi.load_dict")
+        self.name, self._dictionary = name, _copied(dictionary)
+        for key, value in self._dictionary.items():
+            held = value if isinstance(value, dict) else {"": value}
+            if made := [inner for inner in held.values() if isinstance(inner, mi.Sensor | mi.Film)]:
+                raise CommandError(
+                    f"scene={name!r}: {key!r} holds a {type(made[0]).__name__} that is made already; give "
+                    "sensors and films as dictionaries, since images of other sizes are measured"
+                )
+
+    @classmethod
+    def named_by_content(cls, dictionary: Mapping[str, Any]) -> DictionaryScene:
+        """One whose name is another for another content."""
+        unnamed = cls("scene", dictionary)
+        return cls(f"scene_{unnamed.sha256[:8]}", dictionary)
+
+    @property
+    def called(self) -> str:
+        return f"the dictionary {self.name!r}"
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(b"".join(_bytes_of(self._dictionary, self.name))).hexdigest()
+
+    @property
+    def _parameters(self) -> Mapping[str, str]:
+        return {}
+
+    def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
+        if definitions:
+            raise CommandError(f"{self.called} has no parameter {next(iter(definitions))!r}")
+        return mi.parser.parse_dict(config, self._dictionary)
+
+
+def _copied(dictionary: Mapping) -> dict:
+    """A dictionary that does not change when the user changes the one given."""
+    return {key: _copied(value) if isinstance(value, Mapping) else value for key, value in dictionary.items()}
+
+
+def _bytes_of(value: Any, where: str) -> Iterator[bytes]:
+    """All that makes a ``value`` of a scene dictionary, in its order; ``where`` it stands.
+
+    Raises ``CommandError`` for objects of which it cannot be known whether they are the same another time.
+    """
+    if isinstance(value, Mapping):
+        for key, held in value.items():
+            yield f"{len(value)} {key}".encode()
+            yield from _bytes_of(held, f"{where}.{key}")
+        if isinstance(name := value.get("filename"), str):
+            path = Path(str(mi.file_resolver().resolve(name)))
+            yield path.read_bytes() if path.is_file() else b""
+    elif value is None or isinstance(value, str | bool | int | float):
+        yield f"{type(value).__name__} {value!r}".encode()
+    elif isinstance(value, list | tuple):
+        for held in value:
+            yield from _bytes_of(held, where)
+    elif isinstance(value, mi.Object):
+        yield value.class_name().encode()
+        parameters = mi.traverse(value)
+        for key in parameters.keys():
+            yield key.encode()
+            yield from _bytes_of(parameters[key], f"{where}.{key}")
+    else:
+        array = np.array(getattr(value, "matrix", value))
+        if array.dtype == object:
+            raise CommandError(
+                f"{where} is a {type(value).__name__}, of which it cannot be known whether it has changed "
+                "since a reference was made; give a dictionary, a number, a text or an array"
+            )
+        yield f"{array.dtype} {array.shape}".encode()
+        yield array.tobytes()
 
 
 def digest(*paths: Path) -> str:
@@ -149,13 +293,13 @@ def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) 
             raise CommandError(f"{what}: {last}") from error
 
 
-def _size_of(scene: mi.Scene, file: Path) -> tuple[int, int]:
-    """Width and height of the first sensor's image; raises ``CommandError`` as `SceneFile.size`."""
+def _size_of(scene: mi.Scene, called: str) -> tuple[int, int]:
+    """Width and height of the first sensor's image; raises ``CommandError`` as `MeasuredScene.size`."""
     film = choose_sensor(scene, 0).film()
     if film.base_channels_count() < 3:
         raise CommandError(
-            f"scene={str(file)!r}: its film has no colours, of which errors are taken; write "
-            'pixel_format "rgb" into the scene file'
+            f"scene={called}: its film has no colours, of which errors are taken; give it the "
+            'pixel_format "rgb"'
         )
     width, height = film.size()
     return int(width), int(height)
@@ -175,20 +319,6 @@ def _resize(scene, width: int) -> None:
     changed["film.crop_offset"] = [0, 0]
     changed["film.crop_size"] = size
     changed.update()
-
-
-def _with_sampler(file: Path, kind: str, definitions: dict):
-    """The scene of a ``file`` with its first sensor's sampler replaced, which keeps its sample count."""
-    config = mi.parser.ParserConfig(mi.variant())
-    config.parallel = False
-    with _names_resolved_beside(file):
-        state = mi.parser.parse_file(config, str(file), **definitions)
-        sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
-        if not sensors:
-            raise CommandError(f"scene={str(file)!r} has no sensor; add one to the scene file.")
-        _replace_sampler(state.nodes, sensors[0], kind)
-        mi.parser.transform_all(config, state)
-        return mi.parser.instantiate(config, state)
 
 
 def _replace_sampler(nodes, sensor, kind: str) -> None:

@@ -33,6 +33,7 @@ from . import analysis, probes, showing
 from .bench import Bench, measure, measured
 from .cells import FIRST_SEED, Cell, Cells, machine, software
 from .making import Job, check, obtained
+from .options import Sweep as Asked
 from .preset import Preset, read_preset
 from .project import Project
 from .reference import load_reference, make_command, too_few
@@ -250,16 +251,19 @@ def short_of_target(table: list[dict]) -> list[str]:
     ]
 
 
-def run(options: Namespace) -> int:
-    """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
-    mi.set_variant("llvm_ad_rgb")
-    project = Project(options.project)
-    file = project.preset(options.preset)
+def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[list[dict], list[str]]:
+    """Render what is missing of a ``preset`` and print how that went; all rows, and what failed."""
+    if options.scheduler and project.given:
+        raise CommandError(
+            f"scheduler={options.scheduler} with scene={next(iter(project.given))!r}, a dictionary, is not "
+            "possible: workers load files; write it into one"
+        )
+    file = project.preset(preset)
     output = options.output or project.root / "results" / file.stem
     whole = read_preset(file, project)
-    preset = chosen(whole, options.scenes) if options.scenes else whole
+    part = chosen(whole, options.scenes) if options.scenes else whole
     check_output(output / "rows.csv", ".csv")  # complain before hours of rendering, not after
-    sweep = Sweep(project, preset, output)
+    sweep = Sweep(project, part, output)
     sweep.prepare(options.reference_seconds)
     with showing.bar() as progress:
         if options.scheduler:
@@ -276,4 +280,11 @@ def run(options: Namespace) -> int:
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
-    return 1 if sweep.failed else 0
+    return table, sweep.failed
+
+
+def run(options: Namespace) -> int:
+    """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
+    mi.set_variant("llvm_ad_rgb")
+    _, failed = swept(Project(options.project), options.preset, options)
+    return 1 if failed else 0

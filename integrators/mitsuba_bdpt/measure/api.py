@@ -1,0 +1,183 @@
+"""Measurements as functions: each command that measures, of scenes as dictionaries or files.
+
+What a measurement needs is imported when it is called: the command declares its options from this package
+where the extra ``[measure]``, or Mitsuba, is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ..errors import CommandError, did_you_mean
+from . import options as available
+
+if TYPE_CHECKING:
+    from .equal_time import Shot
+    from .project import Project
+    from .reference import Reference
+
+VARIANT = "llvm_ad_rgb"
+"""In which all measurements render."""
+
+
+class SceneDict:
+    """A scene as the ``dictionary`` of ``mi.load_dict``, with the ``name`` of its references and rows."""
+
+    def __init__(self, name: str, dictionary: Mapping[str, Any]):
+        self.name, self.dictionary = name, dictionary
+
+
+Scene = str | Path | Mapping[str, Any] | SceneDict
+"""A scene's file, its name in PROJECT/scenes, or a dictionary."""
+
+_SCENES = (str, Path, Mapping, SceneDict)
+
+Plugin = str | Mapping[str, Any]
+"""An integrator's type, or its parameters as a dictionary; ``sampler`` among them is the sensor's."""
+
+Asked = TypeVar("Asked", bound=available.Options)
+
+
+def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Reference:
+    """Make the reference of a scene, or go on with the stored one.
+
+    ``options``: those of `options.MakeReference`. Returns the reference with its ``image`` and own ``error``.
+    """
+    from .making import Job, make
+
+    asked = _options(available.MakeReference, options)
+    limits = asked.resolution, asked.max_depth, asked.spp, asked.seconds, asked.by
+    with _measured([scene], project) as (found, (name,)):
+        return make(Job(found, found.scene(name), *limits))[0]
+
+
+def compare_integrators(
+    scenes: Scene | Sequence[Scene], first: Plugin, second: Plugin, *, project: str | Path = ".", **options
+) -> str:
+    """Compare two ways to render: time, error and efficiency of the first over the second.
+
+    ``options``: those of `options.Compare`. Returns a table in Markdown.
+    """
+    from . import compare as module
+    from .tables import table
+
+    asked, ways = _options(available.Compare, options), [_parameters(first), _parameters(second)]
+    with _measured(scenes, project) as (found, names):
+        return table(module.HEADS, module.lines(found, names, ways, asked))
+
+
+def compare_at_equal_time(
+    scene: Scene, integrators: Sequence[Plugin] = (), *, project: str | Path = ".", **options
+) -> list[Shot]:
+    """Render a scene by several integrators in equal time, and draw them side by side.
+
+    ``options``: those of `options.EqualTime`; by default `path` (with media `volpath`) and `bdpt`. Returns
+    the renders, with their ``image``, ``seconds`` and ``rel_mse``.
+    """
+    from . import equal_time as module
+
+    asked = _options(available.EqualTime, options)
+    ways = {_called(plugin): _parameters(plugin) for plugin in integrators}
+    with _measured([scene], project) as (found, (name,)):
+        return module.pictured(found, name, ways, asked)[1]
+
+
+def render_pyramid(scene: Scene, *, project: str | Path = ".", **options) -> dict[str, dict]:
+    """Render and draw an image of each strategy (s, t).
+
+    ``options``: those of `options.Pyramid`. Returns the images by kind, ``weighted`` or ``unweighted``, and
+    by (k, s, t).
+    """
+    from . import pyramid as module
+
+    asked = _options(available.Pyramid, options)
+    with _measured([scene], project) as (found, (name,)):
+        return module.pictured(found, name, asked)[1]
+
+
+def find_fireflies(scenes: Scene | Sequence[Scene], *, project: str | Path = ".", **options) -> str:
+    """Find the paths behind the worst values of renders.
+
+    ``options``: those of `options.Fireflies`. Returns a table in Markdown, and the errors of the renders.
+    """
+    from . import fireflies as module
+
+    asked = _options(available.Fireflies, options)
+    with _measured(scenes, project) as (found, names):
+        return module.text(found, names, asked)
+
+
+def run_sweep(
+    preset: str | Path, dictionaries: Sequence[SceneDict] = (), *, project: str | Path = ".", **options
+) -> list[dict]:
+    """Render what is missing of a preset, a TOML file, whose scenes may be ``dictionaries`` by their names.
+
+    ``options``: those of `options.Sweep`. Returns the rows. Raises ``CommandError`` if a render failed.
+    """
+    from . import sweep as module
+
+    asked = _options(available.Sweep, options)
+    with _measured(dictionaries, project) as (found, _):
+        rows, failed = module.swept(found, str(preset), asked)
+    if failed:
+        raise CommandError(f"preset={str(preset)!r}: {len(failed)} failed: {'; '.join(failed)}")
+    return rows
+
+
+@contextmanager
+def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[tuple[Project, list[str]]]:
+    """The project with these scenes, and their names in it; within, the variant is `VARIANT`."""
+    import mitsuba as mi
+
+    from .project import Project
+    from .scenes import DictionaryScene
+
+    before, given, names = mi.variant(), {}, []
+    mi.set_variant(VARIANT)
+    try:
+        for scene in [scenes] if isinstance(scenes, _SCENES) else scenes:
+            if not isinstance(scene, _SCENES):
+                raise CommandError(
+                    f"scene={scene!r} must be the path of a scene file, a name in {str(project)!r}/scenes, "
+                    "or a dictionary as of mi.load_dict"
+                )
+            if isinstance(scene, Mapping):
+                scene = DictionaryScene.named_by_content(scene)
+            elif isinstance(scene, SceneDict):
+                scene = DictionaryScene(scene.name, scene.dictionary)
+            if isinstance(scene, DictionaryScene):
+                given[scene.name] = scene
+            names.append(scene.name if isinstance(scene, DictionaryScene) else str(scene))
+        yield Project(Path(project), given), names
+    finally:
+        if before is not None:
+            mi.set_variant(before)
+
+
+def _options(kind: type[Asked], given: dict) -> Asked:
+    """The ``given`` options of a measurement; raises ``CommandError`` for others."""
+    known = {field.name: field.default for field in available.options_of(kind)}
+    for name in given:
+        if name not in known:
+            question = did_you_mean(name, known)
+            raise CommandError(f"{name}={given[name]!r} is no option; {question}there are {', '.join(known)}")
+    # Of an option that takes several values one may be given alone.
+    several = [name for name in given if isinstance(known[name], tuple)]
+    alone = {name: (given[name],) for name in several if not isinstance(given[name], list | tuple)}
+    return kind(**given | alone)
+
+
+def _parameters(plugin: Plugin) -> dict[str, Any]:
+    found = {"type": plugin} if isinstance(plugin, str) else dict(plugin)
+    if not isinstance(found.get("type"), str):
+        raise CommandError(f"integrator={plugin!r} must be a type or a dictionary with one")
+    return found
+
+
+def _called(plugin: Plugin) -> str:
+    """What is written beneath the image of an integrator."""
+    found = _parameters(plugin)
+    return " ".join([found.pop("type"), *(f"{key}={value}" for key, value in found.items())])

@@ -1,0 +1,204 @@
+"""Options of measurements: their names, defaults and bounds, for the command and for Python alike.
+
+A dataclass for each measurement. Nothing but the standard library is imported here, since the command
+declares its options before it imports anything else.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from ..errors import CommandError
+
+RESOLUTION = 128
+"""Width of references, and of what is judged by them, unless said."""
+
+REFERENCE_SECONDS = 600.0
+"""Seconds that making a reference may take, unless said."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """A finite number of a ``kind``, from ``least`` to ``most``, a multiple of ``step``; or ``apart``."""
+
+    kind: type
+    least: float
+    most: float = math.inf
+    step: int = 1
+    apart: int | None = None
+
+    def __str__(self) -> str:
+        found = "a whole number" if self.kind is int else "a number"
+        found += f" of at least {self.least:g}"
+        if self.most < math.inf:
+            found += f" and at most {self.most if self.kind is int else format(self.most, 'g')}"
+        if self.step > 1:
+            found += f", divisible by {self.step}"
+        return found if self.apart is None else f"{found}, or {self.apart}"
+
+    def holds(self, value: object) -> bool:
+        """Whether a ``value`` is such a number."""
+        if isinstance(value, bool) or not isinstance(value, int if self.kind is int else int | float):
+            return False
+        if value == self.apart:
+            return True
+        fits = self.step == 1 or value % self.step == 0
+        return self.least <= value <= self.most and math.isfinite(value) and fits
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of some ``names``."""
+
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(self.names)}"
+
+    def holds(self, value: object) -> bool:
+        """Whether a ``value`` is one of them."""
+        return value in self.names
+
+
+WHOLE, SEED, STOPS = Number(int, 1), Number(int, 0, 2**32 - 1), Number(float, -100, 100)
+SECONDS, WIDTH = Number(float, 0), Number(int, 4, step=4)
+
+
+def option(default: Any, bounds: Number | Choice | type, text: str, **declared) -> Any:
+    """A field: its ``default`` and ``bounds``, None beside them if that is the default, and its help.
+
+    ``declared``: further arguments for argparse, and ``short``, another name there.
+    """
+    return field(default=default, metadata={"bounds": bounds, "text": text, "declared": declared})
+
+
+def _width(default: int | None = RESOLUTION) -> Any:
+    text = f"width of image and reference; default: {RESOLUTION}"
+    return option(default, WIDTH, text, metavar="PIXELS")
+
+
+def _reference_seconds() -> Any:
+    text = "that making a reference may take where there is none, per scene; default: %(default)g"
+    return option(REFERENCE_SECONDS, SECONDS, text, metavar="SECONDS")
+
+
+class Options:
+    """What all options have in common."""
+
+    def __post_init__(self):
+        """Raise ``CommandError`` for values that cannot be."""
+        for found in options_of(type(self)):
+            value, bounds = getattr(self, found.name), found.metadata["bounds"]
+            if isinstance(bounds, type) or (value is None and found.default is None):
+                continue
+            values = (
+                value if isinstance(found.default, tuple) and isinstance(value, list | tuple) else [value]
+            )
+            for single in values:
+                if not bounds.holds(single):
+                    raise CommandError(f"{found.name}={value!r} must be {bounds}")
+
+
+def options_of(kind: type) -> list[Field]:
+    """The fields of a dataclass of options."""
+    return [found for found in fields(kind) if "bounds" in found.metadata]
+
+
+@dataclass(frozen=True)
+class Sweep(Options):
+    """Options of sweeps."""
+
+    scenes: tuple[str, ...] | None = option(
+        None, str, "these of the preset alone; other rows stay as they are", nargs="+", metavar="SCENE"
+    )
+    output: Path | None = option(None, Path, "folder; default: PROJECT/results/NAME_OF_PRESET", short="-o")
+    scheduler: str | None = option(
+        None, str, "of a dask.distributed cluster to render on (extra [cluster])", metavar="ADDRESS"
+    )
+    reference_seconds: float = _reference_seconds()
+
+
+@dataclass(frozen=True)
+class MakeReference(Options):
+    """Options of references."""
+
+    spp: int = option(64, WHOLE, "of the renders to judge; default: %(default)s")
+    seconds: float = option(REFERENCE_SECONDS, SECONDS, "per scene; default: %(default)g")
+    resolution: int = _width()
+    max_depth: int | None = option(
+        None,
+        Number(int, 1, apart=-1),
+        "-1: no limit; default: that of presets/benchmark.toml, else of the scene's file",
+    )
+    by: str | None = option(
+        None,
+        Choice(("path", "bdpt", "merging")),
+        "what renders it, path (with media: volpath) only where that converges, merging (bdpt with it) where "
+        "nothing else finds all light; default: as references/scenes.toml says, else bdpt",
+    )
+
+
+@dataclass(frozen=True)
+class Compare(Options):
+    """Options of comparisons of two ways to render."""
+
+    spp: tuple[int, ...] = option((64,), WHOLE, "default: 64", nargs="+")
+    pairs: int = option(12, WHOLE, "default: %(default)s")
+    resolution: int = _width()
+    reference_seconds: float = _reference_seconds()
+
+
+@dataclass(frozen=True)
+class EqualTime(Options):
+    """Options of pictures at equal time."""
+
+    spp: int = option(64, WHOLE, "of the last integrator; default: %(default)s")
+    sampler: str | None = option(None, str, "type of the sensor's sampler; default: the scene's")
+    reference: Path | None = option(
+        None,
+        Path,
+        "image to take errors against, at its own size; default: a reference of the project",
+        metavar="EXR",
+    )
+    resolution: int | None = _width(None)
+    reference_seconds: float = _reference_seconds()
+    output: Path | None = option(None, Path, "default: PROJECT/renders/equal_time_SCENE.png", short="-o")
+
+
+@dataclass(frozen=True)
+class Pyramid(Options):
+    """Options of technique pyramids."""
+
+    output: Path | None = option(
+        None,
+        Path,
+        "EXR file to write, PNGs come beside it; default: PROJECT/renders/pyramid_SCENE.exr",
+        short="-o",
+    )
+    max_depth: int = option(5, WHOLE, "longest path in edges; default: %(default)s")
+    spp: int = option(64, WHOLE, "default: %(default)s")
+    seed: int = option(0, SEED, "default: %(default)s")
+    resolution: int | None = option(None, WHOLE, "width of the image; default: the scene's")
+    heuristic: str = option("balance", str, "default: %(default)s")
+    exposure: float = option(0.0, STOPS, "stops, of the pictures")
+
+
+@dataclass(frozen=True)
+class Fireflies(Options):
+    """Options of the search for the paths behind the worst values."""
+
+    seeds: int = option(5, WHOLE, "renders of each scene; default: %(default)s")
+    spp: int = option(64, WHOLE, "default: %(default)s")
+    resolution: int = _width()
+    max_depth: int | None = option(
+        None, WHOLE, "default: that of presets/benchmark.toml, else of the scene's file"
+    )
+    level: float = option(
+        0.5, Number(float, 1e-9), "values of its pixel by which a sample is off; default: %(default)s"
+    )
+    top: int = option(12, WHOLE, "samples examined of each render; default: %(default)s")
+    lines: int = option(6, WHOLE, "kinds of paths of each scene; default: %(default)s")
+    reference_seconds: float = _reference_seconds()

@@ -1,0 +1,189 @@
+"""Measurements as functions, of scenes that are dictionaries."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt import measure
+from mitsuba_bdpt.cli.arguments import build_parser
+from mitsuba_bdpt.measure import options
+from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.scenes import DictionaryScene, SceneFile
+
+PRESET = """
+resolution = 8
+scenes = ["room"]
+spp = [4]
+seeds = 2
+max_depth = 3
+[[integrator]]
+type = "bdpt"
+"""
+
+
+def room(**more):
+    """A lamp under the ceiling of a sphere, 16 x 8 pixels."""
+    camera = {
+        "type": "perspective",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 8, "rfilter": {"type": "box"}},
+    }
+    lamp = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 1, 0]).rotate([1, 0, 0], 90),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [3, 2, 1]}},
+    }
+    walls = {"type": "sphere", "radius": 5, "flip_normals": True}
+    scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 3}, "camera": camera}
+    return scene | {"lamp": lamp, "walls": walls} | more
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def test_a_dictionary_is_loaded_as_a_file_of_it_is(here):
+    """Expected: the same size, depth and images, at another size and with another sampler, and the same
+    answers about media; the dictionary of the user stays as it was."""
+    given = room()
+    # A transform of a file is a matrix of decimals.
+    config = mi.parser.ParserConfig(mi.variant())
+    mi.parser.write_file(mi.parser.parse_dict(config, given), "room.xml")
+    scenes = DictionaryScene("room", given), SceneFile("room", Path("room.xml"))
+    images = [np.array(mi.render(scene.load(32, "stratified"), spp=4, seed=3)) for scene in scenes]
+    assert images[0].shape == (16, 32, 3)
+    np.testing.assert_allclose(*images, rtol=1e-4)
+    for name in ("max_depth", "has_media", "tells_depth"):
+        assert getattr(scenes[0], name) == getattr(scenes[1], name), name
+    assert scenes[0].size(8) == scenes[1].size(8) == (8, 4)
+    assert given["camera"]["film"]["width"] == 16 and "sampler" not in given["camera"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda scene: scene["lamp"]["emitter"]["radiance"].update(value=[3, 2, 2]),
+        lambda scene: scene["camera"].update(to_world=mi.ScalarTransform4f()),
+        lambda scene: scene["walls"].update(bsdf={"type": "diffuse"}),
+        lambda scene: scene.update(
+            sky={"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32))}
+        ),
+        lambda scene: scene.update(ball=mi.load_dict({"type": "sphere", "radius": 0.5})),
+        lambda scene: Path("wall.ply").write_text("another mesh"),
+    ],
+    ids=["number", "transform", "plugin", "bitmap", "object", "file"],
+)
+def test_a_dictionary_that_changes_is_another_scene(here, change):
+    """Expected: a reference is not taken for one of an edited scene, be it a number, an array, an object or a
+    file that the dictionary names; a dictionary of the same content is the same scene."""
+    Path("wall.ply").write_text("a mesh")
+    mesh = {"mesh": {"type": "ply", "filename": "wall.ply"}}
+    before, same = (DictionaryScene.named_by_content(room(**mesh)) for _ in range(2))
+    sha256 = before.sha256
+    assert before.name == same.name and same.sha256 == sha256
+    edited = room(**mesh)
+    change(edited)
+    after = DictionaryScene.named_by_content(edited)
+    assert after.name != before.name and after.sha256 != sha256
+
+
+def test_equal_objects_are_the_same_scene():
+    """Expected: what counts is what an object is, not which one."""
+    balls = (mi.load_dict({"type": "sphere", "radius": 0.5}) for _ in range(2))
+    first, second = (DictionaryScene("room", room(ball=ball)).sha256 for ball in balls)
+    assert first == second
+
+
+def test_measurements_take_dictionaries(here):
+    """Expected: each makes or takes the reference of the scene in the project, and returns what it measured;
+    the variant of the caller stays."""
+    common = {"project": "project", "resolution": 8}
+    mi.set_variant("llvm_ad_mono")
+    reference = measure.make_reference(room(), seconds=0, spp=4, **common)
+    assert reference.image.shape == (4, 8, 3) and reference.provenance["max_depth"] == 3
+    named = measure.SceneDict("mine", room())
+    table = measure.compare_integrators(
+        [room(), named], "bdpt", {"type": "path", "sampler": "stratified"}, spp=4, pairs=1, **common
+    )
+    assert "| `mine` | 4 |" in table and "| `scene_" in table
+    path, bdpt = measure.compare_at_equal_time(named, spp=4, **common)
+    assert (path.name, bdpt.name, bdpt.spp) == ("path", "bdpt", 4) and bdpt.image.shape == (4, 8, 3)
+    images = measure.render_pyramid(named, spp=1, max_depth=2, **common)
+    assert images["weighted"].keys() == images["unweighted"].keys() >= {(2, 1, 2)}
+    assert "relMSE of the renders" in measure.find_fireflies(named, spp=4, seeds=1, level=0.05, **common)
+    assert {"equal_time_mine.png", "pyramid_mine.exr"} <= {p.name for p in Path("project/renders").iterdir()}
+    assert mi.variant() == "llvm_ad_mono"
+
+
+def test_a_sweep_takes_dictionaries(here):
+    """Expected: the scenes of a preset by the names of the dictionaries; rows of both seeds, whose errors are
+    against the reference that the sweep makes; no cluster, whose workers would not know them."""
+    Path("mine.toml").write_text(PRESET)
+    dictionaries = [measure.SceneDict("room", room())]
+    rows = measure.run_sweep("mine.toml", dictionaries, reference_seconds=0, output=Path("rows"))
+    assert [row["seed"] for row in rows] == [1, 2] and all(row["rel_mse"] > 0 for row in rows)
+    assert json.loads(rows[0]["parameters"]) == {"type": "bdpt"}
+    with pytest.raises(ValueError, match="scheduler=x:1 with scene='room', a dictionary"):
+        measure.run_sweep("mine.toml", dictionaries, scheduler="x:1")
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: measure.make_reference(room(), secnds=3), "secnds=3 is no option; did you mean seconds"),
+        (lambda: measure.make_reference(room(), resolution=10), "resolution=10 must be .* divisible by 4"),
+        (lambda: measure.make_reference(room(), by="light"), "by='light' must be one of path, bdpt, merging"),
+        (
+            lambda: measure.compare_integrators(room(), "bdpt", "path", spp=(4, 0)),
+            "spp=.4, 0. must be a whole",
+        ),
+        (lambda: measure.compare_integrators(room(), "bdpt", {"skip": "none"}), "must be a type or a dict"),
+        (lambda: measure.render_pyramid({"type": "sphere"}), "must be a dictionary of type 'scene'"),
+        (lambda: measure.render_pyramid(3), "scene=3 must be the path of a scene file"),
+        (lambda: measure.render_pyramid("nowhere"), "scene='nowhere' is neither a scene file nor"),
+        (lambda: measure.find_fireflies(room(), level=float("nan")), "level=nan must be a number"),
+        (
+            lambda: measure.render_pyramid(room(camera=mi.load_dict({"type": "perspective"}))),
+            "'camera' holds a .* that is made already; give sensors and films as dictionaries",
+        ),
+        (lambda: DictionaryScene("room", room(odd=object())).sha256, "room.odd is a object, of which"),
+    ],
+)
+def test_what_cannot_be_measured_is_named(here, call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_a_reference_of_another_dictionary_is_refused_with_the_call_that_makes_it(here):
+    """Expected: under one name, that of an edited scene is none."""
+    common = {"project": "project", "resolution": 8, "spp": 4}
+    measure.make_reference(measure.SceneDict("mine", room()), seconds=0, **common)
+    edited = room()
+    edited["walls"]["radius"] = 6
+    with pytest.raises(
+        ValueError, match=r"measure.make_reference\(SceneDict\('mine', ...\), resolution=8, max_d"
+    ):
+        measure.compare_integrators(measure.SceneDict("mine", edited), "bdpt", "path", pairs=1, **common)
+
+
+@pytest.mark.parametrize("name", ["reference", "compare", "equal-time", "pyramid", "fireflies", "sweep"])
+def test_the_command_has_the_same_options(name):
+    """Expected: all options of Python with the same defaults."""
+    kinds = {"reference": options.MakeReference, "equal-time": options.EqualTime}
+    kind = kinds.get(name) or getattr(options, name.capitalize())
+    words = {"compare": ["bdpt", "path", "--scenes", "x"]}.get(name, ["x"])
+    parsed = vars(build_parser().parse_args([name, *words]))
+    expected = dataclasses.asdict(kind())
+    assert {key: parsed[key] for key in expected if key != "scenes"} == {
+        key: value for key, value in expected.items() if key != "scenes"
+    }
+
+
+def test_a_project_knows_its_dictionaries():
+    scene = DictionaryScene("mine", room())
+    project = Project(Path(), {"mine": scene})
+    assert project.scene("mine") is scene and project.called(scene) == "mine" and project.depth(scene) == 3
