@@ -124,6 +124,23 @@ def lamp(radiance=8.0, **keys):
     } | keys
 
 
+def sheet():
+    """A sheet that lets half of the light pass on either of its faces, before a white sky."""
+    eye = transform().look_at([0, 0, 6], [0, 0, 3], [0, 1, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sky": {"type": "constant"},
+            "sensor": sensor(to_world=eye, fov=20),
+            "sheet": {
+                "type": "cube",
+                "to_world": transform().translate([0, 0, 3]).scale([1, 1, 1.5e-4]),
+                "bsdf": {"type": "mask", "opacity": 0.5, "inner": grey(0.0)},
+            },
+        }
+    )
+
+
 def round_lamp(turned):
     """A lamp on a sphere, which no turn changes."""
     placed = transform().translate([0.4, 2.2, 0]).scale(0.3)
@@ -458,6 +475,12 @@ CASES = [
         "a scene 0.4 mm wide (scaled by 1e-4): offsets of rays swallow it; of `path` too",
         lambda: tiny(1e-4),
         equal=lambda: tiny(1.0),
+    ),
+    Case(
+        "a sheet 0.3 mm thick with a `mask` of opacity 0.5, 3 m from the origin, before a white sky: masks "
+        "are opaque; `path` skips the second face and has 0.5",
+        sheet,
+        right=0.25,
     ),
 ]
 

@@ -439,6 +439,45 @@ def test_rectangles_that_mitsuba_merges():
     assert float(found.radius[0]) == pytest.approx(float(expected.radius[0]), rel=1e-6)
 
 
+def room_of_rectangles():
+    """A room of five rectangles of one BSDF, open to a white sky, with a small cube on its floor."""
+    grey = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
+    place = mi.ScalarTransform4f()
+    sides = {"floor": ([1, 0, 0], -90), "ceiling": ([1, 0, 0], 90), "left": ([0, 1, 0], 90)}
+    sides |= {"right": ([0, 1, 0], -90), "back": ([0, 1, 0], 0)}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    eye = place.look_at([0, 0, 0.9], [0, 0, -1], [0, 1, 0])
+    return {
+        "type": "scene",
+        "sky": {"type": "constant"},
+        "cube": {"type": "cube", "to_world": place.translate([0, -0.8, 0]).scale(0.2)},
+        "sensor": {"type": "perspective", "fov": 70, "to_world": eye, "film": film},
+    } | {
+        name: {
+            "type": "rectangle",
+            "to_world": place.rotate(axis, angle).translate([0, 0, -1]),
+            "bsdf": grey,
+        }
+        for name, (axis, angle) in sides.items()
+    }
+
+
+@pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=str)
+def test_a_room_of_merged_rectangles(parameters):
+    """Rationale: shadow rays of `path` towards the sky end at the box of the cube, and meet no wall: the room
+    is 6 % too bright. Where other shapes stretch the box nearly to the walls it is a few per mille, which was
+    taken for a loss of ours in other people's scenes. Expected: the image is the same whether
+    Mitsuba has merged the walls or not, to 1e-5 of the mean for sums in another order; `path` differs."""
+    merged, apart = (mi.load_dict(room_of_rectangles(), optimize=on) for on in (True, False))
+    assert len(merged.shapes()) == 2 and len(apart.shapes()) == 6
+    ours = mi.load_dict({"type": "bdpt", "max_depth": 4} | parameters)
+    a, b = (np.array(ours.render(scene, spp=64, seed=1), dtype=float) for scene in (merged, apart))
+    assert np.abs(a - b).mean() < 1e-5 * b.mean()
+    path = mi.load_dict({"type": "path", "max_depth": 4})
+    a, b = (np.array(mi.render(scene, integrator=path, spp=64, seed=1)).mean() for scene in (merged, apart))
+    assert a > 1.05 * b
+
+
 def test_sizes_of_scenes_with_merged_rectangles():
     """Rationale: as above, of all that asks how large a scene or a shape is. Expected: the scene's box is
     that of the rectangles, beside which a ball of radius .1, a thousandth of them, is small; spheres around
