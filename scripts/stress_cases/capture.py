@@ -175,7 +175,7 @@ class Capture(Observer):
         batch = Batch(0, pixels, 0, samples)
         points = Points("independent", dr.opaque(mi.UInt32, seed))
         slot = dr.arange(mi.UInt32, self.lanes)
-        with stepwise():
+        with stepwise(unbound):
             dr.eval(kernel.retrace(unbound, self, batch, points, samples, slot, self))
 
     # What the kernel shows: it has an observer, see `Observer`.

@@ -46,7 +46,8 @@ def test_sigterm_ends_as_ctrl_c_does():
         text=True,
     )
     deadline = time.monotonic() + PATIENCE
-    while not Path("ended.png").exists() and time.monotonic() < deadline:  # the first pass is over
+    while process.poll() is None and not Path("ended.png").exists():  # the first pass is over
+        assert time.monotonic() < deadline
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGTERM)

@@ -29,6 +29,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..host.jit import evaluated_mode
 from . import oracle, reconstruct, recording
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon
@@ -112,7 +113,8 @@ def fireflies(scene, integrator, target, spp: int, seed: int, level: float, top:
 def _found_anew(scene, kernel, kappa, path):
     """The path found anew, and what speaks against it."""
     try:
-        rebuilt = reconstruct.rebuild(scene, kernel.emitters, path)
+        with evaluated_mode(kernel.emitters.evaluated):
+            rebuilt = reconstruct.rebuild(scene, kernel.emitters, path)
     except reconstruct.Lost as why:
         return None, str(why)
     # The estimate is divided by the class's count and by the probability that roulette let the path live.

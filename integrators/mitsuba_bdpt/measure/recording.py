@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..geometry import polarization
-from ..host.jit import gc_paused
+from ..host.jit import evaluated_mode, gc_paused
 from ..image import sink
 from ..planning import planner
 from ..run import rendering
@@ -269,9 +269,15 @@ class _Subpath:
 
 
 @contextlib.contextmanager
-def stepwise():
-    """Dr.Jit runs loops and branches step by step, so that their state can be read."""
+def stepwise(traced: Kernel):
+    """Dr.Jit runs loops and branches of a kernel step by step, so that their state can be read.
+
+    As for a render the cycle collector is paused, and calls too go step by step where an emitter, of this
+    scene or another, needs it.
+    """
     with contextlib.ExitStack() as stack:
+        stack.enter_context(gc_paused())
+        stack.enter_context(evaluated_mode(traced.emitters.evaluated))
         for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
             stack.enter_context(dr.scoped_set_flag(flag, False))
         yield
@@ -466,7 +472,7 @@ def replay(outliers: list[Outlier]) -> list[list[Path]]:
         slots = [outliers[i].slot for i in numbers]
         slots += slots[:1]  # Dr.Jit takes arrays of width 1 for constants
         recorder = Recorder(len(slots))
-        with gc_paused(), stepwise():
+        with stepwise(launch.kernel):
             drawn = launch.kernel, recorder, launch.batch, launch.points, launch.spp
             dr.eval(kernel.retrace(*drawn, mi.UInt32(slots), recorder))
         for lane, i in enumerate(numbers):
