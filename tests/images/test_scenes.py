@@ -26,6 +26,7 @@ LAMPS = {
     "glass_caustics": [(0, -1, 0)],
     "uplight_room": [(0, 1, 0)],
     "ajar_door": [(0, -1, 0)],
+    "furnished_door": [(0, -1, 0)],
     "many_lights": [(0, -1, 0)] * 64,
     "veach_bidir": [SPOT, (0, 1, 0)],
     "pool": [(0.401, -0.469, -0.787)],
@@ -48,6 +49,8 @@ CLOSED_ROOMS = [
     "fog_lamp_in_glass",
     "fog_lamp",
     "lamp_in_glass_seen",
+    "furnished_lamps",
+    "furnished_door",
 ]
 # Extinction, per unit of length, of the medium around the sensor and of those in bodies seen from outside.
 FOGS = {

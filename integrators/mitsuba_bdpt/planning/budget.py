@@ -19,10 +19,13 @@ PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 
-# In a scene of many BSDFs (`bsdf.MANY`) a kernel takes about as long to compile for each kind of BSDF, and to
-# record for each BSDF, as path tracing takes for so many samples. Renders whose samples take longer than that
-# ask a pilot (docs/development/experiments.md, "Pilots in rooms").
-SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 17, 1 << 11
+# In a scene of many BSDFs (`bsdf.MANY`) a pilot's kernel takes about as long to compile for each kind of
+# BSDF, and to record for each BSDF, as a render without a pilot takes for so many samples. Longer ones ask
+# a pilot (docs/development/experiments.md, "Pilots in rooms").
+SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
+
+# Renders so many times as long predict the gain of guided s = 0 there too, which takes two more kernels.
+GUIDING_TIMES = 4
 
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
@@ -47,15 +50,17 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 
-def least_samples(traits: Traits, kernels: int = 1) -> int:
-    """How many samples a render needs for a pilot that compiles so many ``kernels``.
-
-    ``traits``: those of its scene's BSDFs.
-    """
+def least_samples(traits: Traits) -> int:
+    """How many samples a render needs for a pilot; ``traits`` of its scene's BSDFs."""
     asked = traits.asked
     if not asked.many:
         return LEAST_SAMPLES
-    return kernels * (SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count)
+    return SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count
+
+
+def predicts_guiding(traits: Traits, samples: int) -> bool:
+    """Whether the pilot of a render of so many ``samples`` predicts the gain of guided s = 0."""
+    return not traits.asked.many or samples >= GUIDING_TIMES * least_samples(traits)
 
 
 def lanes(samples: int) -> int:

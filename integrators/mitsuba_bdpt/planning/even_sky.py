@@ -19,18 +19,21 @@ from .decision import Decision
 # `furnace_white`.
 SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_GAIN = 1 / 2, 2, 1 << 20, 1.1
 
+# What gains `UNIFORM_GAIN` pays for a pilot in renders so many times as long as those that ask one elsewhere.
+UNIFORM_TIMES = 10
+
 
 def decision(
     prepared: PreparedScene, full: Plan, settings: Settings, samples: int, least: int
 ) -> Decision | None:
     """The decision for a render of so many ``samples`` for which the scene alone suffices.
 
-    A pilot would take too much of it, or is asked by renders of ``least`` samples alone: under an even sky,
+    A pilot, which renders of ``least`` samples ask elsewhere, would take too much of it: under an even sky,
     path tracing alone. (Camera subpaths meet such a sky wherever its light enters, caustics included, and
     light subpaths hardly find the way in.)
     """
     contrast = prepared.emitters.contrast
-    most = max(least, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
+    most = max(UNIFORM_TIMES * least, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
     if samples >= most or not contrast <= EVEN:  # also if it is no number
         return None
     if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):

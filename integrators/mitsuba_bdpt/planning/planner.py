@@ -252,7 +252,7 @@ class Planner:
         self.decided = replace(self.decided, pilots=pilots)
         stands_for = samples / count
         plan = replace(self.full, emission=tables)
-        guiding = self.full.merging or samples >= budget.least_samples(self._prepared.traits, kernels=2)
+        guiding = self.full.merging or budget.predicts_guiding(self._prepared.traits, samples)
 
         def trace() -> Moments:
             seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.asked)
