@@ -300,8 +300,9 @@ def read_only_disk() -> Outcome:
         with mock.patch.object(render, "write_images", write):
             status, text, rendered = _said([scene, "-o", output, "--spp", 2, "--checkpoint", 0])
         same = _listing(folder).items() >= before.items()
-        ok = status == 1 and "error: " in text and rendered and same
+        error = (text.strip().splitlines() or [""])[-1]
+        ok = status == 1 and error.startswith("error: ") and rendered and same
         left = [path.name for path in folder.rglob("*.tmp")]
-        said = re.sub(r"\.\d+\.tmp", ".tmp", text.strip().replace(str(folder), "DISK"))
+        said = re.sub(r"\.\d+\.tmp", ".tmp", error.replace(str(folder), "DISK"))
         said = re.sub(r"(the image is) '.*?'", r"\1 'COPY'", said)
         return Outcome(ok and not left, f"status {status}, {said[:120]}, former image there: {same}")

@@ -146,6 +146,7 @@ def test_sizes_that_are_refused(capsys):
 @pytest.mark.parametrize(
     "arguments",
     [["--size", "16"], ["--size", "0x4"], ["--crop", "1,2,3"], ["--crop", "0,0,0,4"], ["--frames", "3-1"]]
+    + [["--resume", "plain.xml"], ["--resume", "yes"]]
     + [["--frames", "x"], ["--frames", "0-4:0"], ["--threads", "0"]],
     ids=" ".join,
 )

@@ -22,7 +22,7 @@ from ..errors import did_you_mean
 from ..progress import KINDS
 from . import measuring, mistakes
 from .tev import PORT
-from .values import RESUME, crop, definition, frames, number, property_, size, tev_address
+from .values import crop, definition, frames, number, property_, resume, size, tev_address
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -195,7 +195,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
         "(default with --checkpoint) if there is one, must (also --resume alone) or end with an error, never "
         "(begin anew, in place of it)"
     )
-    add("--resume", nargs="?", choices=RESUME, const="must", metavar="WHEN", help=text)
+    add("--resume", nargs="?", type=resume, const="must", metavar="WHEN", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
     add("--statistics", type=Path, metavar="FILE", help=text)
     text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"

@@ -77,6 +77,14 @@ def frames(text: str) -> list[int]:
     return found
 
 
+def resume(text: str) -> str:
+    """One of `RESUME`."""
+    if text not in RESUME:
+        scene = "; write the scene before --resume" if text.lower().endswith(".xml") else ""
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must be {', '.join(RESUME)} or nothing{scene}")
+    return text
+
+
 def tev_address(text: str) -> tuple[str, int]:
     """Host and port of the viewer tev, see `tev.address`."""
     try:
