@@ -38,9 +38,9 @@ MORE_GAIN = 1.02
 
 # Photon-guided BSDF sampling (s = 0) with one sample has to gain this factor in three quarters of the pilot's
 # groups. It removes outliers alone: where 2 is predicted, raw error times time falls by 1.4 to 2.8, and
-# trimmed error times time rises by 1.2 to 1.6. (Of eight pilots in twelve scenes at 4 to 256 samples per
-# pixel none predicts 2.05 to 2.3.)
-GUIDE_GAIN = 2.2
+# trimmed error times time rises by 1.2 to 1.6. (Of eight pilots in seven scenes at 4 to 256 samples per pixel
+# of 128^2 none predicts 2.3 to 3.5; see docs/method/skipping.md.)
+GUIDE_GAIN = 2.5
 
 # A larger number of guided samples has to gain this factor over a smaller one: what guiding cannot help is in
 # no prediction of it.

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..sampling import sobol
 from ..sampling.points import Points
 from ..sampling.sequences import GUIDE, sequence_seed
 from ..scene.prepared import PreparedScene
@@ -23,15 +24,14 @@ from ..transport.isolated_light import MOMENTS, Found, Gauge
 from ..transport.kernel import trace_isolated
 from ..transport.photons import photons_of, trace_guide
 from ..transport.plan import Plan
-from . import moments
 from .moments import FINE, GROUPS, Isolated, tile_of
 
 # Camera samples that look for vertices where s = 0 can be guided: most of their subpaths end at once. Light
 # subpaths that give the photons to measure with, and at most so many that give those of the guide.
 LANES, PHOTONS = 1 << 14, 1 << 16
 
-# An estimate of s = 0 may be as many times as large as what arrives as a render has samples, over this: what
-# a render is not likely to meet is missing from its image, not noise. (One sample in so many is on a path
+# Estimates of s = 0 count up to as many times what arrives as a render has samples, over this: light that a
+# render is not likely to meet is missing from its image, not noise. (One sample in so many is on a path
 # where s = 0 can be guided.)
 SHARE = 16
 
@@ -64,6 +64,15 @@ def measure(
     return Isolated(found, aimed / batch.size, batch.size)
 
 
+def group(lane: mi.UInt32) -> mi.UInt32:
+    """The independent part of the pilot to which a ``lane`` belongs.
+
+    Each of so many neighbours is in another one, in an order by chance: else groups would be columns of films
+    of some widths, and tell of the part of the image that each of them sees.
+    """
+    return (lane + sobol.mix(lane // GROUPS)) % GROUPS
+
+
 # Numbers of a row: an even one, so that Dr.Jit adds it as a packet.
 _WIDTH = MOMENTS + MOMENTS % 2
 
@@ -79,7 +88,7 @@ class Sums:
 
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
         """Add what a ``lane`` found, whose camera sample has this ``position`` on the film."""
-        row = moments.group(lane) * FINE**2 + tile_of(self._region, position)
+        row = group(lane) * FINE**2 + tile_of(self._region, position)
         values = mi.ArrayXd(found.moments + [mi.Float64(0)] * (_WIDTH - MOMENTS))
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
         dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))

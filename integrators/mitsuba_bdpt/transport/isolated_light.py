@@ -37,7 +37,7 @@ _SAME_SIDE = 0.8
 class Gauge:
     """Photons to measure with, those of the ``guide``, and how many subpaths made the former (``count``).
 
-    ``most``: an estimate of s = 0 counts as so many times what arrives at most, and as often more.
+    ``most``: estimates of s = 0 that are larger than so many times what arrives do not count.
     """
 
     photons: Guide
@@ -79,7 +79,8 @@ def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) ->
         # Of all photons in the disc, for which this one stands.
         # Squares, in any unit of radiance, are too large or too small for single precision.
         arriving = mi.Float64(value / size_of(y.flux) * total / (gauge.count * dr.pi * dr.square(radius)))
-        by_hit = dr.minimum(mi.Float64(value / (y.hit * f.pdf_fwd_w)), gauge.most * arriving)
+        by_hit = mi.Float64(value / (y.hit * f.pdf_fwd_w))
+        by_hit = dr.select(by_hit <= gauge.most * arriving, by_hit, 0)
         there = photon_guide.find(gauge.guide, z.si.p)
         pdf = photon_guide.density(gauge.guide, z.si.p, there, y.d)
         ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)
