@@ -684,9 +684,16 @@ MUTANTS = (
     Mutant(
         "media: lamps start outside",
         "scene/light_media.py",
-        "return dr.select(found, number, self._outside)",
-        "return dr.select(found, self._outside, self._outside)",
+        "np.where(asked.found, asked.number, self.outside)",
+        "np.where(asked.found, self.outside, self.outside)",
         ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
+    ),
+    Mutant(
+        "media: lamps partly in fog are in one medium",
+        "scene/light_media.py",
+        "return dr.select(found.found, found.number, number)",
+        "return number",
+        ("tests/images/test_media_edges.py::test_a_lamp_of_which_a_hundredth_is_in_fog",),
     ),
     Mutant(
         "media: null collisions are alike in all channels",
@@ -705,8 +712,8 @@ MUTANTS = (
     Mutant(
         "media: lamps are in no medium",
         "scene/light_media.py",
-        "return dr.select(found, number, self._outside)",
-        "return mi.UInt32(0)",
+        "return space.media.sensor",
+        "return 0",
         (
             "tests/images/test_media_identities.py::test_spots_in_fog[spot]",
             "tests/images/test_media_identities.py::test_spots_in_fog[beam]",
