@@ -22,6 +22,7 @@ from mitsuba_bdpt.transport.batch import Batch
 
 import mitsuba as mi  # isort: skip
 
+from mitsuba_bdpt.host.jit import float64
 from mitsuba_bdpt.measure.endpoints import Camera, disks_of, dot, lamps_of, length2
 from mitsuba_bdpt.measure.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
 from mitsuba_bdpt.measure.recording import stepwise
@@ -83,7 +84,7 @@ class Made:
 
 def rows(v) -> np.ndarray:
     """A Dr.Jit vector as rows, a number as an array, in float64."""
-    return np.asarray(np.array(v), dtype=np.float64).T
+    return float64(v).T
 
 
 def densities(si, to_light, to_camera):

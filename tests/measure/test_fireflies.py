@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import drjit as dr
 import media_parts
 import mitsuba as mi
 import numpy as np
@@ -107,11 +108,23 @@ def box(scale):
     return room
 
 
+def fill_memory():
+    """Leave signalling NaN in the memory that Dr.Jit hands out again."""
+    kept = []
+    for size in np.repeat(1 << np.arange(4, 11), 3000).tolist():
+        kept.append(dr.full(mi.UInt32, 0x7FA00000, size) + dr.opaque(mi.UInt32, 0))
+        dr.eval(kept[-1])
+    dr.sync_thread()
+
+
 @pytest.mark.parametrize("scale", [1, 1e-4])
 def test_replays_add_up_to_what_was_rendered(scale):
     """Rationale: which connection was drawn was told by a distance in units of the scene. Expected: the
     strategies of a camera sample, traced again, add up to what the render put into the pixel, and each splat
-    is found again (the same arithmetic: float32), in a box of two units and in one of a five thousandth."""
+    is found again (the same arithmetic: float32), in a box of two units and in one of a five thousandth. What
+    lies in memory does not matter: steps of lanes that are masked out hold it, and NumPy took a signalling
+    NaN there for an invalid cast, once in four runs of all tests."""
+    fill_memory()
     room = box(scale)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.25})
     _, outliers = recording.render(mi.load_dict(room), integrator, np.full((12, 12, 3), 0.01), 16, 3)

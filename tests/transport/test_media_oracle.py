@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import settings
+from mitsuba_bdpt.host.jit import float64
 from mitsuba_bdpt.measure import endpoints, oracle, recording
 from mitsuba_bdpt.measure.oracle import AREA, POSITION
 from mitsuba_bdpt.run import rendering
@@ -121,9 +122,7 @@ class SensorPoints:
 
     @staticmethod
     def _numbers(p):
-        dr.eval(p)
-        dr.sync_thread()
-        return np.array(p + dr.zeros(mi.Point3f, LANES), dtype=float)
+        return float64(p + dr.zeros(mi.Point3f, LANES))
 
     def completed(self, path, lane: int):
         """``path`` with its point on the sensor."""

@@ -7,11 +7,21 @@ import gc
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .introspection import own_parameters
 
 # Numbers in a row without an emitter after which no more are expected; those of freed ones are used again.
 _GAP = 64
+
+
+def float64(x) -> np.ndarray:
+    """The numbers of an array of Dr.Jit in double precision, those of lanes that are masked out included.
+
+    These hold whatever lay in memory: where it is a signalling NaN, NumPy's cast reports an invalid value.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.array(x, dtype=np.float64)
 
 
 def registered_emitters() -> list[str]:

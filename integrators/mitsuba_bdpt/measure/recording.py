@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..geometry import polarization
-from ..host.jit import evaluated_mode, gc_paused
+from ..host.jit import evaluated_mode, float64, gc_paused
 from ..image import sink
 from ..planning import planner
 from ..run import rendering
@@ -357,10 +357,7 @@ class Recorder(Observer):
     def _numbers(self, x, rows: int = 0):
         """An array of Dr.Jit as one of NumPy, with an entry for each lane."""
         shape = (rows, self._count) if rows else (self._count,)
-        # Finished first: what a kernel divides by zero meanwhile NumPy would take for its own cast's.
-        dr.eval(x)
-        dr.sync_thread()
-        return np.broadcast_to(np.array(x, dtype=float).reshape(*shape[:-1], -1), shape).copy()
+        return np.broadcast_to(float64(x).reshape(*shape[:-1], -1), shape).copy()
 
     def begin(self):
         """Nothing found yet."""
