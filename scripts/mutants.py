@@ -515,6 +515,27 @@ MUTANTS = (
         ("tests/planning/test_pilot.py::test_rays_of_light_subpaths_are_counted_for_each",),
     ),
     Mutant(
+        "pilot: paths that could be guided stay in where their gain is not predicted",
+        "planning/pilot.py",
+        "kernel.without_isolated = found is not None or (everything.guidable and not guiding)",
+        "kernel.without_isolated = found is not None",
+        ("tests/images/test_guided_hits.py::test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot",),
+    ),
+    Mutant(
+        "pilot: each BSDF counts as a kind of its own",
+        "planning/budget.py",
+        "SAMPLES_PER_KIND * asked.kinds",
+        "SAMPLES_PER_KIND * asked.count",
+        ("tests/run/test_first_image.py::test_rooms_of_many_bsdfs_ask_a_pilot",),
+    ),
+    Mutant(
+        "pilot: what looks better has no reason beside it",
+        "planning/choice.py",
+        "    if gain <= 1:\n",
+        "    if gain <= 1 or chosen.candidate.light_paths:\n",
+        ("tests/planning/test_pilot.py::test_what_looks_better_says_why_it_is_not_chosen",),
+    ),
+    Mutant(
         "rounding: rays start on the surface",
         "geometry/rounding.py",
         "OFFSET_ULPS = 32\n",

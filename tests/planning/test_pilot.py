@@ -1117,13 +1117,9 @@ def test_short_renders_of_a_lens_are_path_tracing_alone():
 
 
 def test_pilots_that_do_not_measure_guided_hits():
-    """Rationale: outliers of paths that could be guided hide how candidates differ, measured or not. (In a
-    room of 24 small lamps and glass balls they made a pilot choose what has a third of the efficiency.)
-
-    Expected: a pilot that does not predict guided s = 0 has no moments of it, and guides nothing; its other
-    moments are those of one that does, but for the light of these paths in the brightness of a place (a
-    few percent; with them in the samples path tracing alone has more than twice the variance). Joined with
-    one that does, the result has its moments.
+    """Expected: a pilot that does not predict guided s = 0 has no moments of it, and guides nothing; its
+    other moments are those of one that does, but for the light of these paths in the brightness of a place (a
+    few percent). Joined with one that does, the result has its moments.
     """
     target = caustic()
     render = of(target)
