@@ -138,7 +138,8 @@ class AreaEmitters(Group):
         mapped = rows(how, None, lambda h: h is _Sampled.BY_MAP)
         by_shape = rows(how, None, lambda h: h is _Sampled.BY_SHAPE)
         self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))
-        self._redrawn = Mask(rows(how, None, lambda h: h in (_Sampled.BY_MAP, _Sampled.BY_SHAPE)))
+        self.redraws = rows(how, False, lambda h: h in (_Sampled.BY_MAP, _Sampled.BY_SHAPE))
+        self._redrawn = Mask([e and r for e, r in zip(emitters, self.redraws, strict=True)])
         self._textured = TexturedPoints(emitters, spheres, mapped)
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         self._surfaces = Surfaces(emitters, context, spheres, by_shape, self._textured)
@@ -192,8 +193,10 @@ class AreaEmitters(Group):
         """
         # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
         ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
-        pdf_w = emitter.pdf_direction(it, ds, active)
         by_area = mi.Bool(False)
+        if self._redrawn.any:
+            by_area |= self._redrawn.at(index, active)
+        pdf_w = emitter.pdf_direction(it, ds, active & ~by_area if self._redrawn.any else active)
         if self.any_inner:
             sphere = look_up(self._spheres, index, active)
             inside = dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius)
@@ -202,8 +205,6 @@ class AreaEmitters(Group):
                 # From outside the near half is sampled alone, of one that glows inwards the dark one.
                 beyond = dr.dot(ds.p - sphere.center, ds.d) > 0
                 pdf_w = dr.select((sphere.inner_radius > 0) & ~inside & beyond, 0, pdf_w)
-        if self._redrawn.any:
-            by_area |= self._redrawn.at(index, active)
         cos = dr.abs(dr.dot(ds.d, ds.n))
         pdf_a = self._own_pdf_a(index, ds.uv, active)
         pdf_w = dr.select(by_area, pdf_a * dr.square(ds.dist) / cos, pdf_w)

@@ -75,6 +75,8 @@ class Emitters:
         self._group = mi.UInt32([present.index(t) for t in types])
         self._starts = Mask([t.supports_emission for t in types])
         self._lights = Mask([t.supports_next_event for t in types])
+        redrawn = [group.redraws for group in self.groups if group.redraws]
+        self._asks = Mask([not any(of[i] for of in redrawn) for i in range(self.count)])
         self.disks = next((group.disks for group in self.groups if group.at_infinity), None)
         dr.make_opaque(self._group, self._pmf, self._inverse)
 
@@ -289,7 +291,8 @@ class Emitters:
         """Sample y_0 for the camera vertex ``si`` with ``u`` in [0, 1)^2 (reused for selection)."""
         chosen, u_x = self._select(u.x, active)
         u = mi.Point2f(u_x, u.y)
-        ds, weight = chosen.emitter.sample_direction(si, u, active)
+        asked = active if self._asks.all else self._asks.at(chosen.index, active)
+        ds, weight = chosen.emitter.sample_direction(si, u, asked)
         direct = self._ask(
             lambda group, mask: group.complete_direct(chosen, ds, weight, si, u, mask),
             self._supporting("supports_next_event"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -41,7 +42,9 @@ class Group:
     `is_hittable` does not say otherwise); ``supports_next_event``, next-event estimation can choose it;
     ``supports_emission``, light subpaths can start from it; ``connectible_to_sensor``, a point that emission
     has chosen can be joined with a sensor; ``at_infinity``, its light subpaths start there, on its ``disks``.
-    ``guidable``, tables can guide its emission, by a ``guide`` where one does.
+    ``guidable``, tables can guide its emission, by a ``guide`` where one does. ``redraws``: for each
+    emitter of the scene, whether its points of next-event estimation are chosen here and not by Mitsuba
+    (empty: of none).
     ``limits`` says why it does not support all. Methods of what a group does not support are never called.
     Lanes that are not ``active`` are of other groups: what is returned for them has no meaning.
     """
@@ -52,6 +55,7 @@ class Group:
     connectible_to_sensor = True
     at_infinity = False
     guidable = False
+    redraws: Sequence[bool] = ()
     limits = ""
     guide: EmissionGuide | None = None
 
@@ -128,7 +132,8 @@ class Group:
         """A sample of next-event estimation for the camera vertex ``si``, from ``u``.
 
         ``ds``, ``weight``: what Mitsuba's ``sample_direction`` returned, one call for all groups:
-        they must not be changed. Densities of the result include the selection; ``met`` stays None.
+        they must not be changed (0 where the group ``redraws``). Densities of the result include the
+        selection; ``met`` stays None.
         """
         raise NotImplementedError(f"{type(self).__name__} has no complete_direct")
 

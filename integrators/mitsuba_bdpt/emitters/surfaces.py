@@ -81,9 +81,10 @@ class Surfaces:
         if self.own.all:
             ps = self._own_point(index, shared.time, u, active)
         else:
-            ps, _ = chosen.emitter.sample_position(shared.time, u, active)
+            mask = self.own.at(index, active)
+            asked = active & ~mask if self.own.any else active
+            ps, _ = chosen.emitter.sample_position(shared.time, u, asked)
             if self.own.any:
-                mask = self.own.at(index, active)
                 ps = dr.select(mask, self._own_point(index, shared.time, u, mask), ps)
         ps = self._upright(ps, index, active)
         return ps, self.geometric_normal(ps, index, u, active)
