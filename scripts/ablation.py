@@ -9,14 +9,13 @@ written after each row.
 Seconds of the kernels alone, by Dr.Jit's own events, stand beside those of the clock: the rest is Python,
 which records every pass anew. Kernels with rays are OptiX's, which tells nothing of registers: ``--profile``
 makes the renders of `PROFILED` one by one for a profiler that waits for the program's word (``ncu
---profile-from-start off``). Of each kernel the PTX is counted, kept in an archive beside the file and, where
-ptxas takes it, assembled.
+--profile-from-start off``). The PTX of each kernel is counted, kept in an archive beside the file, and
+assembled for its own ``.target`` if there is a ptxas on the PATH that does so.
 """
 
 from __future__ import annotations
 
 import contextlib
-import glob
 import itertools
 import json
 import multiprocessing
@@ -39,6 +38,7 @@ import repository
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.host.versions import versions
 from mitsuba_bdpt.image.accumulator import Accumulator
+from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.run import schedule
 from mitsuba_bdpt.transport import inputs
 from mitsuba_bdpt.transport.counters import COUNTERS, Counters
@@ -174,7 +174,7 @@ class Subject:
         return row
 
     def samples(self, spp: int) -> int:
-        """Of the image, at so many per pixel."""
+        """Number of samples of the image at ``spp`` samples per pixel."""
         return int(self.scene.sensors()[0].film().size().numpy().prod()) * spp
 
 
@@ -253,30 +253,27 @@ def described(kernel: dict) -> dict:
 
 
 def assembled(code: str) -> dict:
-    """What ptxas says of PTX, or its first error; empty where there is no ptxas or no PTX."""
-    places = (
-        "/usr/local/cuda*/bin/ptxas",
-        "/opt/*/.venv/lib/python3*/site-packages/triton/backends/nvidia/bin/ptxas",
-    )
-    tool = shutil.which("ptxas") or next((found for p in places for found in glob.glob(p)), None)
-    if tool is None or ".target" not in code:
+    """Registers and stack of a kernel as ptxas states them; empty where it does not assemble the PTX.
+
+    It does not assemble kernels of OptiX, whose intrinsics it does not know.
+    """
+    tool, target = shutil.which("ptxas"), re.search(r"^\.target\s+(\w+)", code, re.MULTILINE)
+    if tool is None or target is None or "_optix_" in code:
         return {}
     with tempfile.NamedTemporaryFile("w", suffix=".ptx") as file:
         file.write(code)
         file.flush()
-        command = [tool, "-v", "-arch=sm_90", file.name, "-o", "/dev/null"]
+        command = [tool, "-v", f"-arch={target[1]}", file.name, "-o", "/dev/null"]
         try:
             said = subprocess.run(command, capture_output=True, text=True, timeout=60).stderr
         except subprocess.TimeoutExpired:
-            return {"ptxas": "took more than a minute"}
+            return {}
     numbers = {
         "registers": r"Used (\d+) registers",
         "stack_bytes": r"(\d+) bytes stack frame",
         "spilled_bytes": r"(\d+) bytes spill stores",
     }
     found = {name: re.findall(pattern, said) for name, pattern in numbers.items()}
-    if not found["registers"]:
-        return {"ptxas": next((line for line in said.splitlines() if "rror" in line), said)[:200]}
     return {name: max(map(int, values)) for name, values in found.items() if values}
 
 
@@ -411,6 +408,13 @@ def recorded(options, jobs: list[tuple], rows: dict) -> dict:
     return told | {"software": versions(), "rows": lines}
 
 
+def one_row_per_line(found: dict) -> str:
+    """Format what `recorded` returns as JSON with one row per line."""
+    head = json.dumps({name: value for name, value in found.items() if name != "rows"}, indent=1)
+    rows = ",\n  ".join(map(json.dumps, found["rows"]))
+    return f'{head[:-2]},\n "rows": [\n  {rows}\n ]\n}}\n'
+
+
 def measure(options) -> None:
     """Measure all ways in all scenes and write the file."""
     mi.set_variant(options.variant)
@@ -418,7 +422,7 @@ def measure(options) -> None:
     saved: set[str] = set()
 
     def record(rows: dict) -> None:
-        options.output.write_text(json.dumps(recorded(options, jobs, rows), indent=1) + "\n")
+        options.output.write_text(one_row_per_line(recorded(options, jobs, rows)))
         with ZipFile(options.output.with_suffix(".zip"), "a", ZIP_DEFLATED) as archive:
             for row in rows.values():
                 for name, one in row.get("kernels", {}).items():
@@ -460,17 +464,11 @@ def page(found: dict) -> str:
         [way, *(_nanoseconds(rows[way, s], rows["path", s]) for s in scenes)] for way in ways
     ]
     kernels = [["", *scenes]] + [[way, *(_kernel(rows[way, s]) for s in scenes)] for way in ways]
-    return "\n".join(_table(lines) for lines in (blocks, kernels))
-
-
-def _table(lines: list[list[str]]) -> str:
-    """As `measure.tables.table`, which needs packages of the extra ``[measure]``."""
-    head, *rest = lines
-    return "".join("| " + " | ".join(line) + " |\n" for line in (head, ["---"] * len(head), *rest))
+    return "\n".join(table(head, rest) for head, *rest in (blocks, kernels))
 
 
 def _nanoseconds(row: dict, path: dict) -> str:
-    """Of a sample by the clock and of the kernels alone, and how many times those of `path`."""
+    """Format the time per sample by the clock and of the kernels, and the ratio to the kernels of `path`."""
     if not row["measured"]:
         return row.get("failed", "not measured").splitlines()[0][:40]
     clock, kernels = row["ns_seconds"], row["ns_kernel_seconds"]
@@ -479,7 +477,7 @@ def _nanoseconds(row: dict, path: dict) -> str:
 
 
 def _kernel(row: dict) -> str:
-    """Of the kernel that ran longest: lines of code, bytes of local arrays, registers and stack if known."""
+    """Format lines and bytes of local arrays of the slowest kernel, and registers and stack if known."""
     if not row["kernels"]:
         return "–"
     one = max(row["kernels"], key=lambda k: k["seconds"])

@@ -1,9 +1,8 @@
 """What every test needs: the package imported first, then Mitsuba with a variant."""
 
-import gc  # noqa: I001  (the package chooses the LLVM library; it must precede mitsuba)
-
-import mitsuba_bdpt.workers
+import mitsuba_bdpt.workers  # noqa: I001  (it chooses the LLVM library; it must precede mitsuba)
 import mitsuba as mi
+import leftovers
 import pytest
 import variants
 from mitsuba_bdpt.host.jit import registered_emitters
@@ -15,17 +14,12 @@ mi.set_variant(VARIANT)
 
 @pytest.fixture(autouse=True)
 def _variant():
-    """Give every test the same variant, whatever the one before it has set, and no scene of its own.
-
-    An exception that a test keeps, or failed with, keeps the test's scenes until the cycle collector runs, at
-    any time, and calls of later tests visit their emitters.
-    """
+    """Give every test the same variant, whatever the one before it has set, and free its scenes."""
     mi.set_variant(VARIANT)
     before = registered_emitters()
     yield
     mi.set_variant(VARIANT)
-    if registered_emitters() != before:
-        gc.collect()
+    leftovers.collect(before)
 
 
 @pytest.fixture

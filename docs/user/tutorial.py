@@ -1,10 +1,12 @@
 # %% [markdown]
 # # Tutorial
 #
-# This page is a notebook, [tutorial.ipynb](tutorial.ipynb), which runs in Jupyter and in Colab and needs no other file:
+# This page is a notebook, [tutorial.ipynb](tutorial.ipynb), which runs in Jupyter and needs no other file (not tried in Colab):
 #
 #     pip install mitsuba-bdpt matplotlib jupyterlab
 #     jupyter lab tutorial.ipynb
+#
+# `mitsuba-bdpt` is not on the package index yet: until it is, replace it by the path of a checkout.
 
 # %%
 import json

@@ -102,9 +102,9 @@ class Settings:
         "what may be left out",
         """``none``: do everything. ``impossible``: leave out what the scene cannot use, draw one connection
         per camera vertex, drop small contributions by unbiased Russian roulette. ``auto``: as ``impossible``,
-        and in renders of 2^14 samples or more (in scenes of ten BSDFs or more: 2^16 for each kind of BSDF) a
-        pilot, or the scene alone where that tells, chooses what pays. What a pilot finds is remembered for
-        later renders of the scene, until its parameters are edited.""",
+        and in renders of 2^14 samples or more (in scenes of ten BSDFs or more: about 2^16 for each kind of
+        BSDF) a pilot, or the scene alone where that tells, chooses what pays. What a pilot finds is
+        remembered for later renders of the scene, until its parameters are edited.""",
         choices=SKIP,
     )
     light_paths: float | str = _parameter(

@@ -72,7 +72,7 @@ def test_limits_of_the_process_count_what_it_takes_already(kind, words):
 def test_what_was_asked_for_counts():
     memory.set_limit(GIB / 4)
     try:
-        assert memory.available() == memory.Available(GIB / 4, "what was asked for (--memory)")
+        assert memory.available() == memory.Available(GIB / 4, "the limit set by --memory")
     finally:
         memory.set_limit(None)
     assert memory.available().bytes > GIB / 4

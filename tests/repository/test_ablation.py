@@ -6,6 +6,7 @@ import ablation
 import gpu
 import mitsuba as mi
 import pytest
+import repository
 
 TINY = [
     "--ablation",
@@ -65,6 +66,40 @@ def test_tables_compare_with_path():
     text = ablation.page({"rows": [row("path", 2.0), row("a", 5.0), failed]})
     assert "| path | 4, 2 (1.00x) |" in text and "| a | 10, 5 (2.50x) |" in text
     assert "| b | out of memory |" in text and "10 lines, 64 bytes, 96 registers, first 3 s" in text
+
+
+@pytest.mark.parametrize("target", ["sm_70", "sm_90"])
+def test_kernels_are_assembled_for_their_own_target(target, tmp_path, monkeypatch):
+    """Expected: the ptxas on the PATH gets the architecture of the PTX, and its figures are in the row; those
+    of OptiX, and all where there is no ptxas, have none."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    code = f".version 6.0\n.target {target}\n"
+    assert ablation.assembled(code) == {}
+    tool = tmp_path / "ptxas"
+    tool.write_text(
+        f'#!/bin/sh\n[ "$2" = -arch={target} ] || exit 1\n'
+        'echo "8 bytes stack frame, 4 bytes spill stores, 4 bytes spill loads" >&2\n'
+        'echo "Used 96 registers" >&2\n'
+    )
+    tool.chmod(0o755)
+    assert ablation.assembled(code) == {"registers": 96, "stack_bytes": 8, "spilled_bytes": 4}
+    assert ablation.assembled(code + "call (x), _optix_trace_32, (y);") == {}
+    assert ablation.assembled("; LLVM") == {}
+
+
+def test_a_file_has_one_row_per_line():
+    """Expected: JSON of the same content, each row on a line of its own; so is the recorded one, without
+    what ptxas said of it."""
+    found = {
+        "size": 16,
+        "software": {"a": "1"},
+        "rows": [{"way": "a", "kernels": [{"hash": "h"}]}, {"way": "b"}],
+    }
+    text = ablation.one_row_per_line(found)
+    assert json.loads(text) == found
+    assert text.count('\n  {"way"') == 2
+    recorded = (repository.ROOT / "docs" / "reports" / "cuda_ablation.json").read_text()
+    assert ablation.one_row_per_line(json.loads(recorded)) == recorded and "ptxas" not in recorded
 
 
 def test_code_of_kernels_is_counted():

@@ -30,7 +30,7 @@ def is_needed(kept: Snapshot, spp: int) -> bool:
         return False
     if kept.spp >= spp:
         raise CommandError(
-            f"resume: the checkpoint has {kept.spp} samples per pixel already; ask for more by --spp, or "
+            f"resume: the checkpoint has {kept.spp} samples per pixel already; increase --spp, or "
             f"{BEGIN_ANEW}."
         )
     return True

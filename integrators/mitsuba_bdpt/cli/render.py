@@ -68,7 +68,7 @@ def run(options: Namespace) -> int:
 
 
 def _run(options: Namespace, ending: Ending) -> int:
-    """`run`, whose errors are raised."""
+    """Render like `run`, and raise errors."""
     check_file(options.scene)  # before a folder is made for its image
     jobs = jobs_of(options)
     for job in jobs:
@@ -225,7 +225,7 @@ def explain(options: Namespace) -> int:
 
 
 def _explain(options: Namespace) -> int:
-    """`explain`, whose errors are raised."""
+    """Print the report of `explain`, and raise errors."""
     scene, integrator, _ = loaded(options)
     sensor = choose_sensor(scene, options.sensor)
     say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))

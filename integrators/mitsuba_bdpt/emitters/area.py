@@ -102,7 +102,7 @@ class _Sampled(Enum):
 
     @staticmethod
     def of(emitter, ask_shapes: bool) -> _Sampled:
-        """That of an emitter; ``ask_shapes`` see `Context`."""
+        """Choose the sampling of an emitter's points. ``ask_shapes``: see `Context`."""
         if not is_textured(emitter):
             return _Sampled.UNIFORMLY
         if not is_sampled_by_texture(emitter):

@@ -53,7 +53,7 @@ def peak() -> int | None:
 
 def _limits() -> Iterator[Available]:
     for most in _asked:
-        yield Available(most, "what was asked for (--memory)")
+        yield Available(most, "the limit set by --memory")
     if hasattr(os, "sysconf"):  # not on Windows
         yield Available(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), "the machine's memory")
     for file in _control_groups():

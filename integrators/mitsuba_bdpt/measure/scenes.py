@@ -184,7 +184,7 @@ class DictionaryScene(MeasuredScene):
 
     @classmethod
     def named_by_content(cls, dictionary: Mapping[str, Any]) -> DictionaryScene:
-        """One whose name is another for another content."""
+        """Name a dictionary by a hash of its content."""
         unnamed = cls("scene", dictionary)
         return cls(f"scene_{unnamed.sha256[:8]}", dictionary)
 

@@ -27,7 +27,7 @@ def ranged(found: Summary) -> str:
 
 
 def said(figure, form=ranged) -> str:
-    """A figure in words, or why there is none."""
+    """Format a figure, or the reason for which there is none."""
     try:
         return form(figure())
     except NotJudged as why:

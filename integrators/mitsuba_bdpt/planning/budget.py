@@ -51,7 +51,7 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
 
 
 def least_samples(traits: Traits) -> int:
-    """How many samples a render needs for a pilot; ``traits`` of its scene's BSDFs."""
+    """Least number of samples of a render for which a pilot runs. ``traits``: of the scene's BSDFs."""
     asked = traits.asked
     if not asked.many:
         return LEAST_SAMPLES

@@ -65,10 +65,10 @@ def measure(
 
 
 def group(lane: mi.UInt32) -> mi.UInt32:
-    """The independent part of the pilot to which a ``lane`` belongs.
+    """Return the independent part of the pilot to which a ``lane`` belongs.
 
-    Each of so many neighbours is in another one, in an order by chance: else groups would be columns of films
-    of some widths, and tell of the part of the image that each of them sees.
+    Neighbouring lanes belong to different parts, in random order: else the parts would be columns of films
+    of some widths, and each would measure its own region of the image.
     """
     return (lane + sobol.mix(lane // GROUPS)) % GROUPS
 

@@ -227,7 +227,7 @@ def shares(lost: LostLight, mean: float) -> dict[int, float]:
 def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
     """`shares` before the first pass, by the ``mean`` intensity that a pilot has measured.
 
-    None if they are too close to `WORTH_A_WORD` for the noise of a pilot: what it says may be twice as much.
+    Empty if their sum is below twice `WORTH_A_WORD`, since the estimate of a pilot may be twice too large.
     """
     share = lost.intensity / (mean + lost.intensity)
     if not share >= 2 * WORTH_A_WORD:

@@ -137,7 +137,7 @@ class _Asked:
 
     @classmethod
     def of(cls, side: boundaries.NearSide, count: int) -> _Asked:
-        """Those of ``count`` rays."""
+        """Evaluate ``side`` for ``count`` rays."""
         dr.eval(side)  # one kernel
         return cls(*(np.broadcast_to(np.array(x), count) for x in (side.number, side.found, side.escaped)))
 
@@ -236,7 +236,7 @@ def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int) -> s
 
 
 def _counted(space: Space, lines: boundaries.Lines, parts: int) -> list[np.ndarray]:
-    """Of each of so many ``parts`` of the ``lines``: boundaries compared, and how many of them disagree."""
+    """Count compared and disagreeing boundaries per part; ``lines`` are split into ``parts`` equal ones."""
     found = boundaries.disagreements(space, lines)
     dr.eval(found)  # one kernel
     return [np.array(x).reshape(parts, -1).sum(1) for x in found]

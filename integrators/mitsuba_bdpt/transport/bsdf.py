@@ -131,7 +131,7 @@ class Asked:
 
     @property
     def kinds(self) -> int:
-        """How many structures they have; BSDFs of one structure share the functions of a kernel."""
+        """Number of distinct BSDF structures. BSDFs of one structure share the functions of a kernel."""
         return len({draws.structure(bsdf) for bsdf in self.bsdfs})
 
     def __call__(self, bsdf, question, *args):
