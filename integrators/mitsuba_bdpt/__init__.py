@@ -9,7 +9,7 @@ import sys as _sys
 from pathlib import Path as _Path
 
 from ._version import __version__
-from .errors import CommandError, UnsupportedError, UsageError, UsageTypeError
+from .errors import CommandError, FailureError, UnsupportedError, UsageError, UsageTypeError
 from .host import llvm as _llvm
 from .host.llvm import LLVMNotFoundError
 from .progress import Bar, Display, Lines, Percentages
@@ -19,6 +19,7 @@ __all__ = [
     "Bar",
     "CommandError",
     "Display",
+    "FailureError",
     "LLVMNotFoundError",
     "Lines",
     "PassReport",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 
 class UsageError(ValueError):
@@ -32,7 +32,7 @@ class CommandError(UsageError):
 
 
 class FailureError(RuntimeError):
-    """A command could not do what it was rightly asked for: a full disk, a cluster that is gone."""
+    """A command or a measurement failed for a reason that is not in its arguments, such as a full disk."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -49,10 +49,15 @@ def behind(error: BaseException, *kinds: type[BaseException]) -> BaseException |
 
     Mitsuba and Dr.Jit make a ``RuntimeError`` of all that is raised while they render or record.
     """
+    return next((found for found in chain(error) if isinstance(found, kinds)), None)
+
+
+def chain(error: BaseException) -> Iterator[BaseException]:
+    """Yield ``error`` and the exceptions that were wrapped into it, see `behind`."""
     found: BaseException | None = error
-    while found is not None and not isinstance(found, kinds):
+    while found is not None:
+        yield found
         found = (found.__cause__ or found.__context__) if isinstance(found, RuntimeError) else None
-    return found
 
 
 def message(error: BaseException) -> str:

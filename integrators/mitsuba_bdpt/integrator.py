@@ -112,6 +112,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
     """``None``, or a function that is called after each pass."""
 
     def __init__(self, props: mi.Properties):
+        tracebacks.install()
         check_variant()
         settings = read_settings(props)
         mi.SamplingIntegrator.__init__(self, props)
@@ -310,8 +311,7 @@ def _class_of_variant():
 def register():
     """Register the plugin ``bdpt`` for the current variant, for all that are set later, and for scalar_rgb.
 
-    Mitsuba's parser queries the type of every plugin in scalar_rgb, whatever the current variant. Tracebacks
-    of ``mi.render`` end with the message of the plugin, see `tracebacks`.
+    Mitsuba's parser queries the type of every plugin in scalar_rgb, whatever the current variant.
     """
 
     def register_variant(old=None, new=None):
@@ -325,4 +325,3 @@ def register():
     scalar.register_integrator("bdpt", lambda props: check_variant("scalar_rgb"))
     mi.detail.add_variant_callback(register_variant)
     register_variant()
-    tracebacks.install()

@@ -12,7 +12,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from typing import Any
 
-from .errors import CommandError
+from .errors import CommandError, FailureError
 
 ANSWERS_WITHIN = 3.0
 """Seconds that a scheduler may take to answer."""
@@ -153,7 +153,7 @@ def _result(future, index: int):
         raise
     except Exception as error:
         text = str(error) or type(error).__name__
-        raise RuntimeError(f"part {index} failed on the cluster: {text}") from error
+        raise FailureError(f"part {index} failed on the cluster: {text}") from error
 
 
 def worker_count(client) -> int:

@@ -20,6 +20,7 @@ import pytest
 import rendered
 from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.errors import FailureError
 from mitsuba_bdpt.files.loading import load
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.workers import connected, results
@@ -227,7 +228,7 @@ def test_parts_that_have_come_are_kept(workers, tmp_path, monkeypatch, capsys, c
 
     def broken(*given):
         yield from sorted(original(*given))[1:][:come]
-        raise RuntimeError("part 7 failed on the cluster: no memory")
+        raise FailureError("part 7 failed on the cluster: no memory")
 
     monkeypatch.setattr(cluster, "results", broken)
     assert main(arguments(workers, tmp_path / "a.exr")) == 1

@@ -275,6 +275,7 @@ def test_statistics_are_a_file(capsys):
 
 
 def test_plain_values_are_json():
+    """Expected: statistics become values that JSON knows: non-finite numbers None, paths and others text."""
     odd = {"a": [math.inf, 1.5, (np.float64(2), np.float32(3))], 4: None, "b": {"c": Path("x")}, "d": True}
     assert render.plain(odd) == {"a": [None, 1.5, [2.0, "3.0"]], "4": None, "b": {"c": "x"}, "d": True}
 

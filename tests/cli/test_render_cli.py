@@ -456,6 +456,13 @@ def test_integrators_that_must_develop_their_image_render_too(scene, kind, time)
     np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
 
 
+def wrapped(error):
+    """An error as Dr.Jit raises it for one in the body of a loop."""
+    found = RuntimeError("drjit.while_loop(): encountered an exception (see above).")
+    found.__cause__ = error
+    return found
+
+
 @pytest.mark.parametrize(
     ("error", "status"),
     [
@@ -464,8 +471,13 @@ def test_integrators_that_must_develop_their_image_render_too(scene, kind, time)
         (FailureError("gone"), 1),
         (OSError(errno.EIO, "Input/output error", "a.exr"), 1),
         (OSError(errno.ENOENT, "No such file or directory", "drive/a.exr"), 1),
-        (RuntimeError("jit_malloc(): out of memory"), 1),
+        (
+            RuntimeError("jit_malloc(): out of memory! Could not allocate 9 bytes (backend=llvm, shared=0)."),
+            1,
+        ),
+        (wrapped(RuntimeError("jit_malloc(): out of memory! Could not allocate 9 bytes.")), 1),
         (MemoryError(), 1),
+        (wrapped(MemoryError()), 1),
     ],
 )
 def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, error, status):
@@ -479,13 +491,22 @@ def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, 
     assert main(["render", str(scene), "-o", "a.exr"]) == status
     *_, last = capsys.readouterr().err.splitlines()
     assert last.startswith("error: ") and "Traceback" not in last
+    lacking = any("memory" in repr(found).lower() for found in (error, error.__cause__))
+    assert ("not enough memory" in last) == lacking
 
 
-def test_a_bug_shows_its_traceback(scene, monkeypatch):
-    """Expected: an error that names nothing of the user's is raised."""
-    monkeypatch.setattr(render, "render", lambda *_: {}["bug"])
-    with pytest.raises(KeyError, match="bug"):
+@pytest.mark.parametrize("error", [KeyError("bug"), RuntimeError("bug"), wrapped(RuntimeError("bug"))])
+def test_a_bug_shows_its_traceback(scene, monkeypatch, error):
+    """Rationale: a bug in the code that Dr.Jit records is a RuntimeError, too. Expected: an error that names
+    nothing of the user's, nor a lack of memory, is raised as it is."""
+
+    def broken(*_):
+        raise error
+
+    monkeypatch.setattr(render, "render", broken)
+    with pytest.raises(type(error)) as caught:
         main(["render", str(scene), "-o", "a.exr"])
+    assert caught.value is error
 
 
 @pytest.mark.parametrize("kind", ["path", "ptracer"])

@@ -70,6 +70,7 @@ def test_limits_of_the_process_count_what_it_takes_already(kind, words):
 
 
 def test_what_was_asked_for_counts():
+    """Expected: a limit that was set is the least of all, until it is taken back."""
     memory.set_limit(GIB / 4)
     try:
         assert memory.available() == memory.Available(GIB / 4, "the limit set by --memory")

@@ -19,6 +19,10 @@ MISTAKES = {
 
 # A cell of a notebook, run by IPython without one, and one whose error has nothing to do with the plugin.
 IN_IPYTHON = """
+import sys
+hook = sys.excepthook
+import mitsuba_bdpt
+assert sys.excepthook is hook, "importing the package has changed it"
 import IPython
 shell = IPython.core.interactiveshell.InteractiveShell.instance()
 shell.run_cell('''
@@ -63,7 +67,7 @@ def test_other_tracebacks_are_as_they_were(capsys):
 
 def test_the_last_line_in_a_notebook():
     """Rationale: IPython does not use `sys.excepthook`. Expected: the message below its traceback, and other
-    errors as ever.
+    errors as ever; before the first integrator the hook of scripts is Python's.
     """
     done = subprocess.run(
         [sys.executable, "-c", IN_IPYTHON], capture_output=True, text=True, timeout=PATIENCE

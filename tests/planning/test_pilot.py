@@ -589,6 +589,18 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     assert met == {"", "light", "more", "connections=one", "without"}
 
 
+@pytest.mark.parametrize("light", [(0, 0), (0, 1), (1 / 4, 0)])
+def test_a_row_without_light_subpaths_has_a_reason_or_none(light):
+    """Rationale: the ratio of two numbers of light subpaths has no logarithm where one is 0. Expected: a row
+    with light subpaths names the gain that they need; there is no such rule for one without."""
+    row, chosen = (
+        choice.Prediction(Configuration(n, "none", 1, 1), cost=1.0, variance=v)
+        for n, v in zip(light, (1.0, 1.1), strict=True)
+    )
+    assert ("light subpaths have to gain" in choice.why_not(row, chosen)) == bool(light[0])
+    assert light[0] or not choice.why_not(row, chosen)
+
+
 @pytest.mark.parametrize("name, depth", [("veach_mis", 3), ("thin_lens", 8)])
 def test_explained_tables_say_why(name, depth):
     """Expected: in the text of `explain` the first candidate of the table is the chosen one, and those that

@@ -258,6 +258,29 @@ def test_statements_are_compared_with_answers(name):
             bdpt.render(scene, spp=1)
 
 
+class Mistyped(Halves):
+    """Lacks the parameter ``active`` of Mitsuba's method."""
+
+    def eval(self, si):
+        return mi.Spectrum(si.uv.x)
+
+
+class Buggy(Halves):
+    """Fails in `eval`."""
+
+    def eval(self, si, active=True):
+        raise RuntimeError("a bug")
+
+
+@pytest.mark.parametrize(("kind", "words"), [(Mistyped, r"takes 2 positional"), (Buggy, "a bug")])
+def test_a_method_that_fails_is_not_taken_for_one_that_is_not_there(kind, words):
+    """Rationale: a wrong signature went without a check, and without a word. Expected: its error."""
+    mi.register_texture(f"own_{kind.__name__}", kind)
+    scene = mi.load_dict(room(thing=lamp({"type": f"own_{kind.__name__}"})))
+    with pytest.raises((TypeError, RuntimeError), match=words):
+        check_plugins(scene, scene.sensors()[0])
+
+
 def test_mitsubas_own_plugins_are_not_asked(monkeypatch):
     """Expected: nothing is asked in a scene of Mitsuba's plugins, though the process knows others; one of the
     user's is asked once for all renders, and again after an edit."""

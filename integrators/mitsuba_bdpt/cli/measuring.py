@@ -6,7 +6,6 @@ The room `measure` is imported when one of them runs, since it needs packages th
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib.util
 import sys
 from argparse import Namespace
@@ -16,7 +15,7 @@ from pathlib import Path
 from ..errors import CommandError
 from ..measure import options
 from . import mistakes
-from .values import property_
+from .values import property_, within
 
 NEEDED = ("colour", "flip_evaluator", "matplotlib", "pyarrow", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
@@ -83,16 +82,7 @@ def _parsed(bounds):
     """What argparse takes for these bounds: choices, or a type."""
     if isinstance(bounds, options.Choice):
         return bounds.names
-    if isinstance(bounds, type):
-        return bounds
-
-    def parse(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            if bounds.holds(value := bounds.kind(text)):
-                return value
-        raise argparse.ArgumentTypeError(f"got {text!r}, which must be {bounds}")
-
-    return parse
+    return bounds if isinstance(bounds, type) else within(bounds)
 
 
 SCENES = "scene files, or names in PROJECT/scenes"

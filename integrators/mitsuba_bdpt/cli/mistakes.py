@@ -9,7 +9,8 @@ Usage errors, `USAGE`, name something that the user gave; the same command would
 * ``RuntimeError`` of Mitsuba's parser: about a scene's file, an unknown plugin, or its parameters; where it
   holds the traceback of a plugin in Python, only if that ends in one of the first.
 
-Failures, `FAILURE`, may not happen again: `errors.FailureError`, ``MemoryError`` and other ``OSError``.
+Failures, `FAILURE`, may not happen again: `errors.FailureError`, other ``OSError``, ``MemoryError`` and the
+``RuntimeError`` of Dr.Jit where it cannot allocate memory.
 
 All else is a bug, whose traceback must be seen; Python's exit status is then that of a failure.
 """
@@ -23,7 +24,7 @@ import sys
 from collections.abc import Callable
 from typing import TypeVar
 
-from ..errors import FailureError, UnsupportedError, UsageError, behind, message
+from ..errors import FailureError, UnsupportedError, UsageError, behind, chain, message
 
 FAILURE = 1
 """The exit status after a failure."""
@@ -83,8 +84,8 @@ PATHS = (*REMEDIES.keys() - {errno.ENOSPC, errno.EDQUOT}, errno.ENAMETOOLONG, er
 
 def in_words(error: Exception) -> str:
     """What went wrong; of what the system could not do, with which file, and what to do about it."""
-    if isinstance(error, MemoryError):
-        return f"not enough memory ({message(error) or 'no more was given'}); {MEMORY_REMEDY}"
+    if (lacking := of_memory(error)) is not None:
+        return f"not enough memory ({message(lacking) or 'no more was given'}); {MEMORY_REMEDY}"
     if not isinstance(error, OSError) or error.strerror is None or error.filename is None:
         return message(error)
     remedy = REMEDIES.get(error.errno or 0)
@@ -94,11 +95,26 @@ def in_words(error: Exception) -> str:
 MEMORY_REMEDY = "render a smaller --size, or parts of the image by --crop"
 
 
+OUT_OF_MEMORY = re.compile(r"out[ _]of[ _]memory|failed to allocate", re.IGNORECASE)
+"""What a ``RuntimeError`` of Dr.Jit says of memory that it cannot allocate."""
+
+
+def of_memory(error: BaseException) -> BaseException | None:
+    """The exception about a lack of memory that ``error`` is, or that was wrapped into it; else None."""
+
+    def is_lack(found: BaseException) -> bool:
+        drjits = isinstance(found, RuntimeError) and OUT_OF_MEMORY.search(str(found))
+        return isinstance(found, MemoryError) or bool(drjits)
+
+    return next(filter(is_lack, chain(error)), None)
+
+
 def status_of(error: Exception) -> int | None:
     """The exit status after an ``error``, see above; None for a bug."""
     if is_mistake(error):
         return USAGE
-    return FAILURE if isinstance(error, FailureError | MemoryError | OSError) else None
+    failed = isinstance(error, FailureError | OSError) or of_memory(error) is not None
+    return FAILURE if failed else None
 
 
 def is_mistake(error: Exception) -> bool:

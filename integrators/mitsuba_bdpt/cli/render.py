@@ -89,10 +89,7 @@ def _run(options: Namespace, ending: Ending) -> int:
         try:
             if not render_job(scene, integrator, job, ending):
                 return ending.status
-        except (OSError, RuntimeError) as error:
-            # What was wrong with a path has come out before.
-            if behind(error, KeyboardInterrupt) or (is_mistake(error) and not isinstance(error, OSError)):
-                raise
+        except OSError as error:  # what was wrong with a path has come out before
             raise FailureError(in_words(error)) from error
     return 0
 

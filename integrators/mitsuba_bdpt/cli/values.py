@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import re
 from collections.abc import Callable
-from typing import TypeVar
 
+from ..measure.options import Number
 from . import tev
 
 PropertyValue = bool | int | float | str
@@ -18,25 +19,20 @@ RESUME = ("auto", "must", "never")
 MOST_FRAMES = 1 << 20
 """Sensors in a range, at most."""
 
-Number = TypeVar("Number", int, float)
+
+def number(kind: type, least: float, most: float = math.inf) -> Callable[[str], float]:
+    """An argparse type: a finite number of a ``kind`` from ``least`` to ``most``."""
+    return within(Number(kind, least, most))
 
 
-def number(kind: type[Number], minimum: float, maximum: float = math.inf) -> Callable[[str], Number]:
-    """An argparse type: a finite `kind` between `minimum` and `maximum`."""
+def within(bounds: Number) -> Callable[[str], float]:
+    """An argparse type: a number within ``bounds``."""
 
-    def parse(text: str) -> Number:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = None
-        if value is None or not (minimum <= value <= maximum and math.isfinite(value)):
-            most = maximum if kind is int else f"{maximum:g}"
-            limit = "" if maximum == math.inf else f" and at most {most}"
-            name = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(
-                f"got {text!r}, which must be {name} of at least {minimum:g}{limit}"
-            )
-        return value
+    def parse(text: str) -> float:
+        with contextlib.suppress(ValueError):
+            if bounds.holds(value := bounds.kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must be {bounds}")
 
     return parse
 

@@ -12,6 +12,8 @@ from typing import Any
 
 from ..errors import UnsupportedError, UsageError, behind
 
+_installed: list[bool] = []
+
 
 def last_line(error: BaseException) -> str:
     """The text of the user's mistake behind ``error``; empty if the text of ``error`` ends with it."""
@@ -21,9 +23,14 @@ def last_line(error: BaseException) -> str:
 
 
 def install():
-    """Print `last_line` below the tracebacks of scripts and of IPython."""
-    if sys.excepthook.__module__ == __name__:
+    """Print `last_line` below the tracebacks of scripts and of IPython.
+
+    Called for the first integrator: who imports the package, or lets Mitsuba find its entry point, keeps
+    ``sys.excepthook`` until then.
+    """
+    if _installed:
         return
+    _installed.append(True)
     show = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, traceback: Any):

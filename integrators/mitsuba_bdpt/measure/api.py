@@ -11,16 +11,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import CommandError, did_you_mean
+from ..errors import CommandError, FailureError, did_you_mean
 from . import options as available
+from .options import VARIANT
 
 if TYPE_CHECKING:
     from .equal_time import Shot
     from .project import Project
     from .reference import Reference
-
-VARIANT = "llvm_ad_rgb"
-"""In which all measurements render."""
 
 
 class SceneDict:
@@ -115,7 +113,8 @@ def run_sweep(
 ) -> list[dict]:
     """Render what is missing of a preset, a TOML file, whose scenes may be ``dictionaries`` by their names.
 
-    ``options``: those of `options.Sweep`. Returns the rows. Raises ``CommandError`` if a render failed.
+    ``options``: those of `options.Sweep`. Returns the rows. Raises ``FailureError`` if a render failed;
+    the rows of the others are kept.
     """
     from . import sweep as module
 
@@ -123,7 +122,7 @@ def run_sweep(
     with _measured(dictionaries, project) as (found, _):
         rows, failed = module.swept(found, str(preset), asked)
     if failed:
-        raise CommandError(f"preset={str(preset)!r}: {len(failed)} failed: {'; '.join(failed)}")
+        raise FailureError(f"preset={str(preset)!r}: {len(failed)} failed: {'; '.join(failed)}")
     return rows
 
 

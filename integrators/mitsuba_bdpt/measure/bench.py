@@ -18,6 +18,7 @@ from .. import workers
 from ..errors import CommandError, message
 from ..files.texts import read_json, write_json
 from .cells import Cell, Cells, machine, software
+from .options import VARIANT
 from .preset import read_preset
 from .project import Project
 from .scenes import integrator_of
@@ -139,7 +140,7 @@ def measured(root: str, preset: str, scene: str, cells: list[dict]) -> list:
     ``root`` of the project, text of the ``preset``, name of the ``scene``.
     """
     with workers.one_at_a_time:
-        mi.set_variant("llvm_ad_rgb")
+        mi.set_variant(VARIANT)
         bench, found = _bench(root, preset, scene, cells[0]["scene_sha256"]), []
         for entry in cells:
             cell = Cell(**entry)

@@ -20,7 +20,7 @@ from ..errors import CommandError
 from .analysis import Refused
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse
-from .options import Compare
+from .options import VARIANT, Compare
 from .project import Project
 from .reference import Reference
 from .scenes import check_plugins, integrator_of
@@ -131,6 +131,6 @@ def lines(
 
 def run(options: Namespace) -> int:
     """Print the table that the command line ``options`` ask for."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     print(table(HEADS, lines(Project(options.project), options.scenes, options.sides, options)))
     return 0

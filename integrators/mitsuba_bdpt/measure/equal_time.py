@@ -24,7 +24,7 @@ from ..files.loading import choose_sensor
 from ..files.whole import replacing
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
-from .options import RESOLUTION, EqualTime
+from .options import RESOLUTION, VARIANT, EqualTime
 from .project import Project
 from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers
 from .showing import steps
@@ -166,7 +166,7 @@ def pictured(
 
 def run(options: Namespace) -> int:
     """Draw what the command line ``options`` ask for."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     integrators = dict(options.integrators)
     output, found = pictured(Project(options.project), options.scene, integrators, options)
     print(output)

@@ -33,7 +33,7 @@ from ..host.jit import evaluated_mode
 from . import oracle, reconstruct, recording
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon
-from .options import Fireflies
+from .options import VARIANT, Fireflies
 from .project import Project
 from .scenes import MeasuredScene, integrator_of
 from .showing import steps
@@ -242,6 +242,6 @@ def text(project: Project, names: Sequence[str], options: Fireflies | Namespace)
 
 def run(options: Namespace) -> int:
     """Print what the command line ``options`` ask for."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     print(text(Project(options.project), options.scenes, options))
     return 0

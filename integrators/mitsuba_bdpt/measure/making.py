@@ -36,7 +36,7 @@ from .agreement import FEWEST_RUNS, TILES, Means
 from .efficiency import REFERENCE_SHARE
 from .halves import PASS_SPP, Halves
 from .metrics import TRIM, rel_mse
-from .options import REFERENCE_SECONDS
+from .options import REFERENCE_SECONDS, VARIANT
 from .project import Project
 from .reference import Reference, load_reference, make_command, reference_path, write
 from .scenes import MeasuredScene, integrator_of, path_tracers
@@ -417,7 +417,7 @@ def run(options: Namespace) -> int:
             f"reference --all: there is no scene in {str(project.scenes)!r}; name the folder that has "
             "scenes/ by --project, or give the path of an XML file"
         )
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     for name in names:
         try:
             scene = project.scene(name)

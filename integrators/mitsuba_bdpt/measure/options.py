@@ -13,6 +13,9 @@ from typing import Any
 
 from ..errors import CommandError
 
+VARIANT = "llvm_ad_rgb"
+"""Mitsuba's variant in which all measurements render."""
+
 RESOLUTION = 128
 """Width of references, and of what is judged by them, unless said."""
 
@@ -46,7 +49,8 @@ class Number:
         if value == self.apart:
             return True
         fits = self.step == 1 or value % self.step == 0
-        return self.least <= value <= self.most and math.isfinite(value) and fits
+        finite = isinstance(value, int) or math.isfinite(value)
+        return self.least <= value <= self.most and finite and fits
 
 
 @dataclass(frozen=True)
@@ -202,3 +206,18 @@ class Fireflies(Options):
     top: int = option(12, WHOLE, "samples examined of each render; default: %(default)s")
     lines: int = option(6, WHOLE, "kinds of paths of each scene; default: %(default)s")
     reference_seconds: float = _reference_seconds()
+
+
+def _documented(kind: type[Options]) -> str:
+    """The docstring of a dataclass of options with the meaning of each."""
+    lines = [kind.__doc__ or "", ""]
+    for found in options_of(kind):
+        bounds, text = found.metadata["bounds"], found.metadata["text"] % {"default": found.default}
+        lines.append(
+            f"* ``{found.name}``" + ("" if isinstance(bounds, type) else f" ({bounds})") + f": {text}"
+        )
+    return "\n".join(lines)
+
+
+for _kind in Options.__subclasses__():
+    _kind.__doc__ = _documented(_kind)

@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from ..errors import CommandError
+from .options import VARIANT
 from .project import Project
 from .scenes import SceneFile
 
@@ -20,31 +21,31 @@ from .scenes import SceneFile
 # is no floor.
 FLOOR_SCENES = ("veach_mis", "many_lights", "glass_caustics")
 
-COLD = """
+COLD = f"""
 import time; start = time.perf_counter()
 import mitsuba_bdpt, mitsuba as mi, drjit as dr
-mi.set_variant('llvm_ad_rgb')
+mi.set_variant({VARIANT!r})
 scene = mi.load_dict(mi.cornell_box())
-integrator = mi.load_dict({'type': '%s', 'max_depth': 6})
+integrator = mi.load_dict({{'type': '%s', 'max_depth': 6}})
 loaded = time.perf_counter()
 image = mi.render(scene, integrator=integrator, spp=16); dr.eval(image); dr.sync_thread()
 print(time.perf_counter() - loaded)
 """
 
-MEMORY = """
+MEMORY = f"""
 import resource
 import mitsuba_bdpt, mitsuba as mi
-mi.set_variant('llvm_ad_rgb')
+mi.set_variant({VARIANT!r})
 d = mi.cornell_box()
 d['sensor']['film']['width'], d['sensor']['film']['height'] = 1920, 1080
-mi.render(mi.load_dict(d), integrator=mi.load_dict({'type': 'bdpt', 'max_depth': 8}), spp=%d)
+mi.render(mi.load_dict(d), integrator=mi.load_dict({{'type': 'bdpt', 'max_depth': 8}}), spp=%d)
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
 """
 
-FLOOR = """
+FLOOR = f"""
 import sys, pathlib, mitsuba_bdpt, mitsuba as mi
 from mitsuba_bdpt.measure import floor, scenes
-mi.set_variant('llvm_ad_rgb')
+mi.set_variant({VARIANT!r})
 file = pathlib.Path(sys.argv[1])
 print(*floor.measure(scenes.SceneFile(file.stem, file), int(sys.argv[2])))
 """

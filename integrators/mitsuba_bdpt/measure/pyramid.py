@@ -23,7 +23,7 @@ from ..files.images import check_channels, check_output, write_images
 from ..files.loading import choose_sensor
 from ..files.whole import replacing
 from .metrics import tone_map
-from .options import Pyramid
+from .options import VARIANT, Pyramid
 from .project import Project
 from .scenes import MeasuredScene, integrator_of
 from .showing import amount
@@ -127,7 +127,7 @@ def pictured(
 
 def run(options: Namespace) -> int:
     """Render, write, say what was written, as the command line ``options`` say."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     pictures, _ = pictured(Project(options.project), options.scene, options)
     print(*pictures.values(), sep="\n")
     return 0

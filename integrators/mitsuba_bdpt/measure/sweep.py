@@ -33,6 +33,7 @@ from . import analysis, probes, showing
 from .bench import Bench, measure, measured
 from .cells import FIRST_SEED, Cell, Cells, machine, software
 from .making import Job, check, obtained
+from .options import VARIANT
 from .options import Sweep as Asked
 from .preset import Preset, read_preset
 from .project import Project
@@ -285,6 +286,6 @@ def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[li
 
 def run(options: Namespace) -> int:
     """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(VARIANT)
     _, failed = swept(Project(options.project), options.preset, options)
     return 1 if failed else 0

@@ -275,6 +275,8 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
         return "without guided s=0 it has the outliers of isolated (SDS) paths, which are in no figure here"
     if not chosen.candidate.light_paths and row.candidate.light_paths:
         return f"light subpaths have to gain {LIGHT_GAIN:g}x, and gain {gain:.2f}x"
+    if not (chosen.candidate.light_paths and row.candidate.light_paths):
+        return ""  # no rule puts one without light subpaths behind a slower one
     if chosen.candidate.connections != row.candidate.connections:
         return f"connections={row.candidate.connections} has to gain {KERNEL_TIE:g}x, and gains {gain:.2f}x"
     more = row.candidate.light_paths / chosen.candidate.light_paths

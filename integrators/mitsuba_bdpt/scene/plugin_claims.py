@@ -7,6 +7,7 @@ disagree, so it raises an error. Mitsuba's own plugins are not asked.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 
 import drjit as dr
@@ -22,6 +23,9 @@ from ..host.notices import remembered
 from ..media.media import random_directions, symmetric_frame
 
 _COUNT = 4096  # answers of a plugin
+
+# What Mitsuba raises of a method that a Python class does not have.
+_NOT_IMPLEMENTED = re.compile("pure virtual|not implemented", re.IGNORECASE)
 
 # Share of the answers that may differ, by rounding or at edges, and by how much each may.
 _OFF, _RELATIVE = 0.05, 0.01
@@ -194,8 +198,9 @@ def _first_answer(methods: tuple[Callable, ...], si):
     for method in methods:
         try:
             return method(si, mi.Bool(True))
-        except (RuntimeError, NotImplementedError, TypeError):
-            continue
+        except RuntimeError as error:  # among them NotImplementedError
+            if not (isinstance(error, NotImplementedError) or _NOT_IMPLEMENTED.search(str(error))):
+                raise
     return None
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import measure
 from mitsuba_bdpt.cli.arguments import build_parser
-from mitsuba_bdpt.measure import options
+from mitsuba_bdpt.errors import FailureError
+from mitsuba_bdpt.measure import options, sweep
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import DictionaryScene, SceneFile
 
@@ -154,6 +155,7 @@ def test_a_sweep_takes_dictionaries(here):
     ],
 )
 def test_what_cannot_be_measured_is_named(here, call, words):
+    """Expected: the error names the argument, its value and what it must be."""
     with pytest.raises(ValueError, match=words):
         call()
 
@@ -183,7 +185,28 @@ def test_the_command_has_the_same_options(name):
     }
 
 
+@pytest.mark.parametrize("kind", options.Options.__subclasses__(), ids=lambda kind: kind.__name__)
+def test_the_meaning_of_each_option_is_in_the_docstring(kind):
+    """Expected: a line with the text of the command's help, its default in words, for each; so the page of
+    the API shows it."""
+    lines = kind.__doc__.splitlines()
+    for found in options.options_of(kind):
+        text = found.metadata["text"].replace("%(default)s", str(found.default))
+        text = text.replace("%(default)g", f"{found.default}".removesuffix(".0"))
+        assert [line for line in lines if line.startswith(f"* ``{found.name}``") and line.endswith(text)]
+    assert "%(" not in kind.__doc__
+
+
+def test_a_sweep_that_fails_is_no_usage_error(here, monkeypatch):
+    """Expected: failed renders raise a `FailureError` that names them, since the arguments were right."""
+    Path("mine.toml").write_text(PRESET)
+    monkeypatch.setattr(sweep, "swept", lambda *_: ([], ["room, 4 spp, seed 1: no memory"]))
+    with pytest.raises(FailureError, match="1 failed: room, 4 spp, seed 1: no memory"):
+        measure.run_sweep("mine.toml", [measure.SceneDict("room", room())])
+
+
 def test_a_project_knows_its_dictionaries():
+    """Expected: a project finds a scene given as a dictionary by its name, and its depth."""
     scene = DictionaryScene("mine", room())
     project = Project(Path(), {"mine": scene})
     assert project.scene("mine") is scene and project.called(scene) == "mine" and project.depth(scene) == 3
