@@ -897,6 +897,13 @@ MUTANTS = (
         ("tests/images/test_media_boundaries.py::test_fog_between_opaque_walls[shared-tagged-merged]",),
     ),
     Mutant(
+        "media: backs of lamps say where light starts",
+        "media/boundaries.py",
+        "bounds = hit & si.is_medium_transition() & _may_leave(si, -d)",
+        "bounds = hit & si.is_medium_transition()",
+        ("tests/images/test_media_boundaries.py::test_light_on_a_side_that_states_nothing[spot-wall]",),
+    ),
+    Mutant(
         "media: rays of lamps leave through walls",
         "media/boundaries.py",
         "opaque = hit & ~bounds & ~_transmits(si)",

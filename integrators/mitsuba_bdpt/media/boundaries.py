@@ -54,19 +54,20 @@ _REFLECTIONS = 16
 
 @dr.syntax
 def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> NearSide:
-    """Find the first boundary along ``ray``.
+    """Find the first boundary along ``ray`` of whose side light may leave.
 
-    Surfaces that bound no medium are passed straight on if they transmit light. Opaque ones reflect the ray
-    as mirrors do, so that it stays where light can go.
+    Scenes leave the medium of other sides unstated: that within a wall, at the back of a lamp. Such sides,
+    and surfaces that bound no medium, are passed straight on if they transmit light. Opaque ones reflect the
+    ray as mirrors do, so that it stays where light can go.
     """
     o, d, number = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.UInt32(0)
     found, escaped, reflections = mi.Bool(False), mi.Bool(False), mi.UInt32(0)
     going = mi.Bool(active)
     while dr.hint(going, label="the first boundary", exclude=[space, ray, active]):
         segment = mi.Ray3f(o, d, ray.time, ray.wavelengths)
-        si = space.scene.ray_intersect(segment, mi.RayFlags.Minimal, coherent=False, active=going)
+        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
         hit = going & si.is_valid()
-        bounds = hit & si.is_medium_transition()
+        bounds = hit & si.is_medium_transition() & _may_leave(si, -d)
         number = dr.select(bounds, space.media.number(si.target_medium(-d)), number)
         found |= bounds
         escaped |= going & ~hit
