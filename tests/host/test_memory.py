@@ -1,14 +1,15 @@
 """How much memory there is, and how much a film takes of it."""
 
-import resource
-import threading
-from pathlib import Path
+import json
+import subprocess
+import sys
 
 import mitsuba as mi
 import pytest
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.image import film_limits
 from mitsuba_bdpt.image.channels import Channels
+from patience import PATIENCE
 
 GIB = 2**30
 
@@ -54,19 +55,75 @@ def test_limits_of_control_groups_count(system, memberships, limits, expected):
         assert found.bytes == expected * GIB and found.limit.startswith("the control group's limit, ")
 
 
-@pytest.mark.parametrize(
-    ("kind", "words"), [(resource.RLIMIT_AS, "ulimit -v"), (resource.RLIMIT_DATA, "ulimit -d")]
-)
-def test_limits_of_the_process_count_what_it_takes_already(kind, words):
-    """Expected: 64 MiB above what the process takes now leave 64 MiB at most."""
-    name = {resource.RLIMIT_AS: "VmSize", resource.RLIMIT_DATA: "VmData"}[kind]
-    before, taken = resource.getrlimit(kind), status(name)
-    resource.setrlimit(kind, (taken + 64 * 2**20, before[1]))
+# In a process of its own the films of `FILMS`, the largest last, since a peak is that of all before it, and
+# then limits. Kernels are compiled before, with a film of 16 x 8 pixels. VmHWM is the peak of the resident
+# memory; ru_maxrss would be that of the process which has begun this one, too.
+CHILD = """
+import gc, json, resource, sys
+import mitsuba_bdpt, mitsuba as mi, drjit as dr
+from mitsuba_bdpt.host import memory
+
+mi.set_variant("llvm_ad_rgb")
+
+def status(name):
+    lines = open("/proc/self/status").read().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(name + ":"))
+
+def render(integrator, width):
+    film = {"type": "hdrfilm", "width": width, "height": width // 2, "rfilter": {"type": "box"}}
+    parts = {"sensor": {"type": "perspective", "film": film}, "lamp": {"type": "constant"}}
+    scene = mi.load_dict({"type": "scene", **parts})
+    integrator.render(scene, spp=8 if integrator.settings.variance else 1, develop=False)
+    dr.sync_thread()
+
+def said(integrator):
+    memory.set_limit(1)
     try:
-        found = memory.available()
+        render(integrator, WIDTH)
+    except ValueError as error:
+        return float(str(error).split("takes about ")[1].split()[0]) * 2**30
     finally:
-        resource.setrlimit(kind, before)
-    assert 0 < found.bytes <= 64 * 2**20 and words in found.limit
+        memory.set_limit(None)
+
+WIDTH, found = 1024, {"films": [], "limits": {}}
+ways = [mi.load_dict({"type": "bdpt", "light_paths": 0, **more}) for more in json.loads(sys.argv[1])]
+for integrator in ways:
+    render(integrator, 16)
+gc.collect()
+dr.flush_malloc_cache()
+before = status("VmRSS")
+for integrator in ways:
+    render(integrator, WIDTH)
+    found["films"].append({"said": said(integrator), "taken": status("VmHWM") - before})
+    gc.collect()
+    dr.flush_malloc_cache()
+for option, kind, name in (("-v", resource.RLIMIT_AS, "VmSize"), ("-d", resource.RLIMIT_DATA, "VmData")):
+    usual = resource.getrlimit(kind)
+    resource.setrlimit(kind, (status(name) + 64 * 2**20, usual[1]))
+    left = memory.available()
+    resource.setrlimit(kind, usual)
+    found["limits"][option] = [left.bytes, left.limit]
+print(json.dumps(found))
+"""
+
+FILMS = {"plain": {}, "aovs": {"aovs": "a:albedo,b:sh_normal,d:depth"}, "variance": {"variance": True}}
+
+
+@pytest.fixture(scope="module")
+def child():
+    """What `CHILD` has found: its films, and its limits by the option of ``ulimit``."""
+    command = [sys.executable, "-c", CHILD, json.dumps(list(FILMS.values()))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("option", ["-v", "-d"])
+def test_limits_of_the_process_count_what_it_takes_already(child, option):
+    """Expected: 64 MiB above what a process takes leave 64 MiB; one more stack of a thread, 8 MiB, may have
+    come between."""
+    left, limit = child["limits"][option]
+    assert 48 * 2**20 < left <= 64 * 2**20 and limit == f"the process's limit, ulimit {option}"
 
 
 def test_what_was_asked_for_counts():
@@ -79,49 +136,15 @@ def test_what_was_asked_for_counts():
     assert memory.available().bytes > GIB / 4
 
 
-def status(name):
-    """A line of the process's status, in bytes."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{name}:"))
-
-
-@pytest.mark.parametrize(
-    "more",
-    [{}, {"aovs": "a:albedo,b:sh_normal,d:depth"}, {"variance": True}],
-    ids=["plain", "aovs", "variance"],
-)
-def test_a_film_takes_what_is_said_of_it(monkeypatch, more):
+@pytest.mark.parametrize("name", FILMS)
+def test_a_film_takes_what_is_said_of_it(child, name):
     """Rationale: what exceeds a limit ends the process by a signal.
 
-    Expected: a render's peak of data grows by at most what its film is said to take; what was freed before
-    may be used again, so there is no bound from below. Tolerance: 48 MiB for kernels and the scene, of 144 to
-    360 MiB.
+    Expected: a render's peak of resident memory grows by what its film is said to take. Tolerances: measured
+    are 0.80 of it with `aovs`, 0.95 else; 32 MiB above for what else a render takes.
     """
-    said, check = [], film_limits.check_film
-
-    def noted(film, channels, variance):
-        monkeypatch.setattr(memory, "available", lambda: memory.Available(0, "nothing"))
-        with pytest.raises(ValueError, match="takes about") as caught:
-            check(film, channels, variance)
-        said.append(float(str(caught.value).split("takes about ")[1].split()[0]) * GIB)
-
-    monkeypatch.setattr(film_limits, "check_film", noted)
-    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 1024, "height": 512}}
-    camera["film"]["rfilter"] = {"type": "box"}
-    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": {"type": "constant"}})
-    integrator = mi.load_dict({"type": "bdpt", "light_paths": 0, **more})
-    before, peak, done = status("VmData"), [0], threading.Event()
-
-    def watch():
-        while not done.wait(0.002):
-            peak[0] = max(peak[0], status("VmData"))
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    integrator.render(scene, spp=8 if "variance" in more else 1, develop=False)
-    done.set()
-    thread.join()
-    assert peak[0] - before <= said[0] + 48 * 2**20
+    film = child["films"][list(FILMS).index(name)]
+    assert 0.7 * film["said"] <= film["taken"] <= film["said"] + 32 * 2**20
 
 
 def test_channels_of_a_film_are_those_of_its_sums():
