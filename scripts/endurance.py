@@ -20,8 +20,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import re
-import resource
 import signal
 import sys
 import time
@@ -34,6 +32,7 @@ import repository
 from mitsuba_bdpt.cli.mistakes import INTERRUPTED, answered
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_json, write_text
+from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.measure import reference
 from mitsuba_bdpt.measure.report import replace_part
 from mitsuba_bdpt.measure.tables import table
@@ -106,11 +105,7 @@ def reset_peak() -> None:
 
 def peak() -> int:
     """The most memory that this process had since `reset_peak`, in bytes."""
-    status = Path("/proc/self/status")
-    if status.exists() and (found := re.search(r"VmHWM:\s+(\d+) kB", status.read_text())):
-        return int(found[1]) * 1024
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most if sys.platform == "darwin" else most * 1024
+    return memory.peak() or 0
 
 
 class Interruption:

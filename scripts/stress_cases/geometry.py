@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import tempfile
 import time
 from functools import partial
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import drjit as dr
 import numpy as np
+from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.measure.agreement import Sample
 
 import mitsuba as mi  # isort: skip
@@ -294,12 +294,12 @@ def _million(emits: bool) -> Outcome:
     common = {"sensor": _camera((3, -5, 3), (0, 0, -0.2)), "floor": _floor(0.5, 5)}
     common["floor"]["to_world"] = _transform().translate([0, 0, -1.2]).scale(5)
     common |= {} if emits else {"lamp": _lamp(4, 0.5, 20)}
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = memory.peak() or 0
     with tempfile.TemporaryDirectory() as folder:
         mesh = _ball_mesh(707, folder, **parts)
         fine, exact = _scene(**common, ball=mesh), _scene(**common, ball={"type": "sphere"} | parts)
     seconds = _first_render("bdpt", fine)
-    more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    more = ((memory.peak() or 0) - before) / 2**20
     theirs = _first_render("path", fine)
     outcome = _against([(fine, exact, {})], {"max_depth": 5})
     text = (

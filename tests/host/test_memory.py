@@ -126,6 +126,14 @@ def test_limits_of_the_process_count_what_it_takes_already(child, option):
     assert 48 * 2**20 < left <= 64 * 2**20 and limit == f"the process's limit, ulimit {option}"
 
 
+def test_the_peak_is_of_this_process_alone(system):
+    """Rationale: on Linux ``ru_maxrss`` is at least what the process had that began this one: a small render
+    of a large one had its memory in its statistics. Expected: VmHWM; elsewhere what there is."""
+    assert 2**26 < memory.peak() < 2**46
+    system("proc/self/status", "Name:\tpython\nVmHWM:\t2048 kB\n")
+    assert memory.peak() == 2 * 2**20
+
+
 def test_what_was_asked_for_counts():
     """Expected: a limit that was set is the least of all, until it is taken back."""
     memory.set_limit(GIB / 4)

@@ -42,9 +42,14 @@ def available() -> Available:
 
 
 def peak() -> int | None:
-    """Bytes of memory that this process has taken at most so far; None where the system has no count."""
+    """Bytes of memory that this process has taken at most so far; None where the system has no count.
+
+    On Linux of this process alone: ``ru_maxrss`` there is at least what the process had that began this one.
+    """
     if sys.platform == "win32":
         return None
+    if found := _status("VmHWM"):
+        return found["VmHWM"]
     import resource
 
     found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -87,11 +92,7 @@ def _own_limits() -> Iterator[Available]:
         return
     import resource
 
-    taken = {}
-    for line in (ROOT / "proc/self/status").read_text().splitlines():
-        name, _, value = line.partition(":")
-        if name in ("VmSize", "VmData"):
-            taken[name] = 1024 * int(value.split()[0])
+    taken = _status("VmSize", "VmData")
     for kind, name, option in (
         (resource.RLIMIT_AS, "VmSize", "-v"),
         (resource.RLIMIT_DATA, "VmData", "-d"),
@@ -99,3 +100,13 @@ def _own_limits() -> Iterator[Available]:
         most = resource.getrlimit(kind)[0]
         if most != resource.RLIM_INFINITY:
             yield Available(max(most - taken.get(name, 0), 0), f"the process's limit, ulimit {option}")
+
+
+def _status(*names: str) -> dict[str, int]:
+    """The lines of these ``names`` in the process's status, in bytes; empty on other systems than Linux."""
+    file, found = ROOT / "proc/self/status", {}
+    for line in file.read_text().splitlines() if file.is_file() else []:
+        name, _, value = line.partition(":")
+        if name in names:
+            found[name] = 1024 * int(value.split()[0])
+    return found

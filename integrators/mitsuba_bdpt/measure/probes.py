@@ -33,13 +33,13 @@ print(time.perf_counter() - loaded)
 """
 
 MEMORY = f"""
-import resource
 import mitsuba_bdpt, mitsuba as mi
+from mitsuba_bdpt.host import memory
 mi.set_variant({VARIANT!r})
 d = mi.cornell_box()
 d['sensor']['film']['width'], d['sensor']['film']['height'] = 1920, 1080
 mi.render(mi.load_dict(d), integrator=mi.load_dict({{'type': 'bdpt', 'max_depth': 8}}), spp=%d)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+print(memory.peak() / 2**30)
 """
 
 FLOOR = f"""
