@@ -563,7 +563,7 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     """
     random, needed, met = np.random.default_rng(1), re.compile(r"to gain (.*)x, and gains? (.*)x"), set()
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined"), 1.0)
-    rays |= {"far": 0.0, "bsdfs": 1, "evaluated": 0.0, "aimed": 0.01}
+    rays |= {"far": 0.0, "kinds": 1, "evaluated": 0.0, "aimed": 0.01}
     possible = [
         Configuration.weighted(w, served, "one" if w.inner else "none")
         for w in WEIGHTINGS
@@ -879,7 +879,7 @@ def test_the_same_kernel_where_it_hardly_matters():
     where it takes 1 / 1.1."""
     numbers = [WEIGHTINGS.index(Weighting(1, 1, 1 / 16, inner)) for inner in (0, 1)]
     possible = [candidate(n, 4, kind) for n, kind in zip(numbers, ("none", "one"), strict=True)]
-    kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "bsdfs", "far")
+    kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "kinds", "far")
     rays = dict.fromkeys(kinds, 1.0)
     ratio = costs.cost(possible[1], rays) / costs.cost(possible[0], rays)
     for faster, chosen in ((1.03, "none"), (1.1, "one")):

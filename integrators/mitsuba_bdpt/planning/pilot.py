@@ -336,7 +336,7 @@ def measure(
     found = pilot.moments(counted, found)
     if everything.guidable and not guiding:
         found = replace(found, isolated=found.isolated[:, :0])
-    known = {"bsdfs": prepared.traits.asked.count, "far": prepared.emitters.far_share}
+    known = {"kinds": prepared.traits.asked.kinds, "far": prepared.emitters.far_share}
     contrast = prepared.emitters.contrast
     known["media"] = float(prepared.space is not None)
     known["evenness"] = 1 / contrast if contrast < np.inf else 0.0  # also if it is no number
