@@ -193,6 +193,7 @@ def test_the_meaning_of_each_option_is_in_the_docstring(kind):
     for found in options.options_of(kind):
         text = found.metadata["text"].replace("%(default)s", str(found.default))
         text = text.replace("%(default)g", f"{found.default}".removesuffix(".0"))
+        assert not text.startswith("default")  # else there is no meaning
         assert [line for line in lines if line.startswith(f"* ``{found.name}``") and line.endswith(text)]
     assert "%(" not in kind.__doc__
 

@@ -85,7 +85,7 @@ def _width(default: int | None = RESOLUTION) -> Any:
 
 
 def _reference_seconds() -> Any:
-    text = "that making a reference may take where there is none, per scene; default: %(default)g"
+    text = "seconds that making a reference may take where there is none, per scene; default: %(default)g"
     return option(REFERENCE_SECONDS, SECONDS, text, metavar="SECONDS")
 
 
@@ -116,11 +116,17 @@ class Sweep(Options):
     """Options of sweeps."""
 
     scenes: tuple[str, ...] | None = option(
-        None, str, "these of the preset alone; other rows stay as they are", nargs="+", metavar="SCENE"
+        None,
+        str,
+        "scenes of the preset to render; rows of others stay as they are; default: all",
+        nargs="+",
+        metavar="SCENE",
     )
-    output: Path | None = option(None, Path, "folder; default: PROJECT/results/NAME_OF_PRESET", short="-o")
+    output: Path | None = option(
+        None, Path, "folder of the rows; default: PROJECT/results/NAME_OF_PRESET", short="-o"
+    )
     scheduler: str | None = option(
-        None, str, "of a dask.distributed cluster to render on (extra [cluster])", metavar="ADDRESS"
+        None, str, "address of a dask.distributed cluster to render on (extra [cluster])", metavar="ADDRESS"
     )
     reference_seconds: float = _reference_seconds()
 
@@ -129,8 +135,8 @@ class Sweep(Options):
 class MakeReference(Options):
     """Options of references."""
 
-    spp: int = option(64, WHOLE, "of the renders to judge; default: %(default)s")
-    seconds: float = option(REFERENCE_SECONDS, SECONDS, "per scene; default: %(default)g")
+    spp: int = option(64, WHOLE, "samples per pixel of the renders to judge; default: %(default)s")
+    seconds: float = option(REFERENCE_SECONDS, SECONDS, "seconds per scene; default: %(default)g")
     resolution: int = _width()
     max_depth: int | None = option(
         None,
@@ -149,8 +155,8 @@ class MakeReference(Options):
 class Compare(Options):
     """Options of comparisons of two ways to render."""
 
-    spp: tuple[int, ...] = option((64,), WHOLE, "default: 64", nargs="+")
-    pairs: int = option(12, WHOLE, "default: %(default)s")
+    spp: tuple[int, ...] = option((64,), WHOLE, "samples per pixel; default: 64", nargs="+")
+    pairs: int = option(12, WHOLE, "pairs of renders; default: %(default)s")
     resolution: int = _width()
     reference_seconds: float = _reference_seconds()
 
@@ -159,7 +165,7 @@ class Compare(Options):
 class EqualTime(Options):
     """Options of pictures at equal time."""
 
-    spp: int = option(64, WHOLE, "of the last integrator; default: %(default)s")
+    spp: int = option(64, WHOLE, "samples per pixel of the last integrator; default: %(default)s")
     sampler: str | None = option(None, str, "type of the sensor's sampler; default: the scene's")
     reference: Path | None = option(
         None,
@@ -169,7 +175,9 @@ class EqualTime(Options):
     )
     resolution: int | None = _width(None)
     reference_seconds: float = _reference_seconds()
-    output: Path | None = option(None, Path, "default: PROJECT/renders/equal_time_SCENE.png", short="-o")
+    output: Path | None = option(
+        None, Path, "PNG file to write; default: PROJECT/renders/equal_time_SCENE.png", short="-o"
+    )
 
 
 @dataclass(frozen=True)
@@ -183,11 +191,11 @@ class Pyramid(Options):
         short="-o",
     )
     max_depth: int = option(5, WHOLE, "longest path in edges; default: %(default)s")
-    spp: int = option(64, WHOLE, "default: %(default)s")
-    seed: int = option(0, SEED, "default: %(default)s")
+    spp: int = option(64, WHOLE, "samples per pixel; default: %(default)s")
+    seed: int = option(0, SEED, "seed of the render; default: %(default)s")
     resolution: int | None = option(None, WHOLE, "width of the image; default: the scene's")
-    heuristic: str = option("balance", str, "default: %(default)s")
-    exposure: float = option(0.0, STOPS, "stops, of the pictures")
+    heuristic: str = option("balance", str, "heuristic of multiple importance sampling; default: %(default)s")
+    exposure: float = option(0.0, STOPS, "exposure of the pictures in stops; default: %(default)g")
 
 
 @dataclass(frozen=True)
@@ -195,7 +203,7 @@ class Fireflies(Options):
     """Options of the search for the paths behind the worst values."""
 
     seeds: int = option(5, WHOLE, "renders of each scene; default: %(default)s")
-    spp: int = option(64, WHOLE, "default: %(default)s")
+    spp: int = option(64, WHOLE, "samples per pixel; default: %(default)s")
     resolution: int = _width()
     max_depth: int | None = option(
         None, WHOLE, "default: that of presets/benchmark.toml, else of the scene's file"
