@@ -141,7 +141,8 @@ class MakeReference(Options):
     max_depth: int | None = option(
         None,
         Number(int, 1, apart=-1),
-        "-1: no limit; default: that of presets/benchmark.toml, else of the scene's file",
+        "longest path in edges, -1: no limit; default: that of presets/benchmark.toml, else of the "
+        "scene's file",
     )
     by: str | None = option(
         None,
@@ -206,7 +207,9 @@ class Fireflies(Options):
     spp: int = option(64, WHOLE, "samples per pixel; default: %(default)s")
     resolution: int = _width()
     max_depth: int | None = option(
-        None, WHOLE, "default: that of presets/benchmark.toml, else of the scene's file"
+        None,
+        WHOLE,
+        "longest path in edges; default: that of presets/benchmark.toml, else of the scene's file",
     )
     level: float = option(
         0.5, Number(float, 1e-9), "values of its pixel by which a sample is off; default: %(default)s"
