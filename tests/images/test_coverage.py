@@ -415,6 +415,70 @@ def test_meter_reads_the_known_irradiance(lamp):
     assert_agree(found)
 
 
+def meters_under_a_point(width, **others):
+    """A batch of two meters that look up at a point light, one of them twice as large as the other."""
+
+    def plate(x, scale):
+        to_world = T().translate([x, 0, 0]) @ T().scale(scale) @ T().rotate([1, 0, 0], -90)
+        return parts.meter({"type": "rectangle", "to_world": to_world})
+
+    film = parts.film(size=1) | {"width": width, "height": 1}
+    batch = {"type": "batch", "left": plate(-0.5, 0.2), "right": plate(0.3, 0.4), "film": film}
+    scene = {"type": "scene", "sensor": batch, "lamp": LAMPS_ABOVE["point"]()} | others
+    return mi.load_dict(scene, optimize=False)  # else Mitsuba makes one meter of equal ones
+
+
+@pytest.mark.parametrize("width", [2, 4])
+def test_batch_of_meters_reads_the_known_irradiance(width):
+    """Rationale: light of a point light that falls on the meters of a batch directly has (1,1) alone;
+    without it each reads 0, without a word.
+
+    Expected: in each pixel the irradiance of its part of its plate, 3 h / r^3 integrated by midpoints.
+    Statistic: Student's t-test against it.
+    """
+    scene = meters_under_a_point(width)
+    values = renders(scene, bdpt(max_depth=1), SAMPLES, 0)[:, 0, :, :3] @ CHANNELS
+    middle = (np.arange(40) + 0.5) / 20 - 1
+    x, z = np.meshgrid(middle, middle)
+    known = []
+    for place, scale in ((-0.5, 0.2), (0.3, 0.4)):
+        irradiance = 3 / ((place + scale * x - 0.2) ** 2 + (scale * z) ** 2 + 1) ** 1.5
+        known += [part.mean() * CHANNELS.sum() for part in np.split(irradiance, width // 2, axis=1)]
+    assert_agree([st.one_sample(values, known, f"{width} pixels")])
+    assert (values.std(0) < 0.05 * values.mean(0)).all()  # known well enough to mean something
+
+
+def test_strategies_of_a_batch_of_meters_agree():
+    """Rationale: meters side by side share the densities of one; a wrong one would show in the weights.
+
+    Expected: with a lamp that has area, between a mirror and a floor, all strategies and camera subpaths
+    alone have the same mean in each meter. Statistic: Welch's t-test.
+    """
+    lamp = LAMPS_ABOVE["rectangle"]()
+    mirror = {"type": "rectangle", "to_world": T().translate([0, 0, -1]), "bsdf": {"type": "conductor"}}
+    flat = T().translate([0, -0.2, 0]) @ T().rotate([1, 0, 0], -90).scale(3)
+    floor = {"type": "rectangle", "to_world": flat}
+    scene = meters_under_a_point(2, lamp=lamp, mirror=mirror, floor=floor)
+    both = [renders(scene, bdpt(**o), SAMPLES, i) for i, o in enumerate(({}, {"light_paths": 0}))]
+    a, b = (images[:, 0, :, :3] @ CHANNELS for images in both)
+    assert_agree([st.welch(a, b, "meters")])
+
+
+def test_meter_of_another_scene():
+    """Rationale: the shape of a meter from elsewhere is not in the scene, so that no light subpath arrives at
+    it; weights that count with t = 0 lose its part.
+
+    Expected: the known irradiance under a lamp with area. Statistic: Student's t-test.
+    """
+    scene = mi.load_dict({"type": "scene", "lamp": LAMPS_ABOVE["rectangle"]()})
+    elsewhere = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS)})
+    method, sensor = bdpt(max_depth=1), elsewhere.sensors()[0]
+    images = [np.array(method.render(scene, sensor, seed=i, spp=SAMPLES_OF_A_PIXEL)) for i in range(SEEDS)]
+    values = tiles(np.stack(images).astype(np.float64))
+    precise(values, 0.01, "meter")
+    assert_agree([st.compare_known(values, irradiance_above("rectangle") * CHANNELS.sum(), "meter")])
+
+
 def test_lens_sees_a_point():
     """Rationale: a point light in front of an open lens is a disk on the film, which only (1,1) and (2,0)
     make; `path` misses it.

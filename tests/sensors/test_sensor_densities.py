@@ -44,7 +44,7 @@ def prepared(name):
     scene = mi.load_dict(parts.open_scene(SENSORS[name]()))
     sensor = scene.sensors()[0]
     u = np.random.default_rng(6).random((10, COUNT), dtype=np.float32)
-    return scene, sensor, sensors.prepare(sensor, ShapeErrors(scene)), u
+    return scene, sensor, sensors.prepare(sensor, ShapeErrors(scene), scene), u
 
 
 def start_of(camera, u):
@@ -197,7 +197,7 @@ def test_sensors_by_their_rays_alone(name):
     parts.register_plugins()
     scene = mi.load_dict(parts.open_scene(parts.SENSORS[name]()))
     sensor = scene.sensors()[0]
-    camera = sensors.prepare(sensor, ShapeErrors(scene))
+    camera = sensors.prepare(sensor, ShapeErrors(scene), scene)
     u = np.random.default_rng(6).random((10, COUNT), dtype=np.float32)
     start = start_of(camera, u)
     uv = camera.region.to_uv(start.position)

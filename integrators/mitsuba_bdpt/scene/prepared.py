@@ -35,7 +35,7 @@ class PreparedScene:
         self.surfaces = bool(scene.shapes())
         self.emitters = Emitters(scene, ShapeFacts.of(scene, sensor))
         check_sensor(sensor, scene.sensors())
-        self.camera = prepare(sensor, self.emitters.shape_errors, self.surfaces)
+        self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)
         _prepare_bitmaps(found)
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)

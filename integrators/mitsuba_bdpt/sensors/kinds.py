@@ -14,10 +14,10 @@ from .records import Sensor
 UNTARGETED = "target = none"
 
 
-def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, bounded: bool = True) -> Sensor:
-    """Return the sensor for one render.
+def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
+    """Return the sensor for one render of ``scene``.
 
-    Of a scene that has surfaces (``bounded``) or none. Kinds that light vertices cannot be connected to take
+    Kinds that light vertices cannot be connected to take
     part by camera subpaths alone, and say why. Raises ``UnsupportedError`` for what Mitsuba itself cannot
     render.
     """
@@ -27,9 +27,9 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, bounded: bool = True) 
     if kind == "OrthographicCamera":
         return Orthographic(sensor)
     if kind == "BatchSensor":
-        return _batch(sensor)
+        return _batch(sensor, shape_errors)
     if kind == "IrradianceMeter":
-        return _meter(sensor, shape_errors)
+        return _meter(sensor, shape_errors, scene)
     if kind == "RadianceMeter":
         return _by_rays(
             sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
@@ -37,7 +37,7 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, bounded: bool = True) 
     if kind == "DistantSensorImpl":
         # Only its text tells the three kinds apart.
         if UNTARGETED in str(sensor):
-            return Distant(sensor) if bounded else RayOnlySensor(sensor, "the scene has no surface")
+            return Distant(sensor) if scene.shapes() else RayOnlySensor(sensor, "the scene has no surface")
         return _by_rays(sensor, "the target of a distant sensor is out of a plugin's reach")
     return _by_rays(sensor, f"of the class {kind} nothing but its camera rays is known")
 
@@ -49,7 +49,7 @@ def _by_rays(sensor: mi.Sensor, reason: str, views: list[mi.Sensor] | None = Non
     return RayOnlySensor(sensor, reason, views)
 
 
-def _batch(sensor) -> Sensor:
+def _batch(sensor: mi.Sensor, shape_errors: ShapeErrors) -> Sensor:
     views = checks.views(sensor)
     if sensor.film().sample_border():
         raise UnsupportedError(
@@ -64,18 +64,18 @@ def _batch(sensor) -> Sensor:
     kinds = {view.class_name() for view in views}
     if len(kinds) == 1 and kinds <= set(cameras.KINDS):
         return cameras.Camera(sensor, views)
-    return _by_rays(sensor, "the views of the batch are not all perspective or all thinlens", views)
+    if kinds == {"IrradianceMeter"}:
+        return IrradianceMeter(sensor, shape_errors, views)
+    why = "the views of the batch are not all perspective, all thinlens or all irradiance meters"
+    return _by_rays(sensor, why, views)
 
 
-def _meter(sensor, shape_errors) -> Sensor:
+def _meter(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
     film = sensor.film()
     if film.sample_border():
         raise UnsupportedError(
             f"film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
             "its shape; set it to false"
         )
-    if tuple(film.size()) != (1, 1):
-        return RayOnlySensor(
-            sensor, "the film has more than one pixel: which of them a point belongs to is unknown"
-        )
-    return IrradianceMeter(sensor, shape_errors)
+    shape = sensor.get_shape()
+    return IrradianceMeter(sensor, shape_errors, in_scene=any(shape is other for other in scene.shapes()))

@@ -115,68 +115,100 @@ class Distant(_Parallel):
         return self._joining(z0, self.region.anywhere(u_film), valid)
 
 
+class _Face:
+    """The shape of one irradiance meter, with the points that its film samples."""
+
+    def __init__(self, sensor, shape_errors):
+        self.shape, self._shape_errors = sensor.get_shape(), shape_errors
+        self._smooth_mesh = SmoothMeshes.of([sensor])
+        sphere = Sphere.of(self.shape)
+        self._sphere = sphere if sphere is not None and sphere.turned else None
+
+    def sample(self, u, shared, reference=None):
+        """A point, its shading normal, and its anchor for rays to and from ``reference`` (itself if None)."""
+        ps = self.shape.sample_position(shared.time, u)
+        if self._sphere is not None:
+            ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
+        n = ps.n
+        if self._smooth_mesh is not None:
+            n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
+        errors = self._shape_errors.at(mi.ShapePtr(self.shape))
+        anchor = rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
+        return mi.Point3f(ps.p), mi.Normal3f(ps.n), anchor
+
+
 class IrradianceMeter(Sensor):
-    """An irradiance meter with one pixel.
+    """An irradiance meter, or several side by side (the views of a batch).
 
     z_0 is uniform on its shape (area measure), directions are distributed by the cosine with the shading
     normal, W_e = 1 / area * (cosine with the shading normal over that with the geometric normal). The film
-    position chooses z_0, as in Mitsuba.
+    position chooses the view, and z_0, as in Mitsuba.
     """
 
     needs_aperture_sample = True
     delta = False
     needs_film_sample = True
 
-    def __init__(self, sensor, shape_errors):
+    def __init__(self, sensor, shape_errors, views=None, in_scene=True):
         super().__init__(sensor)
-        self._shape, self._shape_errors = sensor.get_shape(), shape_errors
-        self._smooth_mesh = SmoothMeshes.of([sensor])
-        sphere = Sphere.of(self._shape)
-        self._sphere = sphere if sphere is not None and sphere.turned else None
-        self._density = dr.opaque(mi.Float, 1 / number(self._shape.surface_area()))
-        # A light subpath tells its point of the shape, but not the film position that chooses it.
-        self.area = self.region.box
-        self.no_area = "with a filter other than box the film position of a point of its shape is unknown"
+        self._faces = [_Face(view, shape_errors) for view in views or [sensor]]
+        self._density = dr.opaque(mi.Float, 1 / number(self._faces[0].shape.surface_area()))
+        self._find_area(in_scene)
+
+    def _find_area(self, in_scene: bool):
+        """Set ``area``; ``in_scene``: whether the shape is one of the scene, which rays can hit."""
+        if len(self._faces) > 1:
+            self.no_area = "which of the batch's meters light hits is not looked for"
+        elif not in_scene:
+            self.no_area = "the meter's shape is not in the scene"
+        elif not self.region.box or tuple(self.region.crop_size) != (1, 1):
+            # A light subpath tells its point of the shape, but not the film position that chooses it.
+            self.no_area = (
+                "with more than one pixel, or a filter other than box, the film position of a point of its "
+                "shape is unknown"
+            )
+        else:
+            self.area = True
 
     def _sample(self, u, shared, reference=None):
-        """A point of the shape, and its anchor for rays to and from ``reference`` (the point itself)."""
-        ps = self._shape.sample_position(shared.time, u)
-        if self._sphere is not None:
-            ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
-        n = ps.n
-        if self._smooth_mesh is not None:
-            n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
-        errors = self._shape_errors.at(mi.ShapePtr(self._shape))
-        return ps, rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
+        """As `_Face.sample`, of the view that ``u`` chooses."""
+        if len(self._faces) == 1:
+            return self._faces[0].sample(u, shared, reference)
+        index, x = view_at(u.x, len(self._faces))
+        u = mi.Point2f(x, u.y)
+        found = self._faces[0].sample(u, shared, reference)
+        for i, face in enumerate(self._faces[1:], 1):
+            found = dr.select(index == i, face.sample(u, shared, reference), found)
+        return found
 
     def _start(self, uv, u_lens, shared) -> CameraStart:
-        ps, anchor = self._sample(uv, shared)
+        p, n, anchor = self._sample(uv, shared)
         local = mi.warp.square_to_cosine_hemisphere(u_lens)
-        d = mi.Frame3f(ps.n).to_world(local)
+        d = mi.Frame3f(n).to_world(local)
         pdf_w = local.z * dr.inv_pi
         return CameraStart(
             ray=mi.Ray3f(rays.spawn(anchor, d, shared)),
-            p=mi.Point3f(ps.p),
+            p=p,
             pdf_w=pdf_w,
             weight=mi.Float(dr.pi),
             arrival=dr.pi / self._density if self.area else mi.Float(0),  # cos / (density * cos / pi)
         )
 
     def join(self, p, u_lens, u_film) -> CameraJoin:
-        ps, anchor = self._sample(u_film, self._like(), p)
-        to_z0 = ps.p - p
+        z0, n, anchor = self._sample(u_film, self._like(), p)
+        to_z0 = z0 - p
         dist2 = dr.squared_norm(to_z0)
         d = to_z0 * dr.rsqrt(dist2)
-        return self._joining(ps, mi.Vector3f(d), dist2, anchor, u_film)
+        return self._joining(z0, n, mi.Vector3f(d), dist2, anchor, u_film)
 
     def join_direction(self, d, u_lens, u_film) -> CameraJoin:
-        ps, anchor = self._sample(u_film, self._like())
-        return self._joining(ps, mi.Vector3f(d), mi.Float(1), anchor, u_film)
+        z0, n, anchor = self._sample(u_film, self._like())
+        return self._joining(z0, n, mi.Vector3f(d), mi.Float(1), anchor, u_film)
 
-    def _joining(self, ps, d, dist2, anchor, u_film) -> CameraJoin:
-        cos = dr.dot(ps.n, -d)
+    def _joining(self, z0, n, d, dist2, anchor, u_film) -> CameraJoin:
+        cos = dr.dot(n, -d)
         return CameraJoin(
-            p=mi.Point3f(ps.p),
+            p=z0,
             anchor=anchor,
             d=d,
             dist2=dist2,
@@ -201,7 +233,7 @@ class IrradianceMeter(Sensor):
             pdf_w=cos * dr.inv_pi,
             importance=self._density * cos / vertex.cos,
             position=self.region.to_position(mi.Point2f(0.5)),
-            active=vertex.hit & (cos > 0) & (si.shape == mi.ShapePtr(self._shape)),
+            active=vertex.hit & (cos > 0) & (si.shape == mi.ShapePtr(self._faces[0].shape)),
         )
 
 
