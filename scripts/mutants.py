@@ -733,8 +733,8 @@ MUTANTS = (
     Mutant(
         "media: lamps are in no medium",
         "scene/light_media.py",
-        "return space.media.sensor",
-        "return 0",
+        "if len(numbers) else space.media.sensor",
+        "if len(numbers) else 0",
         (
             "tests/images/test_media_identities.py::test_spots_in_fog[spot]",
             "tests/images/test_media_identities.py::test_spots_in_fog[beam]",
@@ -774,8 +774,8 @@ MUTANTS = (
     Mutant(
         "media: seldom chosen lamps are in one medium",
         "scene/light_media.py",
-        "mixed.append(unknown or bool(",
-        "mixed.append(bool(",
+        "mixed = finite and (seldom or bool(",
+        "mixed = finite and (bool(",
         ("tests/images/test_media_edges.py::test_a_lamp_that_is_seldom_chosen[0.0001-True]",),
     ),
     Mutant(
@@ -902,6 +902,60 @@ MUTANTS = (
         "bounds = hit & si.is_medium_transition() & _may_leave(si, -d)",
         "bounds = hit & si.is_medium_transition()",
         ("tests/images/test_media_boundaries.py::test_light_on_a_side_that_states_nothing[spot-wall]",),
+    ),
+    Mutant(
+        "media: lamps do not look for keyholes",
+        "media/boundaries.py",
+        "aimed = aims & ((reflections & 1) == 0)",
+        "aimed = mi.Bool(False)",
+        ("tests/images/test_media_boundaries.py::test_a_lamp_behind_a_keyhole",),
+    ),
+    Mutant(
+        "media: rays within a plane are aimed at",
+        "media/boundaries.py",
+        "> _GRAZING",
+        "> 0",
+        ("tests/images/test_media_boundaries.py::test_a_lamp_behind_a_keyhole",),
+    ),
+    Mutant(
+        "media: surroundings are what the sensor sees",
+        "scene/light_media.py",
+        "[numbers, leaving.number[leaving.escaped]]",
+        "[numbers]",
+        (
+            "tests/images/test_media_boundaries.py::test_sky_through_a_small_window[open]",
+            "tests/images/test_media_boundaries.py::test_sky_through_a_small_window[porch]",
+        ),
+    ),
+    Mutant(
+        "media: rays may leave in two media",
+        "scene/light_media.py",
+        "wrong = leaving.escaped & (leaving.number != media.outside)",
+        "wrong = np.zeros_like(leaving.escaped)",
+        ("tests/images/test_media_boundaries.py::test_media_that_nothing_tells[a gap under a porch]",),
+    ),
+    Mutant(
+        "media: the sky is in the sensor's medium if none is known",
+        "scene/light_media.py",
+        "elsewhere = leaving.lost & (leaving.number != space.media.sensor)",
+        "elsewhere = np.zeros_like(leaving.lost)",
+        ("tests/images/test_media_boundaries.py::test_media_that_nothing_tells[a hall]",),
+    ),
+    Mutant(
+        "media: a lamp is outside if its medium is not known",
+        "scene/light_media.py",
+        'why if lost else ""',
+        '""',
+        ("tests/images/test_media_boundaries.py::test_media_that_nothing_tells[a lamp in a box]",),
+    ),
+    Mutant(
+        "boxes: rectangles merged with a cube have its size",
+        "geometry/boxes.py",
+        'shape.class_name() == "Mesh" or ',
+        "",
+        (
+            "tests/emitters/test_emission_densities.py::test_the_size_of_a_scene_with_rectangles_merged_with_a_cube",
+        ),
     ),
     Mutant(
         "media: rays of lamps leave through walls",

@@ -494,6 +494,17 @@ def test_sizes_of_scenes_with_merged_rectangles():
     assert all(np.isfinite(float(sphere.radius[0])) for sphere in aims.spheres)
 
 
+def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
+    """Rationale: the box of such a mesh is that of the cube alone, and valid. Expected: the scene's box is
+    that of all.
+    """
+    scene = room_of_rectangles()
+    scene["cube"]["bsdf"] = scene["floor"]["bsdf"]
+    merged, apart = (mi.load_dict(scene, optimize=on) for on in (True, False))
+    assert (len(merged.shapes()), len(apart.shapes())) == (1, 6)
+    assert boxes.scene_box(merged) == apart.bbox()
+
+
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_light_subpaths(name):
     """Rationale: the density of aimed emission enters the weights of all strategies, at the points where

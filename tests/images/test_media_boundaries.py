@@ -129,6 +129,87 @@ def test_light_on_a_side_that_states_nothing(light, emits):
     assert list(media._front) == [1] * (1 + emits)
 
 
+def windowed(half=0.15, gap=0.0, **more):
+    """A room of 10 m with opaque walls and a window in the ceiling, which bounds the fog in the room.
+
+    ``half`` the window's width / 2; ``gap``: how far part of the ceiling is away from it.
+    """
+    at, wall = parts.transform(), {"type": "rectangle", "bsdf": plaster()}
+    shapes = {
+        name: {**wall, "to_world": at.rotate(*turn).scale(5).translate([0, 0, -1])}
+        for name, turn in WALLS.items()
+        if name != "ceiling"
+    }
+    shapes["front"] = {**wall, "to_world": at.translate([0, 0, 5]).scale(5)}
+    up, strip, middle = at.translate([0, 5, 0]).rotate([1, 0, 0], -90), (5 - half) / 2, (5 + half) / 2
+    for name, x, y, width, height in (
+        ("east", middle + gap, 0, strip, 5),
+        ("west", -middle, 0, strip, 5),
+        ("north", 0, middle, half, strip),
+        ("south", 0, -middle, half, strip),
+    ):
+        shapes[name] = {**wall, "to_world": up.translate([x, y, 0]).scale([width, height, 1])}
+    null = {"bsdf": {"type": "null"}, "interior": shared()}
+    window = {"type": "rectangle", "id": "window", "to_world": up.scale(half), **null}
+    eye = parts.sensor(origin=(0, 0, 4), target=(0, 0, 0), medium=shared())
+    scene = {"type": "scene", "fog": fog(0.08, id="fog"), "sensor": eye, **shapes, "window": window}
+    return mi.load_dict(scene | {"sky": parts.sky()} | more)
+
+
+def porch():
+    """A roof above the window, so that no straight line from outside meets it before the room's walls."""
+    to_world = parts.transform().translate([0, 8, 0]).rotate([1, 0, 0], 90).scale(20)
+    return {"roof": {"type": "rectangle", "bsdf": plaster(), "to_world": to_world}}
+
+
+def sealed(half, at, **more):
+    """A cube of plaster with nothing in it that states a medium."""
+    to_world = parts.transform().translate(list(at)).scale(half)
+    return {"type": "cube", "bsdf": plaster(), "to_world": to_world, **more}
+
+
+@pytest.mark.parametrize("covered", [False, True], ids=["open", "porch"])
+def test_sky_through_a_small_window(covered):
+    """Rationale: no ray around the sensor found the window, 10 cm wide, and the sky then started in fog
+    without end: a contradiction, or 17 % too dark under a porch. Expected: it starts in vacuum.
+    """
+    _, light = prepared(windowed(0.05, **(porch() if covered else {})))
+    assert (light.contradiction, light.outside, light.hides_infinity) == ("", 0, False)
+
+
+def test_a_lamp_behind_a_keyhole():
+    """Rationale: no ray of a lamp found the boundary, 5 cm wide, and it shone in the vacuum that the sensor
+    outside is in: 6 % too dark. Expected: it is in the fog of the room.
+    """
+    lamp = parts.lamp(center=[2, 1, 2], radius=0.5)
+    eye = parts.sensor(origin=(0, 5.1, 0.01), target=(0, 0, 0), near=1e-3)
+    scene = windowed(0.025, lamp=lamp, sensor=eye, sky=parts.point(position=[0, 20, 0]))
+    _, light = prepared(scene)
+    assert (light.contradiction, sorted(light._front)) == ("", [0, 1])
+    assert not light.mixed
+
+
+UNKNOWN = {
+    "a gap under a porch": (lambda: windowed(0.15, gap=2, **porch()), "leave the scene in"),
+    "a hall": (lambda: windowed(0.15, hall=sealed(12, (0, 0, 0))), "in which light from infinity starts"),
+    "a lamp in a box": (
+        lambda: windowed(case=sealed(0.5, (2, 1, 0)), lamp=parts.point(position=[2, 1, 0])),
+        "meets a boundary or leaves the scene",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_media_that_nothing_tells(name):
+    """Rationale: a medium that no ray finds was that of the sensor. Expected: no light subpaths, and why:
+    a gap beside the window, through which rays leave in fog; opaque walls around all under a sky; a lamp in a
+    closed box.
+    """
+    scene, why = UNKNOWN[name]
+    _, light = prepared(scene())
+    assert why in light.contradiction
+
+
 def closed_room():
     """Fog that the sensor declares, in plain walls; behind a pillar glass that says it stands in nothing."""
     behind = parts.ball("dielectric", 0.05, (0, 0.2, -0.8), interior=fog(2.0), id="glass")

@@ -1,8 +1,8 @@
 """Bounding boxes of shapes and scenes, also where Mitsuba's own are invalid.
 
-Mitsuba merges rectangles of one BSDF into a mesh when it loads a scene; ``bbox`` of that mesh is invalid, and
-not part of the scene's. A mesh with a vertex that is not finite has an invalid box too, though rays meet its
-other triangles.
+Mitsuba merges rectangles and meshes of one BSDF into a mesh when it loads a scene. ``bbox`` of that mesh, and
+the scene's, lack the rectangles; it is invalid if there is nothing else. A mesh with a vertex that is not
+finite has an invalid box too, though rays meet its other triangles.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
     """The bounding box of a scene, those of shapes included that Mitsuba leaves out of its own."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
     for shape in scene.shapes():
-        if not _is_finite(mi.ScalarBoundingBox3f(shape.bbox())) and (box := box_of(shape)) is not None:
+        partial = shape.class_name() == "Mesh" or not _is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
+        if partial and (box := box_of(shape)) is not None:
             whole.expand(box)
     return whole
 

@@ -53,17 +53,19 @@ _REFLECTIONS = 16
 
 
 @dr.syntax
-def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> NearSide:
+def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool, target: mi.Point3f | None = None) -> NearSide:
     """Find the first boundary along ``ray`` of whose side light may leave.
 
     Scenes leave the medium of other sides unstated: that within a wall, at the back of a lamp. Such sides,
     and surfaces that bound no medium, are passed straight on if they transmit light. Opaque ones reflect the
-    ray as mirrors do, so that it stays where light can go.
+    ray as mirrors do, so that it stays where light can go; every other one towards the ``target``.
     """
+    aims = mi.Bool(target is not None)
+    aim = mi.Point3f(0) if target is None else target
     o, d, number = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.UInt32(0)
     found, escaped, reflections = mi.Bool(False), mi.Bool(False), mi.UInt32(0)
     going = mi.Bool(active)
-    while dr.hint(going, label="the first boundary", exclude=[space, ray, active]):
+    while dr.hint(going, label="the first boundary", exclude=[space, ray, active, aims, aim]):
         segment = mi.Ray3f(o, d, ray.time, ray.wavelengths)
         si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
         hit = going & si.is_valid()
@@ -72,11 +74,55 @@ def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> NearSide:
         found |= bounds
         escaped |= going & ~hit
         opaque = hit & ~bounds & ~_transmits(si)
-        d = dr.select(opaque, _mirrored(d, si.n), d)
+        aimed = aims & ((reflections & 1) == 0)
+        d = dr.select(opaque, dr.select(aimed, _towards(aim, si, d), _mirrored(d, si.n)), d)
         o = _onwards(space, segment, si, d, opaque)
         reflections += dr.select(opaque, mi.UInt32(1), 0)
         going = hit & ~bounds & (reflections < _REFLECTIONS)
     return NearSide(number, found, escaped)
+
+
+@dataclass
+class Leaving:
+    """Rays that leave boundaries: each ``ray`` starts in the medium ``number``.
+
+    Mask ``known``: there is a boundary, and light may leave it along the ray.
+    """
+
+    ray: mi.Ray3f
+    number: mi.UInt32
+    known: mi.Bool
+
+
+def leaving(space: Space, line: mi.Ray3f, through: mi.Point3f, local: mi.Vector3f) -> Leaving:
+    """Rays from the boundary on each ``line`` that is nearest to the point ``through``.
+
+    ``local`` their directions in a frame about the boundary's normal.
+    """
+    start, found = _before_the_nearest(space, line, through)
+    segment = mi.Ray3f(start, line.d, line.time, line.wavelengths)
+    si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=found)
+    d = mi.Frame3f(si.n).to_world(local)
+    known = found & si.is_valid() & si.is_medium_transition() & _may_leave(si, d)
+    ray = rays.spawn(rays.surface_anchor(si, segment, space.shape_errors), d, line)
+    return Leaving(ray, space.media.number(si.target_medium(d)), known)
+
+
+@dr.syntax
+def _before_the_nearest(space: Space, line: mi.Ray3f, through: mi.Point3f) -> tuple[mi.Point3f, mi.Bool]:
+    """A point on each ``line`` just before its boundary nearest to ``through``, and whether there is one."""
+    o, start = mi.Point3f(line.o), mi.Point3f(line.o)
+    best, going = dr.full(mi.Float, dr.inf, dr.width(line.o)), mi.Bool(True)
+    while dr.hint(going, label="boundaries near a point", exclude=[space, line, through]):
+        segment = mi.Ray3f(o, line.d, line.time, line.wavelengths)
+        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
+        hit = going & si.is_valid()
+        distance = dr.select(hit & si.is_medium_transition(), dr.norm(si.p - through), dr.inf)
+        start = dr.select(distance < best, o, start)
+        best = dr.minimum(best, distance)
+        o = segment(rays.passed(segment, si, space.shape_errors))
+        going = mi.Bool(hit)
+    return start, best < dr.inf
 
 
 @dataclass
@@ -154,10 +200,14 @@ def _mirrored(d, n) -> mi.Vector3f:
     return d - n * (2 * dr.dot(d, n))
 
 
+# Cosine below which rounding decides on which side of a plane a direction within it goes.
+_GRAZING = 1e-3
+
+
 def _towards(target, si, d) -> mi.Vector3f:
-    """Direction from ``si`` to ``target``, that of a mirror where this is on the other side than ``-d``."""
+    """Direction from ``si`` to ``target``, that of a mirror where this is not on the side of ``-d``."""
     aimed = dr.normalize(target - si.p)
-    return dr.select(dr.dot(si.n, aimed) * dr.dot(si.n, d) < 0, aimed, _mirrored(d, si.n))
+    return dr.select(dr.dot(si.n, aimed) * -dr.sign(dr.dot(si.n, d)) > _GRAZING, aimed, _mirrored(d, si.n))
 
 
 def _onwards(space: Space, segment, si, d, turned) -> mi.Point3f:

@@ -29,6 +29,9 @@ _PROBES, _OF_EMITTER, _OF_EMITTERS = 64, 4096, 1 << 20
 _LINES, _TOLERATED = 2048, 0.01
 _OF_SHAPE, _TOLERATED_OF_SHAPE, _MOST_SHAPES = 64, 0.05, 1024
 
+# Rays that leave boundaries, of all shapes and of one at most.
+_LEAVING, _LEAVING_ONE = 1 << 16, 1024
+
 # Relative difference of sigma_t rho and its reverse, on average, that rounding leaves.
 _SYMMETRIC = 1e-3
 
@@ -45,27 +48,30 @@ class LightMedia:
         self._space, self._emitters = space, emitters
         rays = _rays_around(sensor, _PROBES, 0)
         around = _Asked.of(boundaries.near_side(space, rays, mi.Bool(True)), _PROBES)
-        self.outside = _outside(space, around)
+        bounds = _bounding_shapes(space.scene)
+        leaving = _Leaving.of(space, bounds) if bounds else None
+        self.outside = _outside(space, around, leaving)
         self._outside = dr.opaque(mi.UInt32, self.outside)
-        self.contradiction = (
-            _contradiction_of_media(space, sensor, around, self.outside)
-            or _contradiction_of_phases(space)
-            or (_contradiction_at_infinity(space, self.outside) if emitters.at_infinity else "")
-            or _contradiction_at_far_plane(space, sensor, 0 if far == self.outside else far)
-        )
         # Nothing arrives from infinity through a homogeneous medium without end.
         endless = space.media.objects[self.outside - 1] if self.outside else None
         self.hides_infinity = (
             endless is not None and endless.is_homogeneous() and space.media.looks[self.outside - 1].least > 0
         )
         front, back = _declared(space, emitters)
-        probed, mixed = (
-            self._probed() if emitters.traced else ([0] * emitters.count, [False] * emitters.count)
+        found = self._probed(leaving) if emitters.traced else [_Probed(0, False, "")] * emitters.count
+        self.contradiction = (
+            _contradiction_of_media(space, sensor, around, self.outside, bounds)
+            or (_contradiction_of_surroundings(space, leaving, self, emitters.at_infinity) if leaving else "")
+            or _contradiction_of_phases(space)
+            or (_contradiction_at_infinity(space, self.outside) if emitters.at_infinity else "")
+            or _contradiction_at_far_plane(space, sensor, 0 if far == self.outside else far)
+            or next((p.unknown for f, p in zip(front, found, strict=True) if f is None and p.unknown), "")
         )
-        self._front = mi.UInt32([p if f is None else f for f, p in zip(front, probed, strict=True)] or [0])
-        self._back = mi.UInt32([p if b is None else b for b, p in zip(back, probed, strict=True)] or [0])
+        pairs = zip(front, back, found, strict=True)
+        numbers = [(p.number if f is None else f, p.number if b is None else b) for f, b, p in pairs]
+        self._front, self._back = (mi.UInt32([pair[i] for pair in numbers] or [0]) for i in (0, 1))
         # Of emitters that stand partly in a medium, each ray is asked.
-        mixed = [m and f is None for m, f in zip(mixed, front, strict=True)]
+        mixed = [p.mixed and f is None for p, f in zip(found, front, strict=True)]
         self.mixed = any(mixed)
         self._mixed = mi.Bool(mixed or [False])
         dr.make_opaque(self._front, self._back, self._mixed)
@@ -84,11 +90,11 @@ class LightMedia:
         number = dr.select(found.escaped, self._outside, number)
         return dr.select(found.found, found.number, number)
 
-    def _near_side(self, e, active) -> boundaries.NearSide:
-        return boundaries.near_side(self._space, mi.Ray3f(e.anchor.towards(e.d), e.d), active)
+    def _near_side(self, e, active, target=None) -> boundaries.NearSide:
+        return boundaries.near_side(self._space, mi.Ray3f(e.anchor.towards(e.d), e.d), active, target)
 
-    def _probed(self) -> tuple[list[int], list[bool]]:
-        """By emitter: the medium that its rays start in, and whether they do not all start in the same."""
+    def _probed(self, leaving: _Leaving | None) -> list[_Probed]:
+        """What rays of each emitter find; towards boundaries too, which may be as small as a keyhole."""
         count = self._emitters.count
         rng = np.random.default_rng(0)
         each = min(max(_OF_EMITTERS // max(count, 1), _PROBES), _OF_EMITTER)
@@ -100,20 +106,40 @@ class LightMedia:
             zeros += 550
         shared = Shared(mi.Float(0), zeros, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(u_point, mi.Point2f(u[1], u[2]), shared, mi.Bool(True))
-        asked = _Asked.of(self._near_side(e, mi.Bool(True)), n)
+        target = leaving.points(n, rng) if leaving else None
+        asked = _Asked.of(self._near_side(e, mi.Bool(True), target), n)
         number = np.where(asked.found, asked.number, self.outside)
         known = asked.found | asked.escaped
         index = np.array(e.index + dr.zeros(mi.UInt32, n))
         order = np.argsort(index, kind="stable")
         parts = np.split(order, np.searchsorted(index[order], np.arange(1, count)))
-        probed, mixed = [], []
+        probed = []
         for emitter, part in zip(self._emitters.scene.emitters(), parts, strict=True):
             of_this = number[part[known[part]]]
-            probed.append(int(np.bincount(of_this).argmax()) if len(of_this) else self.outside)
+            most = int(np.bincount(of_this).argmax()) if len(of_this) else self.outside
             # One that is seldom chosen is not known well enough.
-            unknown = len(part) < _PROBES // 2 and emitter.sampling_weight() > 0
-            mixed.append(unknown or bool((of_this != probed[-1]).any()))
-        return probed, mixed
+            seldom = len(part) < _PROBES // 2 and emitter.sampling_weight() > 0
+            finite = not mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+            lost = finite and target is not None and len(part) >= _PROBES // 2 and not len(of_this)
+            why = (
+                f"no ray of emitter {named(emitter)} meets a boundary or leaves the scene, so that the "
+                "medium in which it is stays unknown: give the shapes around it their media"
+            )
+            mixed = finite and (seldom or bool((of_this != most).any()))
+            probed.append(_Probed(most, mixed, why if lost else ""))
+        return probed
+
+
+@dataclass(frozen=True)
+class _Probed:
+    """What rays of an emitter find: the ``number`` of the medium that most start in.
+
+    ``mixed``: not all start in the same. ``unknown``: why it is not known at all, or empty.
+    """
+
+    number: int
+    mixed: bool
+    unknown: str
 
 
 def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
@@ -147,18 +173,84 @@ class _Asked:
         return self.number[self.found]
 
 
-def _outside(space: Space, around: _Asked) -> int:
+def _bounding_shapes(scene: mi.Scene) -> list[tuple[mi.Shape, mi.ScalarBoundingBox3f]]:
+    """Shapes of a scene that bound media, instances too, with their boxes."""
+    bounds = [s for s in scene.shapes() if s.is_medium_transition() or is_instance(s)]
+    return [(s, box) for s in bounds if (box := box_of(s)) is not None][:_MOST_SHAPES]
+
+
+@dataclass(frozen=True)
+class _Leaving:
+    """Rays that leave boundaries, (shapes, rays of each): the media that they start in, and where they end.
+
+    Masks: ``escaped``, they leave the scene without meeting another boundary; ``lost``, they stay among
+    opaque surfaces. ``p`` where those of known medium start, (3, n).
+    """
+
+    shapes: list[mi.Shape]
+    number: np.ndarray
+    known: np.ndarray
+    escaped: np.ndarray
+    lost: np.ndarray
+    p: np.ndarray
+
+    @classmethod
+    def of(cls, space: Space, bounds: list) -> _Leaving | None:
+        """Rays to both sides of the shapes ``bounds``; None if no boundary was met."""
+        each = min(max(_LEAVING // len(bounds), _OF_SHAPE), _LEAVING_ONE)
+        count = each * len(bounds)
+        rng = np.random.default_rng(4)
+        through = _points_in([box for _, box in bounds], each, rng)
+        local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.random((2, count))))
+        local.z = dr.select(dr.arange(mi.UInt32, count) % 2 == 0, local.z, -local.z)
+        sides = boundaries.leaving(space, _through_scene(space, through, rng), through, local)
+        dr.eval(sides)
+        met = _Asked.of(boundaries.near_side(space, sides.ray, sides.known), count)
+        number, known = (np.broadcast_to(np.array(x), count) for x in (sides.number, sides.known))
+        if not known.any():
+            return None
+        p = np.array(sides.ray.o)[:, known]
+        arrays = (number, known, known & met.escaped, known & ~met.escaped & ~met.found)
+        return cls([s for s, _ in bounds], *(x.reshape(len(bounds), each) for x in arrays), p)
+
+    def points(self, count: int, rng) -> mi.Point3f:
+        """So many random points of boundaries from which light may leave."""
+        return mi.Point3f(self.p[:, rng.integers(self.p.shape[1], size=count)])
+
+
+def _outside(space: Space, around: _Asked, leaving: _Leaving | None) -> int:
     """The number of the medium that surrounds the scene.
 
-    The sensor's if some of the rays ``around`` it escape, or if none meets a boundary; else what most
-    boundaries say that are met from outside.
+    That of most rays that leave the scene, from boundaries or ``around`` the sensor; the sensor's if none
+    does.
     """
-    if around.escaped.any() or not around.found.any():
-        return space.media.sensor
-    rng = np.random.default_rng(1)
-    rays = _through_scene(space, _points_in([scene_box(space.scene)], _LINES, rng), rng)
-    met = _Asked.of(boundaries.near_side(space, rays, mi.Bool(True)), _LINES)
-    return int(np.bincount(met.numbers).argmax()) if met.found.any() else 0
+    numbers = np.full(around.escaped.sum(), space.media.sensor)
+    if leaving is not None:
+        numbers = np.concatenate([numbers, leaving.number[leaving.escaped]])
+    return int(np.bincount(numbers).argmax()) if len(numbers) else space.media.sensor
+
+
+def _contradiction_of_surroundings(
+    space: Space, leaving: _Leaving, media: LightMedia, at_infinity: bool
+) -> str:
+    """Why it is not certain which medium surrounds the scene; empty if it is."""
+    wrong = leaving.escaped & (leaving.number != media.outside)
+    number = wrong.sum(1)
+    share = np.where(number > 2, number / np.maximum(leaving.known.sum(1), 1), 0)
+    if share.max() > _TOLERATED_OF_SHAPE or (at_infinity and media.hides_infinity and wrong.any()):
+        worst = int(np.argmax(share if share.max() > 0 else number))
+        inside = _called(space, int(leaving.number[worst][wrong[worst]][0]))
+        return (
+            f"rays from shape {named(leaving.shapes[worst])} leave the scene in {inside}, others in "
+            f"{_called(space, media.outside)}, which therefore disagree: close the boundary between them"
+        )
+    elsewhere = leaving.lost & (leaving.number != space.media.sensor)
+    if at_infinity and not leaving.escaped.any() and elsewhere.any():
+        return (
+            "no ray from the boundaries of media leaves the scene, so that the medium in which light from "
+            "infinity starts stays unknown: take out the emitters at infinity if they light nothing"
+        )
+    return ""
 
 
 def _rays_around(sensor: mi.Sensor, count: int, seed: int) -> mi.Ray3f:
@@ -181,7 +273,9 @@ def _camera_rays(sensor: mi.Sensor, count: int, seed: int):
 _AT_ONE_POINT = frozenset("PerspectiveCamera ThinLensCamera RadianceMeter".split())
 
 
-def _contradiction_of_media(space: Space, sensor: mi.Sensor, around: _Asked, outside: int) -> str:
+def _contradiction_of_media(
+    space: Space, sensor: mi.Sensor, around: _Asked, outside: int, bounds: list
+) -> str:
     """Why the sensor and boundaries do not agree on the media between them; empty if they do.
 
     ``around`` are the boundaries around the sensor. Where these are everywhere, and none is in the sensor's
@@ -192,7 +286,7 @@ def _contradiction_of_media(space: Space, sensor: mi.Sensor, around: _Asked, out
     of_sensor = _contradiction_of_sensor(space, sensor, around.numbers)
     if of_sensor and around.found.all() and (around.numbers != space.media.sensor).all():
         return of_sensor
-    return _contradiction_of_shapes(space, sensor, outside) or of_sensor
+    return _contradiction_of_shapes(space, sensor, outside, bounds) or of_sensor
 
 
 def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: np.ndarray) -> str:
@@ -212,14 +306,12 @@ def _called(space: Space, number: int) -> str:
     return f"the medium {named(space.media.objects[number - 1])}" if number else "no medium"
 
 
-def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int) -> str:
+def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int, boxes: list) -> str:
     """Why boundaries do not agree on the medium between them; empty if they do."""
     remedy = (
         "disagree about the medium between them: give each the interior and exterior medium that is there, "
         "and leave a gap where faces coincide"
     )
-    bounds = [s for s in space.scene.shapes() if s.is_medium_transition() or is_instance(s)]
-    boxes = [(s, box) for s in bounds if (box := box_of(s)) is not None][:_MOST_SHAPES]
     if boxes:
         lines = _lines(space, sensor, [box for _, box in boxes], _OF_SHAPE, outside)
         compared, wrong = _counted(space, lines, len(boxes))
