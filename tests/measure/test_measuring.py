@@ -499,7 +499,7 @@ def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
     assert re.search(r"failed: room: no rows: .*json' is damaged .*; delete it", capsys.readouterr().out)
     (here / "elsewhere" / "room.xml").write_text(room.replace("<integrator", "<!-- edited --><integrator", 1))
     assert main(words) == 2
-    assert "reference room_16_4.exr was made of another room.xml" in capsys.readouterr().err
+    assert "reference room_16_4.exr was made of another room, mesh" in capsys.readouterr().err
     grey = '<film type="hdrfilm"><string name="pixel_format" value="luminance"/>'
     (here / "elsewhere" / "fog.xml").write_text(room.replace('<film type="hdrfilm">', grey))
     assert main(words) == 2
