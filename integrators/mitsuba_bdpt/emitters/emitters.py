@@ -37,8 +37,9 @@ class Emitters:
     ``traced``, ``connectible_to_sensor``: camera subpaths can hit one, next-event estimation can choose one,
     light subpaths can start from one, one of these points can be joined with a sensor;
     ``connectible_nearby``: one of the latter is not at infinity; ``unhittable``: one
-    cannot be hit; ``finite_hittable``: one that can be hit and joined is not at infinity; ``on_shapes``: one
-    is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of them do; ``beams``:
+    cannot be hit; ``unhittable_connectible``: indices of those that cannot be hit and whose point can be
+    joined with a sensor; ``finite_hittable``: one that can be hit and joined is not at infinity;
+    ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of them do; ``beams``:
     one can be reached only by the light subpaths that it starts; ``evaluated``: one that lives, be it in
     another scene, makes it necessary to record kernels without symbolic loops, calls and branches.
     ``left_out``: what single ones cannot take part in, and why. ``groups`` that the scene has; ``disks``
@@ -91,6 +92,11 @@ class Emitters:
         self.connectible_to_sensor = any(t.connectible_to_sensor for t in types)
         self.connectible_nearby = any(t.connectible_to_sensor and not t.at_infinity for t in types)
         joined = [h and t.connectible_to_sensor for h, t in zip(hittable, types, strict=True)]
+        self.unhittable_connectible = tuple(
+            i
+            for i, (h, t) in enumerate(zip(hittable, types, strict=True))
+            if not h and t.connectible_to_sensor
+        )
         self.finite_hittable = any(j and not t.at_infinity for j, t in zip(joined, types, strict=True))
         self.on_shapes = any(emitter.get_shape() is not None for emitter in emitters)
         self.beams = any(t.supports_emission and not t.connectible_to_sensor for t in types)

@@ -8,7 +8,11 @@ from ..transport.plan import Plan
 from .choice import LIGHT_GAIN, Prediction, why_not
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
-_STARTS = {Start.DELTA_EMITTER: "delta emitter, delta surfaces", Start.BEAM: "directionalarea"}
+_STARTS = {
+    Start.DELTA_EMITTER: "delta emitter, delta surfaces",
+    Start.BEAM: "directionalarea",
+    Start.DIRECT_DELTA_EMITTER: "delta emitter",
+}
 _RESTS = {
     Rest.SEEN_VERTEX: ", a {vertex} that the sensor sees",
     Rest.VERTICES: ", two other {vertices} or more, delta surfaces or none, sensor",

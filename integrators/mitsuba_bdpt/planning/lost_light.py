@@ -31,7 +31,7 @@ from ..settings import Settings
 from ..transport import spectra
 from ..transport.inputs import Shared
 from ..transport.plan import Plan
-from .possible import unreachable_paths
+from .possible import Start, unreachable_paths
 
 if TYPE_CHECKING:
     from drjit.auto.ad import PCG32  # that of Mitsuba, of which its stubs do not know
@@ -163,7 +163,8 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if prepared.space is not None:  # what it looks with knows surfaces only
         return False
-    return bool(unreachable_paths(prepared, plan, settings))
+    lost = unreachable_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
+    return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
 
 
 def estimate(prepared: PreparedScene, plan: Plan, max_depth: int) -> LostLight:
@@ -210,7 +211,7 @@ def _ids(shapes: mi.UInt32, found: mi.UnpolarizedSpectrum) -> tuple[str, ...]:
 def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     """Say of which emitters, by their ``indices``, the light that is lost cannot be told."""
     emitters = prepared.scene.emitters()
-    lamps = " and ".join(_called(emitters[i]) for i in indices[:NAMED])
+    lamps = " and ".join(called(emitters[i]) for i in indices[:NAMED])
     text = (
         f"bdpt: how much light of {lamps} is missing cannot be told, since the estimate is NaN or infinite; "
         "look for such numbers, or very large ones, in the lamp and in the BSDFs that its light meets"
@@ -247,7 +248,7 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], thro
     emitters = prepared.scene.emitters()
     order = sorted(shares, key=shares.get, reverse=True)
     lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * lost][:NAMED]
-    what = " and ".join(map(_called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
+    what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "a lamp without area cannot be found that way", _remedy(lamps)
     if plan.splat:
@@ -261,7 +262,7 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], thro
     return f"bdpt: {what}: this light, {share} of the image's, is missing, because {why}; {remedy}"
 
 
-def _called(emitter: mi.Emitter) -> str:
+def called(emitter: mi.Emitter) -> str:
     """An emitter by its kind and the nearest id."""
     kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
     if emitter.id():
@@ -276,7 +277,7 @@ def _remedy(emitters: Iterable[mi.Emitter]) -> str:
     return "set merging=true, or give it a small area: an area light on a small sphere or disk"
 
 
-def _shared(prepared: PreparedScene, generator: PCG32) -> Shared:
+def shared_sample(prepared: PreparedScene, generator: PCG32) -> Shared:
     """Time and wavelengths of subpaths."""
     sensor = prepared.camera.sensor
     time = sensor.shutter_open() + generator.next_float32() * sensor.shutter_open_time()
@@ -307,7 +308,7 @@ def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi
     Also the emitters' indices, and the mask of subpaths whose ray is not finite, which hit nothing.
     """
     generator = mi.PCG32(SUBPATHS, SEED, 1)
-    shared = _shared(prepared, generator)
+    shared = shared_sample(prepared, generator)
     e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
     active = e.delta & ~spectra.is_zero(e.weight)  # what is not finite is kept, to be said
     ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
@@ -327,7 +328,7 @@ def _seen(prepared: PreparedScene, plan: Plan, max_depth: int) -> _Ends:
     Weights are those of the irradiance there, distances the radii of the disks that stand for these points.
     """
     generator = mi.PCG32(SUBPATHS, SEED, 2)
-    shared, camera = _shared(prepared, generator), prepared.camera
+    shared, camera = shared_sample(prepared, generator), prepared.camera
     pixels = int(camera.region.size.prod())
     place = (dr.arange(mi.Float, SUBPATHS) + generator.next_float32()) * dr.opaque(
         mi.Float, pixels / SUBPATHS

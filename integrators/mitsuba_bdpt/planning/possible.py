@@ -236,6 +236,7 @@ class Start(Enum):
 
     DELTA_EMITTER = "a delta emitter seen through delta surfaces"
     BEAM = "directionalarea, which emits into one direction"
+    DIRECT_DELTA_EMITTER = "a delta emitter"
 
 
 class Rest(Enum):
@@ -282,6 +283,10 @@ def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> t
             lost.append(UnreachablePaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
         if not camera.delta and starts:
             lost.append(UnreachablePaths(starts, Rest.SENSOR, "t=0"))
+        # With hide_emitters this light is hidden, not lost.
+        direct = bool(emitters.unhittable_connectible) and not settings.hide_emitters
+        if direct and not camera.delta and not p.endpoints and settings.max_depth:
+            lost.append(UnreachablePaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "(1,1)"))
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
         lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))

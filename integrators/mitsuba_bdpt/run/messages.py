@@ -92,6 +92,12 @@ def warn_of_lost_light(prepared, plan, text: str):
         warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
 
 
+def warn_of_missed_direct(prepared, text: str):
+    """Warn once of direct light on the sensor that is not sampled, unless ``text`` is empty."""
+    if text:
+        warn_once(prepared.scene, prepared.camera.sensor, text)
+
+
 def _some(found: list[str]) -> str:
     """The first `NAMED` of them, and how many more there are."""
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""

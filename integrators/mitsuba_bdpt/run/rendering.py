@@ -18,7 +18,7 @@ from ..host.jit import evaluated_mode, gc_paused
 from ..image.accumulator import Accumulator
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
-from ..planning import lost_light
+from ..planning import lost_light, missed_direct
 from ..planning.choice import Prediction
 from ..planning.decision import MOST_ROULETTE
 from ..planning.findings import Findings
@@ -139,6 +139,10 @@ class Render:
                 self._decide_again()
                 if not number:
                     messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())
+                    messages.warn_of_missed_direct(
+                        self.prepared,
+                        missed_direct.warning(self.prepared, self.plan, self.settings, self.findings),
+                    )
                 self._pass(step)
                 if not number:
                     self.lost_light()

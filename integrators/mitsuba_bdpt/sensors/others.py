@@ -247,6 +247,7 @@ class RayOnlySensor(Sensor):
         super().__init__(sensor)
         self.reason = self.no_area = reason
         self._views = views or [sensor]
+        self.delta = not any(map(_has_area, self._views))
 
     def _start(self, uv, u_lens, shared) -> CameraStart:
         index, x = view_at(uv.x, len(self._views))
@@ -265,6 +266,11 @@ class RayOnlySensor(Sensor):
             weight=weight,
             arrival=mi.Float(0),
         )
+
+
+def _has_area(sensor: mi.Sensor) -> bool:
+    """Whether light of a delta emitter arrives at a sensor directly, as far as that is known."""
+    return sensor.class_name() == "ThinLensCamera" or sensor.get_shape() is not None
 
 
 def _sampled(view, uv, u_lens, shared):

@@ -1,0 +1,102 @@
+"""Direct light of delta emitters on a sensor with area: said where it is not sampled."""
+
+import mitsuba as mi
+import pytest
+import scene_parts as parts
+
+T = parts.T
+LAMPS = {
+    "point": {"type": "point", "id": "bulb", "position": [0, 0, 1], "intensity": 3.0},
+    "spot": {"type": "spot", "id": "bulb", "to_world": T().look_at([0, 0, 1], [0, 0, 0], [0, 1, 0])},
+    "directional": {"type": "directional", "id": "bulb", "direction": [0.1, 0, -1]},
+}
+AREA_LAMP = {
+    "type": "rectangle",
+    "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.2),
+    "emitter": {"type": "area", "radiance": 3.0},
+}
+LENS = parts.thinlens(0.3, 3.0, origin=(0, 0, -3), target=(0, 0, 1), size=4)
+CAMERA = parts.perspective(origin=(0, 0, -3), target=(0, 0, 1), size=4)
+FLOOR = {"type": "rectangle", "to_world": T().translate([0, 0, -0.3])}
+BLIND = {"type": "rectangle", "to_world": T().translate([0, 0, 0.5])}
+
+
+def meter(x=0.0):
+    plate = {"type": "rectangle", "to_world": T().translate([x, 0, 0]).scale(0.2)}
+    return parts.meter(plate)
+
+
+def batch(**views):
+    return {"type": "batch", "film": parts.film(size=1, width=2), **views}
+
+
+def said(capfd, sensor, lamp, method=None, **others):
+    """Warnings of a render of one sample, and what `explain` says is lost."""
+    scene = {"type": "scene", "sensor": sensor, "lamp": lamp} | others
+    scene = mi.load_dict(scene, optimize=False)
+    method = mi.load_dict({"type": "bdpt", "max_depth": 4} | (method or {}))
+    method.render(scene, spp=1)
+    lines = capfd.readouterr().out.splitlines()
+    warnings = [line for line in lines if "directly on" in line]
+    return warnings, [line for line in method.explain(scene, spp=1).splitlines() if "lost: " in line]
+
+
+WITHOUT = {"light_paths": 0}
+LOST = {
+    "a meter without light subpaths": (meter, WITHOUT, "leave light_paths at auto"),
+    "a batch of meters without them": (
+        lambda: batch(a=meter(-0.1), b=meter(0.1)),
+        WITHOUT,
+        "leave light_paths at auto",
+    ),
+    "a meter beside a camera": (lambda: batch(a=CAMERA, b=meter()), {}, "render the views one by one"),
+}
+
+
+@pytest.mark.parametrize("lamp", LAMPS)
+@pytest.mark.parametrize("case", LOST)
+def test_missing_direct_light_is_said(case, lamp, capfd):
+    """Rationale: only (1,1) and t = 0 sample direct light of a delta emitter on a sensor with area; without
+    them a meter reads 0, which looks like a measurement.
+
+    Expected: one warning that names the lamp, and the remedy; a line of `explain`.
+    """
+    sensor, method, remedy = LOST[case]
+    warnings, lost = said(capfd, sensor(), LAMPS[lamp], method, floor=FLOOR)
+    assert len(warnings) == 1
+    assert "'bulb' shines directly on" in warnings[0] and remedy in warnings[0]
+    assert "lost: delta emitter, sensor (needs (1,1))" in lost
+
+
+def test_a_lens_without_light_subpaths(capfd):
+    """Rationale: a point light before an open lens is a disk on the film, which camera subpaths miss.
+
+    Expected: a warning if the lens sees it, none if it is outside the image or behind a surface.
+    """
+    for lamp, blind, count in (("point", {}, 1), ("point", {"blind": BLIND}, 0), ("behind", {}, 0)):
+        source = LAMPS["point"] | ({"position": [0, 0, -8]} if lamp == "behind" else {})
+        warnings, _ = said(capfd, LENS, source, WITHOUT, **blind)
+        assert len(warnings) == count, lamp
+
+
+@pytest.mark.parametrize(
+    "sensor, lamp, method, others",
+    [
+        (meter, LAMPS["point"], {}, {}),
+        (lambda: batch(a=meter(-0.1), b=meter(0.1)), LAMPS["directional"], {}, {}),
+        (meter, AREA_LAMP, WITHOUT, {}),
+        (meter, {"type": "constant"}, WITHOUT, {}),
+        (meter, LAMPS["point"], WITHOUT, {"blind": BLIND}),
+        (meter, LAMPS["point"] | {"position": [0, 0, -1]}, WITHOUT, {}),
+        (meter, LAMPS["point"], WITHOUT | {"hide_emitters": True}, {}),
+        (lambda: CAMERA, LAMPS["point"], WITHOUT, {}),
+        (lambda: batch(a=CAMERA, b=parts.orthographic(size=4)), LAMPS["point"], {}, {}),
+    ],
+)
+def test_nothing_is_said_where_nothing_is_missing(sensor, lamp, method, others, capfd):
+    """Rationale: a warning about light that is not missing teaches to overlook them.
+
+    Expected: none where (1,1) takes part, where s = 0 finds the lamp, where a surface or the back of the
+    meter stops the light, where the lamp is hidden on purpose, and of sensors without area.
+    """
+    assert said(capfd, sensor(), lamp, method, **others)[0] == []
