@@ -39,9 +39,10 @@ class Emitters:
     ``connectible_nearby``: one of the latter is not at infinity; ``unhittable``: one
     cannot be hit; ``unhittable_connectible``: indices of those that cannot be hit and whose point can be
     joined with a sensor; ``finite_hittable``: one that can be hit and joined is not at infinity;
-    ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of them do; ``beams``:
-    one can be reached only by the light subpaths that it starts; ``evaluated``: one that lives, be it in
-    another scene, makes it necessary to record kernels without symbolic loops, calls and branches.
+    ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of
+    them do; ``beams``: one can be reached only by the light subpaths that it starts; ``evaluated``: one
+    that lives, be it in another scene, makes it necessary to record kernels without symbolic loops, calls
+    and branches.
     ``left_out``: what single ones cannot take part in, and why. ``groups`` that the scene has; ``disks``
     where light subpaths from infinity start, if any do; ``shape_errors`` of the scene, for rays.
     ``table_count``: tables that guide emission (`emission_tables`), ``side`` of those that know the `cell` of
