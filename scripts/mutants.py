@@ -985,10 +985,17 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "media: voxels do not count",
+        "media: tables do not count",
         "media/equal.py",
         "np.array_equal(np.array(ours), np.array(theirs), equal_nan=True)",
         "True",
+        ("tests/images/test_media_boundaries.py::test_media_are_told_apart_by_what_they_are[llvm_ad_rgb]",),
+    ),
+    Mutant(
+        "media: grids of one class are equal",
+        "media/equal.py",
+        "owner if _varies(owner) else None, *_shapes",
+        "None, *_shapes",
         ("tests/images/test_media_boundaries.py::test_media_are_told_apart_by_what_they_are[llvm_ad_rgb]",),
     ),
     Mutant(

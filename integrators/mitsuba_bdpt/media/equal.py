@@ -25,7 +25,8 @@ def representatives(media: list[mi.Medium], answers: Callable[[mi.Medium], np.nd
     ``answers(medium)``: extinction, scattering and phase function at random points and directions.
 
     Two media are equal if they have the same structure (`_structure`), the same values, and the same answers
-    to rounding. Constants count by the answers alone, since only their product matters.
+    to rounding. Constants count by the answers alone, since only their product matters. Volumes that vary are
+    equal to themselves alone: Mitsuba states neither the filter of a grid, nor how it goes on beyond its box.
     """
     structures = [_structure(medium) for medium in media]
     answered = cache(lambda index: answers(media[index]))
@@ -47,7 +48,7 @@ def _same(structure: tuple | None, other: tuple | None) -> bool:
 
 
 def _structure(medium: mi.Medium) -> tuple | None:
-    """Classes and texts of a medium and of all that it holds; None with a plugin written in Python.
+    """Classes of a medium and of all that it holds, and its volumes; None with a plugin written in Python.
 
     What such a plugin is, its parameters do not tell.
     """
@@ -55,18 +56,17 @@ def _structure(medium: mi.Medium) -> tuple | None:
     # Objects of Mitsuba's own plugins have just these types, those of plugins in Python derived ones.
     if any(type(owner) not in (mi.Medium, mi.Volume, mi.PhaseFunction) for _, owner in parts):
         return None
-    # The text of a volume has its place and size.
-    texts = (
-        (path, owner.class_name(), str(owner) if _varies(owner) else "", *_shapes(owner))
+    of_parts = (
+        (path, owner.class_name(), owner if _varies(owner) else None, *_shapes(owner))
         for path, owner in parts
     )
-    return (medium.use_emitter_sampling(), *texts)
+    return (medium.use_emitter_sampling(), *of_parts)
 
 
 def _held(owner: mi.Object, path: str) -> Iterator[tuple[str, mi.Object]]:
-    """``owner`` and all that it holds, with paths; constants are left as they are."""
+    """``owner`` and all that it holds, with paths; volumes are left as they are."""
     yield path, owner
-    if isinstance(owner, mi.Volume) and not _varies(owner):
+    if isinstance(owner, mi.Volume):
         return
     for name, value in children(owner).items():
         if isinstance(value, mi.Object):
@@ -79,7 +79,7 @@ def _varies(owner: mi.Object) -> bool:
 
 def _values(owner: mi.Object) -> dict[str, Any]:
     """The parameters of ``owner`` by which it may differ from an equal structure."""
-    if isinstance(owner, mi.Volume) and not _varies(owner):
+    if isinstance(owner, mi.Volume):
         return {}
     skipped = "scale" if isinstance(owner, mi.Medium) and owner.is_homogeneous() else ""
     return {name: value for name, value in own_parameters(owner).items() if name != skipped}
@@ -90,7 +90,7 @@ def _shapes(owner: mi.Object) -> list[tuple]:
 
 
 def _have_same_values(a: mi.Medium, b: mi.Medium) -> bool:
-    """Whether two media of one structure have the same values, constants aside."""
+    """Whether two media of one structure have the same values, volumes aside."""
     return all(
         np.array_equal(np.array(ours), np.array(theirs), equal_nan=True)
         for (_, one), (_, other) in zip(_held(a, ""), _held(b, ""), strict=True)
