@@ -120,6 +120,62 @@ def test_size_and_crop():
     assert nearest == (4, 2) and off[nearest] < 0.2 * off[second]
 
 
+PIXEL = (
+    '<film type="hdrfilm"><integer name="width" value="1"/><integer name="height" value="1"/>'
+    '<rfilter type="box"/></film>'
+)
+LAMP = (
+    '<emitter type="point"><point name="position" value="0,0,1"/><rgb name="intensity" value="3"/></emitter>'
+)
+
+
+def test_size_leaves_meters_alone(capsys):
+    """Rationale: a meter has a film of one pixel, which belongs to its shape or ray; a radiance meter with
+    another one fails in Mitsuba. Expected: the camera beside it has the size that was asked for; where the
+    meter itself is rendered, an error names the option.
+    """
+    Path("meters.xml").write_text(
+        f'<scene version="3.0.0">{LAMP}<film type="hdrfilm" id="pixel"><integer name="width" value="1"/>'
+        '<integer name="height" value="1"/><rfilter type="box"/></film>'
+        '<sensor type="perspective"><film type="hdrfilm"/></sensor>'
+        '<sensor type="radiancemeter"><ref id="pixel"/></sensor>'
+        f'<shape type="rectangle"><sensor type="irradiancemeter">{PIXEL}</sensor></shape></scene>'
+    )
+    with open("meters.xml") as file:
+        scene = mi.load_string(file.read())
+    kinds = [sensor.class_name() for sensor in scene.sensors()]
+    for index, kind in enumerate(kinds):
+        command = ["render", "meters.xml", "--sensor", str(index), "--spp", "1", "-o", f"{kind}.exr"]
+        camera = kind == "PerspectiveCamera"
+        assert main([*command, "--size", "4x3"]) == (0 if camera else 2)
+        assert camera or "size=4x3 is for images" in capsys.readouterr().err
+        if not camera:
+            assert main([*command, "--crop", "0,0,1,1"]) == 2
+            assert "crop=0,0,1,1 is for images" in capsys.readouterr().err
+            assert main(command) == 0
+    assert rendered.image("PerspectiveCamera.exr", "RGB")[0].shape == (3, 4, 3)
+    assert rendered.image("IrradianceMeter.exr", "RGB")[0].shape == (1, 1, 3)
+
+
+def test_equal_meters_on_two_shapes():
+    """Rationale: Mitsuba's loader makes one of equal objects, and a sensor can be on one shape alone.
+    Expected: a file with two equal meters loads; each reads the irradiance of its own small plate, 3 h / r^3.
+    """
+    sensor = f'<sensor type="irradiancemeter">{PIXEL}</sensor>'
+    plates = "".join(
+        f'<shape type="rectangle"><transform name="to_world"><scale value="0.01"/><translate x="{x}"/>'
+        f"</transform>{sensor}</shape>"
+        for x in (0, 1)
+    )
+    Path("two.xml").write_text(f'<scene version="3.0.0">{LAMP}{plates}</scene>')
+    found = []
+    for index in (0, 1):
+        command = ["render", "two.xml", "--sensor", str(index), "--spp", "256", "-o", f"{index}.exr"]
+        assert main(command) == 0
+        found.append(rendered.image(f"{index}.exr", "RGB")[0].mean())
+    np.testing.assert_allclose(sorted(found), [3 / 2**1.5, 3], rtol=1e-3)  # the plate is no point
+
+
 def test_sizes_that_are_refused(capsys):
     Path("cropped.xml").write_text(
         '<scene version="3.0.0"><emitter type="constant"/><sensor type="perspective"><film type="hdrfilm">'

@@ -154,7 +154,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
     text = "folder in which files that the scene names are looked for, after the scene's own; may be repeated"
     add("-a", "--append", type=Path, action="append", default=[], metavar="FOLDER", help=text)
-    text = "size of the image in pixels, in place of that of all of the scene's films"
+    text = "size of the image in pixels, in place of that of all films of the scene but those of meters"
     add("--size", type=size, metavar="WxH", help=text)
     text = "render this part of the image alone, in pixels from the upper left corner"
     add("--crop", type=crop, metavar="X,Y,W,H", help=text)

@@ -39,8 +39,9 @@ TERMINATED = 143
 """The exit status of a process that SIGTERM has ended."""
 
 STATUSES = (
-    f"Exit status: 0 done; {FAILURE} failed, which may not happen again (a full disk, a lost cluster, too "
-    f"little memory); {USAGE} usage error in the command line or the scene, which would happen again; "
+    f"Exit status: 0 done; {FAILURE} failed, which may not happen again (a full disk, a lost cluster, "
+    f"memory that runs out during the render); {USAGE} usage error in the command line or the scene, a film "
+    f"that needs more memory than there is among them, which would happen again; "
     f"{INTERRUPTED} ended by SIGINT (Ctrl-C), {TERMINATED} by SIGTERM."
 )
 """What ``--help`` says of them."""

@@ -37,6 +37,9 @@ NOT_CARRIED = {
 CROP = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 """Parameters of a film's crop window."""
 
+METERS = {"irradiancemeter": "IrradianceMeter", "radiancemeter": "RadianceMeter"}
+"""Sensors whose films `--size` and `--crop` leave alone: plugins and classes."""
+
 AROUND = ("aov", "stokes", *NOT_CARRIED)
 """Mitsuba's integrators around another one."""
 
@@ -152,8 +155,10 @@ def _load(options: Namespace) -> Loaded:
     state = mi.parser.parse_file(config, str(options.scene), **defines)
     _check_root(state, options.scene)
     _check_film_sizes(state)
-    for film in _films(state):
+    for film in _films_of_images(state):
         set_film_size(film.props, options.size, options.crop)
+    if len(_meters(state)) > 1:  # equal ones would become one, which Mitsuba refuses on a second shape
+        config.merge_equivalent = False
     # Nodes are in the order of the file: an integrator comes before those nested in it.
     node = next((node for node in state.nodes if node.type == mi.ObjectType.Integrator), None)
     own = node.props.plugin_name() if node is not None else None
@@ -175,6 +180,7 @@ def _load(options: Namespace) -> Loaded:
     mi.parser.transform_all(config, state)
     # The stub says object; `_check_root` has seen that it is a scene.
     scene: mi.Scene = mi.parser.instantiate(config, state)  # pyright: ignore[reportAssignmentType]
+    _check_no_meter(scene, options)
     if node is not None:
         return Loaded(scene, scene.integrator(), said)
     made = mi.load_dict({"type": used, **overrides})
@@ -228,6 +234,45 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
 def _films(state: mi.parser.ParserState) -> list:
     """The nodes of all films."""
     return [node for node in state.nodes if node.type == mi.ObjectType.Film]
+
+
+def _meters(state: mi.parser.ParserState) -> list:
+    """The nodes of all sensors that measure at a point, along a ray or on a shape, and make no image."""
+    return [node for node in state.nodes if node.type == mi.ObjectType.Sensor and _is_meter(node)]
+
+
+def _is_meter(node: mi.parser.SceneNode) -> bool:
+    return node.props.plugin_name() in METERS
+
+
+def _films_of_images(state: mi.parser.ParserState) -> list:
+    """The nodes of all films but those of meters."""
+    held: set[int] = set()
+    for node in _meters(state):
+        values = [node.props[name] for name in node.props]
+        held |= {value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)}
+        named = [value.id() for value in values if isinstance(value, mi.Properties.Reference)]
+        held |= {state.id_to_index[name] for name in named if name in state.id_to_index}
+    return [
+        node
+        for index, node in enumerate(state.nodes)
+        if node.type == mi.ObjectType.Film and index not in held
+    ]
+
+
+def _check_no_meter(scene: mi.Scene, options: Namespace) -> None:
+    """Raise ``CommandError`` if ``--size`` or ``--crop`` is given for a sensor that is a meter."""
+    given = next((name for name in ("size", "crop") if getattr(options, name)), None)
+    if given is None:
+        return
+    for index in getattr(options, "frames", None) or [options.sensor]:
+        if choose_sensor(scene, index).class_name() in METERS.values():
+            value = getattr(options, given)
+            written = "x".join(map(str, value)) if given == "size" else ",".join(map(str, value))
+            raise CommandError(
+                f"{given}={written} is for images, and sensor {index} is a meter, whose film keeps its size; "
+                f"leave out --{given}, or choose another sensor by --sensor."
+            )
 
 
 def _check_film_sizes(state: mi.parser.ParserState) -> None:
