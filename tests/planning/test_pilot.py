@@ -811,7 +811,19 @@ def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     assert "time to the same error" not in integrator.explain(scene, spp=1024)
     integrator.render(scene, spp=1024)
     assert integrator.statistics["decisions"] == []
-    assert integrator.statistics["no_pilot"] == "it saw nothing, or no finite value"
+    assert integrator.statistics["no_pilot"] == (
+        "it found no light but that of emitters which the sensor sees directly"
+    )
+
+
+def test_pilots_without_a_finite_value_say_so():
+    """Expected: no decision where all that a pilot found is infinite, and the reason is not that of a sky."""
+    lamp = {"type": "point", "position": [0, 3, 0], "intensity": np.inf}
+    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(5)}
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, "floor": floor, "sensor": camera(24)})
+    integrator = bdpt()
+    integrator.render(scene, spp=1024)
+    assert integrator.statistics["no_pilot"] == "it found no finite value"
 
 
 def test_decisions_that_never_begin_are_named():

@@ -60,8 +60,9 @@ UNMEASURED = (
     },
 )
 
-# Why a pilot that was asked decides nothing.
-SAW_NOTHING = "it saw nothing, or no finite value"
+# Why a pilot that was asked decides nothing. (Emission that the sensor sees directly is the same for all.)
+SAW_NOTHING = "it found no light but that of emitters which the sensor sees directly"
+NOT_FINITE = "it found no finite value"
 
 
 class Pilots(NamedTuple):
@@ -163,7 +164,7 @@ class Planner:
                 self._with_tables = answer.with_tables
         if answer.table:
             self.adopt(answer.table[0].decided(len(passes), answer.moments.mean), answer.left_out)
-        self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else SAW_NOTHING)
+        self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else self._why_undecided())
         return list(answer.table)
 
     def _answer(self, samples: int) -> _Answer:
@@ -315,7 +316,11 @@ class Planner:
 
     def why_no_pilot(self, passes: tuple[int, ...] = ()) -> str:
         """Why there is no table of a pilot's, as a sentence."""
-        return f"no pilot: {self._settled(passes)[0] or SAW_NOTHING}"
+        return f"no pilot: {self._settled(passes)[0] or self._why_undecided()}"
+
+    def _why_undecided(self) -> str:
+        """Why the pilots that were asked decide nothing."""
+        return NOT_FINITE if self.lost_by_pilots() else SAW_NOTHING
 
     def _settled(self, passes: tuple[int, ...]) -> tuple[str, Decision | None]:
         """Why no pilot is asked about the rest of the render, and what is decided without one.
