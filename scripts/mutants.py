@@ -892,8 +892,8 @@ MUTANTS = (
     Mutant(
         "media: backs of lamps are compared",
         "media/boundaries.py",
-        "both = bounds & known & back",
-        "both = bounds & known",
+        "both = bounds & known & back & counts",
+        "both = bounds & known & counts",
         ("tests/images/test_media_boundaries.py::test_fog_between_opaque_walls[shared-tagged-merged]",),
     ),
     Mutant(
@@ -966,6 +966,13 @@ MUTANTS = (
             "tests/images/test_media_boundaries.py::test_fog_between_opaque_walls[each-plain-apart]",
             "tests/images/test_media_boundaries.py::test_light_in_a_room_of_opaque_walls",
         ),
+    ),
+    Mutant(
+        "media: boundaries beside a shape count as its own",
+        "media/boundaries.py",
+        "both = bounds & known & back & counts",
+        "both = bounds & known & back",
+        ("tests/images/test_media_boundaries.py::test_a_wrong_shape_in_shells_that_agree",),
     ),
     Mutant(
         "media: lines from the sensor end at walls",

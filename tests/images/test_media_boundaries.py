@@ -129,6 +129,21 @@ def test_light_on_a_side_that_states_nothing(light, emits):
     assert list(media._front) == [1] * (1 + emits)
 
 
+def test_a_wrong_shape_in_shells_that_agree():
+    """Rationale: boundaries all along the lines through a shape counted as its own, so that many shells hid
+    one that is wrong. Expected: it is found.
+    """
+    shells = {f"s{i}": parts.ball(radius=0.5 + i / 99, center=(0, 0, 0)) for i in range(40)}
+    both = {"interior": shared(), "exterior": shared()}
+    scene = {"type": "scene", "fog": fog(0.1, id="fog"), "outer": parts.ball(radius=1, center=(0, 0, 0))}
+    scene["outer"]["interior"] = shared()
+    scene |= {name: shell | both for name, shell in shells.items()}
+    scene["glass"] = parts.ball("dielectric", 0.05, (0, 0, 0), interior=fog(2.0), id="glass")
+    scene |= {"sensor": parts.sensor(origin=(0, 0, 4), target=(0, 0, 0)), "lamp": parts.point()}
+    _, light = prepared(mi.load_dict(scene))
+    assert "shape 'glass'" in light.contradiction
+
+
 def windowed(half=0.15, gap=0.0, **more):
     """A room of 10 m with opaque walls and a window in the ceiling, which bounds the fog in the room.
 
@@ -254,14 +269,17 @@ def grid(values=None, edge=1.0, **more):
     return parts.grid(values, [0, 0, 0], edge, **more)
 
 
+NEAREST = {"filter_type": "nearest"}
+
+
 def nearest(medium):
-    return medium | {"sigma_t": medium["sigma_t"] | {"filter_type": "nearest"}}
+    return medium | {"sigma_t": medium["sigma_t"] | NEAREST}
 
 
 def beyond(wrap_mode):
     """A homogeneous medium that reaches beyond the grid of its albedo."""
     values = mi.VolumeGrid(np.linspace(0, 1, 8, dtype=np.float32).reshape(2, 2, 2, 1))
-    return fog() | {"albedo": {"type": "gridvolume", "grid": values, "wrap_mode": wrap_mode}}
+    return fog() | {"albedo": {"type": "gridvolume", "grid": values, "wrap_mode": wrap_mode} | NEAREST}
 
 
 def sparse():

@@ -130,13 +130,16 @@ class Lines:
     """Lines along which boundaries are compared.
 
     ``medium`` the number of the one that each ``ray`` starts in. Mask ``reflected``: opaque surfaces reflect
-    the line towards its ``target``, as often as light may go on there; other lines go through.
+    the line towards its ``target``, as often as light may go on there; other lines go through. Boundaries
+    count in the box from ``low`` to ``high``.
     """
 
     ray: mi.Ray3f
     medium: mi.UInt32
     reflected: mi.Bool
     target: mi.Point3f
+    low: mi.Point3f
+    high: mi.Point3f
 
 
 # Reflections of such a line.
@@ -164,7 +167,8 @@ def disagreements(space: Space, lines: Lines) -> tuple[mi.UInt32, mi.UInt32]:
         bounds = hit & si.is_medium_transition()
         near, beyond = (space.media.number(si.target_medium(side)) for side in (-d, d))
         back, onwards = _may_leave(si, -d), _may_leave(si, d)
-        both = bounds & known & back
+        counts = dr.all((si.p >= lines.low) & (si.p <= lines.high))
+        both = bounds & known & back & counts
         compared += dr.select(both, mi.UInt32(1), 0)
         wrong += dr.select(both & (near != current), mi.UInt32(1), 0)
         opaque = hit & ~_transmits(si)

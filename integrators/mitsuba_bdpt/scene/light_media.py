@@ -29,6 +29,9 @@ _PROBES, _OF_EMITTER, _OF_EMITTERS = 64, 4096, 1 << 20
 _LINES, _TOLERATED = 2048, 0.01
 _OF_SHAPE, _TOLERATED_OF_SHAPE, _MOST_SHAPES = 64, 0.05, 1024
 
+# Hits on a shape are in its box, but for this share of its size (its square, of coordinates: rounding).
+_SLACK = 1e-3
+
 # Rays that leave boundaries, of all shapes and of one at most.
 _LEAVING, _LEAVING_ONE = 1 << 16, 1024
 
@@ -405,15 +408,23 @@ def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int
         own.d = dr.select(lane % 4 == 1, dr.normalize(through - own.o), own.d)
     reflected = lane % 2 == 1
     medium = dr.select(reflected, dr.opaque(mi.UInt32, space.media.sensor), dr.opaque(mi.UInt32, outside))
-    return boundaries.Lines(dr.select(reflected, own, straight), medium, reflected, through)
+    low, high = _corners(boxes, each)
+    slack = _SLACK * (high - low).max(1, keepdims=True) + _SLACK**2 * np.abs([low, high]).max((0, 2))[:, None]
+    corners = (mi.Point3f(x.T) for x in (low - slack, high + slack))
+    return boundaries.Lines(dr.select(reflected, own, straight), medium, reflected, through, *corners)
+
+
+def _corners(boxes: list, each: int) -> tuple[np.ndarray, ...]:
+    """The corners of every box, (n, 3), ``each`` times in a row."""
+    return tuple(
+        np.repeat(np.array([np.array(x, dtype=np.float64).ravel() for x in corner]), each, axis=0)
+        for corner in ([box.min for box in boxes], [box.max for box in boxes])
+    )
 
 
 def _points_in(boxes: list, each: int, rng) -> mi.Point3f:
     """``each`` random points in every box, box by box."""
-    low, high = (
-        np.repeat(np.array([np.array(x, dtype=np.float64).ravel() for x in corner]), each, axis=0)
-        for corner in ([box.min for box in boxes], [box.max for box in boxes])
-    )
+    low, high = _corners(boxes, each)
     return mi.Point3f((low + rng.random(low.shape) * (high - low)).T)
 
 
