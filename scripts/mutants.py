@@ -550,6 +550,24 @@ MUTANTS = (
         ("tests/geometry/test_rays.py::test_far_ends_do_not_block[sphere-30.0]",),
     ),
     Mutant(
+        "rounding: visibility rays end where what found their end would",
+        "geometry/rays.py",
+        "dr.maximum(b.offset, offset_at(dr.norm(b.p - a.p)))",
+        "b.offset",
+        (
+            "tests/geometry/test_rays.py::test_what_was_found_from_near_by_is_seen_from_afar[rectangle-False]",
+            "tests/geometry/test_rays.py::test_the_image_does_not_depend_on_where_the_origin_is[cube]",
+            "tests/geometry/test_rays.py::test_lamps_at_the_origin_are_seen_from_afar_in_fog[rectangle]",
+        ),
+    ),
+    Mutant(
+        "rounding: so do those that ask what they meet",
+        "geometry/rays.py",
+        "    end = _before(a, b)\n    ray",
+        "    end = b.towards(a.p - b.p)\n    ray",
+        ("tests/geometry/test_rays.py::test_what_was_found_from_near_by_is_seen_from_afar[rectangle-True]",),
+    ),
+    Mutant(
         "media: T~ of one side of the weights",
         "transport/mis.py",
         "light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)",

@@ -292,7 +292,7 @@ class AreaEmitters(Group):
             # A density that is NaN leaves the weight NaN, to be counted.
             weight=dr.select(pdf_a * pdf_w == 0, 0, radiance * (cos / (pdf_a * pdf_w))),
             d=d,
-            anchor=self._surfaces.anchor(chosen, ps.p, n, ps.p, active),
+            anchor=self._surfaces.anchor(chosen, ps.p, n, active),
             cos=cos,
             pdf_first=pdf_a,
             pdf_second=pdf_w,
@@ -339,7 +339,7 @@ class AreaEmitters(Group):
             weight=weight_over(to_geometric * pmf, weight, shading_pdf_w),
             pdf_w=pdf_w,
             d=ds.d,
-            anchor=self._surfaces.anchor(chosen, ds.p, n, si.p, active),
+            anchor=self._surfaces.anchor(chosen, ds.p, n, active),
             infinite=mi.Bool(False),
             delta=mi.Bool(False),
             emission_ratio=emitted / (pdf_w * cos),

@@ -38,7 +38,7 @@ class DirectionalAreaEmitters(Group):
         return Emission(
             weight=dr.select(ps.pdf == 0, 0, radiance / ps.pdf),  # without cosine, as in Mitsuba
             d=d,
-            anchor=self._surfaces.anchor(chosen, ps.p, n, ps.p, active),
+            anchor=self._surfaces.anchor(chosen, ps.p, n, active),
             cos=dr.abs(dr.dot(n, d)),
             pdf_first=ps.pdf,
             pdf_second=mi.Float(1),

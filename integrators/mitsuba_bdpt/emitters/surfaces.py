@@ -131,10 +131,10 @@ class Surfaces:
             n = dr.select(self._reversed.at(index, active), -n, n)
         return n if self._smooth_meshes is None else self._smooth_meshes.normal(n, index, u.y, active)
 
-    def anchor(self, chosen, p, n, reference, active) -> rays.Anchor:
-        """Where rays to or from ``reference`` end or start at the point ``p`` with the normal ``n``."""
+    def anchor(self, chosen, p, n, active) -> rays.Anchor:
+        """Where rays start or end at the point ``p`` with the normal ``n``."""
         errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
-        return rays.sampled_anchor(p, n, reference, errors)
+        return rays.sampled_anchor(p, n, errors)
 
 
 def spheres_of(emitters, context: Context) -> list[Sphere | None]:

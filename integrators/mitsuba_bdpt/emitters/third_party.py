@@ -43,7 +43,7 @@ class ThirdPartyEmitters(Group):
             weight=weight_over(chosen.pmf, weight, ds.pdf),
             pdf_w=dr.select(delta, 1, ds.pdf) * chosen.pmf,
             d=ds.d,
-            anchor=rays.sampled_anchor(ds.p, n, si.p, errors),
+            anchor=rays.sampled_anchor(ds.p, n, errors),
             infinite=mi.has_flag(flags, mi.EmitterFlags.Infinite),
             delta=delta,
             emission_ratio=mi.Float(0),

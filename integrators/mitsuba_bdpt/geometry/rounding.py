@@ -44,7 +44,12 @@ def rounding_offset(p, o, t, reach):
     The hit was found from ``o`` at distance ``t``.
     """
     magnitude = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(o)))
-    return (OFFSET_ULPS * 2.0**-24) * dr.maximum(dr.maximum(magnitude, t), reach)
+    return offset_at(dr.maximum(dr.maximum(magnitude, t), reach))
+
+
+def offset_at(magnitude):
+    """Offset that clears the rounding error of a hit which follows from numbers of this ``magnitude``."""
+    return (OFFSET_ULPS * 2.0**-24) * magnitude
 
 
 @dataclass

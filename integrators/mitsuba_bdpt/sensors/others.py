@@ -124,8 +124,8 @@ class _Face:
         sphere = Sphere.of(self.shape)
         self._sphere = sphere if sphere is not None and sphere.turned else None
 
-    def sample(self, u, shared, reference=None):
-        """A point, its shading normal, and its anchor for rays to and from ``reference`` (itself if None)."""
+    def sample(self, u, shared):
+        """A point, its shading normal, and its anchor."""
         ps = self.shape.sample_position(shared.time, u)
         if self._sphere is not None:
             ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
@@ -133,7 +133,7 @@ class _Face:
         if self._smooth_mesh is not None:
             n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
         errors = self._shape_errors.at(mi.ShapePtr(self.shape))
-        anchor = rays.sampled_anchor(ps.p, n, ps.p if reference is None else reference, errors)
+        anchor = rays.sampled_anchor(ps.p, n, errors)
         return mi.Point3f(ps.p), mi.Normal3f(ps.n), anchor
 
 
@@ -170,15 +170,15 @@ class IrradianceMeter(Sensor):
         else:
             self.area = True
 
-    def _sample(self, u, shared, reference=None):
+    def _sample(self, u, shared):
         """As `_Face.sample`, of the view that ``u`` chooses."""
         if len(self._faces) == 1:
-            return self._faces[0].sample(u, shared, reference)
+            return self._faces[0].sample(u, shared)
         index, x = view_at(u.x, len(self._faces))
         u = mi.Point2f(x, u.y)
-        found = self._faces[0].sample(u, shared, reference)
+        found = self._faces[0].sample(u, shared)
         for i, face in enumerate(self._faces[1:], 1):
-            found = dr.select(index == i, face.sample(u, shared, reference), found)
+            found = dr.select(index == i, face.sample(u, shared), found)
         return found
 
     def _start(self, uv, u_lens, shared) -> CameraStart:
@@ -195,7 +195,7 @@ class IrradianceMeter(Sensor):
         )
 
     def join(self, p, u_lens, u_film) -> CameraJoin:
-        z0, n, anchor = self._sample(u_film, self._like(), p)
+        z0, n, anchor = self._sample(u_film, self._like())
         to_z0 = z0 - p
         dist2 = dr.squared_norm(to_z0)
         d = to_z0 * dr.rsqrt(dist2)
