@@ -236,9 +236,9 @@ def test_spheres_that_to_world_turns(inwards, radiance):
     at = dr.zeros(mi.SurfaceInteraction3f, COUNT)
     at.p = mi.Point3f(1, 2, 3.2 if inwards else 6)
     direct = emitters.sample_direct(at, mi.Point2f(u[0], u[1]), mi.Bool(True))
-    camera = sensors.prepare(scene.sensors()[0], emitters.shape_errors)
-    ps, anchor = camera._sample(mi.Point2f(u[0], u[1]), like)
-    for p, n in ((e.si.p, e.anchor.n), (direct.anchor.p, direct.anchor.n), (ps.p, ps.n), (ps.p, anchor.n)):
+    camera = sensors.prepare(scene.sensors()[0], emitters.shape_errors, scene)
+    z0, n_shading, anchor = camera._sample(mi.Point2f(u[0], u[1]), like)
+    for p, n in ((e.si.p, e.anchor.n), (direct.anchor.p, direct.anchor.n), (z0, n_shading), (z0, anchor.n)):
         away = dr.normalize(p - mi.Point3f(1, 2, 3)) * (-1 if inwards else 1)
         np.testing.assert_allclose(column(n), column(away), atol=1e-5)
     made = column(dr.max(e.weight)) > 0  # Mitsuba has no point for 3e-4 of the samples of a texture

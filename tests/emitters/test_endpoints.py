@@ -368,7 +368,8 @@ CAMERAS = {
 
 
 def camera_of(sensor):
-    camera = sensors.prepare(sensor, ShapeErrors(mi.load_dict({"type": "scene"})))
+    scene = mi.load_dict({"type": "scene"})
+    camera = sensors.prepare(sensor, ShapeErrors(scene), scene)
     return camera, like_of_rgb()
 
 

@@ -974,7 +974,8 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
             **more,
         }
     )
-    camera = sensors.prepare(sensor, rounding.ShapeErrors(mi.load_dict({"type": "scene"})))
+    scene = mi.load_dict({"type": "scene"})
+    camera = sensors.prepare(sensor, rounding.ShapeErrors(scene), scene)
     like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(4096)
     u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]
