@@ -417,11 +417,18 @@ MUTANTS = (
     Mutant(
         "sensors: a meter is lit from behind",
         "sensors/others.py",
-        "        cos = dr.dot(ps.n, -d)\n",
-        "        cos = dr.abs(dr.dot(ps.n, -d))\n",
+        "        cos = dr.dot(n, -d)\n",
+        "        cos = dr.abs(dr.dot(n, -d))\n",
         (
             "tests/sensors/test_sensor_densities.py::test_importance_integrates_to_the_weight[irradiancemeter]",
         ),
+    ),
+    Mutant(
+        "sensors: light hits a meter that is not in the scene",
+        "sensors/others.py",
+        "        elif not in_scene:\n",
+        "        elif False:\n",
+        ("tests/images/test_coverage.py::test_meter_of_another_scene",),
     ),
     Mutant(
         "film: the filter's taps begin a pixel early",

@@ -137,7 +137,7 @@ def test_schedule_of_replicates():
     of all with one sample for the scale of roulette; without `variance` one part.
     """
     target = scene()
-    settings, camera = bdpt().settings, prepare(target.sensors()[0], ShapeErrors(target))
+    settings, camera = bdpt().settings, prepare(target.sensors()[0], ShapeErrors(target), target)
     steps = schedule.schedule(camera, 19, settings, True)
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
     assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)
