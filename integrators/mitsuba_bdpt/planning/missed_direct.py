@@ -7,6 +7,7 @@ sample it. Where a render does without both, the emitters whose light arrives ar
 from __future__ import annotations
 
 from functools import partial
+from itertools import islice
 
 import drjit as dr
 import mitsuba as mi
@@ -57,14 +58,15 @@ def _cause(prepared: PreparedScene, plan: Plan, settings: Settings) -> tuple[str
 
 
 def _arriving(prepared: PreparedScene) -> tuple[int, ...]:
-    """Indices of the delta emitters whose light arrives at the sensor directly."""
+    """Indices of the first delta emitters whose light arrives at the sensor directly, `NAMED` + 1 at most."""
     views = _with_area(prepared)
     emitters = prepared.scene.emitters()
-    return tuple(
+    arriving = (
         i
         for i in prepared.emitters.unhittable_connectible
         if any(_arrives(prepared, view, emitters[i]) for view in views)
     )
+    return tuple(islice(arriving, NAMED + 1))
 
 
 def _with_area(prepared: PreparedScene) -> list[Sensor]:
