@@ -712,7 +712,12 @@ METER = {"type": "rectangle"}
         (GLASS_LAMP, False, {"connections": "none"}, ["needs inner", "no two neighbours"]),
         (GLASS_LAMP, True, {}, []),
         (GLASS_LAMP, True, {"stored_vertices": 4}, ["longer than 4 edges"]),
-        (GLASS_LAMP, True, {"light_paths": 0}, ["needs t=1", "needs inner", "no two", "needs t=0"]),
+        (
+            GLASS_LAMP,
+            True,
+            {"light_paths": 0},
+            ["needs t=1", "needs inner", "no two", "needs t=0", r"delta emitter, sensor .needs \(1,1\)"],
+        ),
         (BEAM, False, {}, []),
         (BEAM, False, {"light_paths": 0}, ["directionalarea.*needs t=1", "directionalarea.*needs inner"]),
         (BEAM, False, {"connections": "none"}, ["directionalarea.*needs inner"]),
