@@ -27,8 +27,9 @@ RESOLUTION = 128
 
 
 def guides(scene, spp: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """Albedo and normals of a scene, by Mitsuba's own plugin."""
-    made = mi.load_dict({"type": "aov", "aovs": denoising.GUIDES})
+    """Albedo and normals of a scene, by Mitsuba's own plugin, which has no normals of maps in the world."""
+    guides = denoising.GUIDES.replace(denoising.WORLD_NORMAL, "sh_normal")
+    made = mi.load_dict({"type": "aov", "aovs": guides})
     image = np.array(mi.render(scene, integrator=made, spp=spp, seed=7))
     return image[..., -6:-3], image[..., -3:]
 
