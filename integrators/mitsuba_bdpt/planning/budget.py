@@ -19,12 +19,12 @@ PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 
-# In a scene of many BSDFs (`bsdf.MANY`) a pilot's kernel takes about as long to compile for each kind of
-# BSDF, and to record for each BSDF, as a render without a pilot takes for so many samples. Longer ones ask
-# a pilot (docs/development/experiments.md, "Pilots in rooms").
+# Costs of a pilot's kernel in a scene of many BSDFs (`bsdf.MANY`), in samples of a render without a pilot:
+# compiling per kind of BSDF, recording per BSDF. Longer renders run a pilot
+# (docs/development/experiments.md, "Pilots in rooms").
 SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
 
-# Renders so many times as long predict the gain of guided s = 0 there too, which takes two more kernels.
+# Multiple of that length from which on the pilot also predicts the gain of guided s = 0 (two more kernels).
 GUIDING_TIMES = 4
 
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.
@@ -59,7 +59,7 @@ def least_samples(traits: Traits) -> int:
 
 
 def predicts_guiding(traits: Traits, samples: int) -> bool:
-    """Whether the pilot of a render of so many ``samples`` predicts the gain of guided s = 0."""
+    """Whether the pilot of a render with ``samples`` samples predicts the gain of guided s = 0."""
     return not traits.asked.many or samples >= GUIDING_TIMES * least_samples(traits)
 
 

@@ -19,7 +19,7 @@ from .decision import Decision
 # `furnace_white`.
 SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_GAIN = 1 / 2, 2, 1 << 20, 1.1
 
-# What gains `UNIFORM_GAIN` pays for a pilot in renders so many times as long as those that ask one elsewhere.
+# Multiple of the least length of a render with a pilot at which a gain of `UNIFORM_GAIN` pays for the pilot.
 UNIFORM_TIMES = 10
 
 

@@ -143,7 +143,7 @@ class LostLight:
 
     @property
     def radiance(self) -> dict[int, float]:
-        """The brightest colour of the sum over all lamps, of which each has a part by its own brightest."""
+        """The brightest colour of the sum over all lamps, divided in proportion to each lamp's brightest."""
         single = {i: float(colour.max()) for i, colour in self.colours.items()}
         brightest = float(sum(self.colours.values()).max()) if single else 0.0
         scale = brightest / max(sum(single.values()), np.finfo(float).tiny)
