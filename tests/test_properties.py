@@ -578,8 +578,8 @@ def test_walks_without_a_finite_throughput_are_counted(light_paths):
     no third (7/16 of 64 per pixel); of light subpaths, which end an edge earlier, a quarter. Tolerance: 5 %,
     five standard errors of the count.
     """
-    mi.register_bsdf("poison", Poison)
-    scene = lamp_in_a_sphere(bsdf={"type": "poison"})
+    mi.register_bsdf("spoiled", Poison)
+    scene = lamp_in_a_sphere(bsdf={"type": "spoiled"})
     bdpt = integrator(max_depth=3, skip="none", light_paths=light_paths, points="independent")
     result = image(bdpt, scene, spp=64)
     assert np.isfinite(result).all() and result.max() > 0

@@ -246,7 +246,7 @@ def test_statements_are_compared_with_answers(name):
     """
     entry, base, changes, message = CASES[name]
     own = type(f"Own{base.__name__}", (base,), changes)
-    key = f"own_{name.replace(' ', '_').replace(chr(39), '')}"
+    key = f"stated_{name.replace(' ', '_').replace(chr(39), '')}"
     REGISTER[next(kind for kind in REGISTER if issubclass(base, kind))](key, own)
     scene = mi.load_dict(room(thing=entry({"type": key})))
     if message is None:
@@ -275,8 +275,8 @@ class Buggy(Halves):
 @pytest.mark.parametrize(("kind", "words"), [(Mistyped, r"takes 2 positional"), (Buggy, "a bug")])
 def test_a_method_that_fails_is_not_taken_for_one_that_is_not_there(kind, words):
     """Rationale: a wrong signature went without a check, and without a word. Expected: its error."""
-    mi.register_texture(f"own_{kind.__name__}", kind)
-    scene = mi.load_dict(room(thing=lamp({"type": f"own_{kind.__name__}"})))
+    mi.register_texture(f"stated_{kind.__name__}", kind)
+    scene = mi.load_dict(room(thing=lamp({"type": f"stated_{kind.__name__}"})))
     with pytest.raises((TypeError, RuntimeError), match=words):
         check_plugins(scene, scene.sensors()[0])
 
