@@ -1,4 +1,7 @@
-"""This repository as a project to measure in, and its scenes as the benchmark renders them."""
+"""This repository as a project to measure in, and its scenes as the benchmark renders them.
+
+Puts the folder tests on the path, for `stress_cases` and `instruments`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,8 @@ from mitsuba_bdpt.measure.options import RESOLUTION  # noqa: F401 (for the scrip
 from mitsuba_bdpt.measure.project import Project
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "tests"))
+
 PROJECT = Project(ROOT)
 SCENES = PROJECT.scenes
 

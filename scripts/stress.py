@@ -31,6 +31,7 @@ from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.measure import reference
 from mitsuba_bdpt.measure.report import replace_part, table
+
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
 

@@ -15,9 +15,10 @@ from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.planning import emission, pilot
 from mitsuba_bdpt.run import rendering
 from snapshots import ROUNDING, stopped
+from test_merging import images as rendered_images
+
 from stress_cases.capture import Capture
 from stress_cases.weights import Tally, weigh
-from test_merging import images as rendered_images
 
 SCENES = Path(__file__).parents[2] / "scenes"
 T = mi.ScalarTransform4f

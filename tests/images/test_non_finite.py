@@ -1,6 +1,6 @@
 """Values of users' plugins, textures and meshes that are not finite, and reflectances above 1.
 
-Families of such values are in scripts/stress_cases/non_finite.py and non_finite_shapes.py, with what is
+Families of such values are in tests/stress_cases/non_finite.py and non_finite_shapes.py, with what is
 expected of each and the reason of each tolerance; the quick ones are run by tests/repository/test_stress.py.
 """
 
@@ -15,6 +15,7 @@ from mitsuba_bdpt.emitters import infinite
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.scene import diagnostics
 from scipy import stats
+
 from stress_cases import cases
 from stress_cases.poisons import NAN, filled, painted, room
 from stress_cases.warned import Warned

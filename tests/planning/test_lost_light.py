@@ -11,6 +11,7 @@ import pytest
 import scene_parts as parts
 from mitsuba_bdpt.planning import lost_light
 from mitsuba_bdpt.run.rendering import Render
+
 from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f

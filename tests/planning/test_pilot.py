@@ -27,6 +27,7 @@ from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
 from mitsuba_bdpt.transport.batch import NET, NETS, Batch, Places
 from mitsuba_bdpt.transport.plan import GUIDED
+
 from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f

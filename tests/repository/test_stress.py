@@ -5,6 +5,7 @@ import json
 import pytest
 import stress
 from mitsuba_bdpt.measure.report import replace_part
+
 from stress_cases import cases
 from stress_cases.agreement import Judged, worst
 
@@ -12,7 +13,7 @@ from stress_cases.agreement import Judged, worst
 @pytest.mark.parametrize("name", [case.name for case in cases() if case.quick])
 def test_what_is_expected_happens(name):
     """Rationale, expectation and the reason of each tolerance: see the case of that name in
-    scripts/stress_cases. (In a process of its own: a crash is an outcome, too.)"""
+    tests/stress_cases. (In a process of its own: a crash is an outcome, too.)"""
     outcome = stress.apart(name)
     if outcome.ok is None:
         pytest.skip(outcome.happened)

@@ -24,6 +24,7 @@ from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import kernel
 from mitsuba_bdpt.transport.batch import Batch
+
 from stress_cases.chains import COEFFICIENTS, random_paths, recursion
 
 

@@ -50,6 +50,7 @@ from mitsuba_bdpt.transport import (
 from mitsuba_bdpt.transport.counters import Counters
 from mitsuba_bdpt.transport.merge_radius import Radius
 from mitsuba_bdpt.transport.observer import Observer
+
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------

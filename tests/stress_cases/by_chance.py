@@ -1,7 +1,7 @@
 """Scene files and BSDFs drawn at random: do all strategies find the same light, and `path`'s?
 
 More of them, which is how bugs are looked for: `python -m stress_cases.by_chance NAME FIRST LAST`, in
-the folder scripts, with the name of a case and two seeds; it prints those that are not as expected, and
+the folder tests, with the name of a case and two seeds; it prints those that are not as expected, and
 their XML.
 """
 
