@@ -1,16 +1,16 @@
 """Try to break the renderer, and write what happened into a table.
 
-    python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress*
+    python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress.*
     python scripts/stress.py NAME ...    # some of them, printed; with --write in the place of their rows
     python scripts/stress.py --list      # names of all
     python scripts/stress.py --same ../before/docs/reports/stress.json   # the same as that record?
 
 Each case runs in a process of its own, so that a crash or a hang is an outcome too. Written are the record,
-docs/reports/stress.json; the tables of all cases, docs/reports/stress_cases.md; and between the lines
-`<!-- report: stress -->` and `<!-- end -->` of docs/reports/stress.md how many cases went as expected, and
-those that did not. Exit status 1 if one did not; one that can't be tried here (as this user, on this system)
-says so. With ``--same`` nothing is written, and it is 1 as well if words or figures of a case differ from
-those of a record: what a change that must not change images is checked by, beside scripts/versus.py.
+docs/reports/stress.json, and two parts of docs/reports/stress.md: counts and failures (`stress`), and a row
+per case (`cases`), without the tolerances and figures of the record. Exit status 1 if a case failed; one that
+can't be tried here (as this user, on this system) is named. ``--same`` writes nothing, and exits with 1 if
+words or figures of a case differ from those of a record: the check, beside scripts/versus.py, of a change
+that must keep all images.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ import repository
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.measure import reference
-from mitsuba_bdpt.measure.report import replace_part, table
+from mitsuba_bdpt.measure.report import replace_part
+from mitsuba_bdpt.measure.tables import table
 
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
@@ -39,7 +40,6 @@ import mitsuba as mi  # isort: skip
 
 RECORD = repository.ROOT / "docs" / "reports" / "stress.json"
 PAGE = repository.ROOT / "docs" / "reports" / "stress.md"
-TABLES = PAGE.with_name("stress_cases.md")
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.
@@ -55,6 +55,7 @@ _NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?(?:e[-+]?\d+)?")
 
 # What is put before that which happened, by `Outcome.ok`.
 MARKS = {True: "", False: "**no**: ", None: "**not tried**: "}
+RESULTS = {True: "as expected", False: "**not as expected**", None: "**not tried**"}
 
 
 def here(name: str) -> Outcome:
@@ -89,17 +90,25 @@ def made_with(record: list[dict]) -> str:
     return f"{text}; digest of the plugin's source: {', '.join(sources)}."
 
 
-def page(record: list[dict]) -> str:
-    """The tables of all sections, as Markdown; an expectation that several cases share stands once."""
-    texts = ["# Stress: all cases", f"Written by `python scripts/stress.py`. {made_with(record)}"]
+def brief(text: str) -> str:
+    """The first clause of an expectation or outcome, without what stands in brackets."""
+    text = re.sub(r"( |^)\((?:[^()]|\([^()]*\))*\)", "", text)
+    return re.split(r"[;:.] ", text)[0]
+
+
+def tables(record: list[dict]) -> str:
+    """A row per case, as Markdown; an expectation that several cases share stands once."""
+    texts = []
     for section in dict.fromkeys(row["section"] for row in record):
         rows, first = [], {}
         for row in record:
             if row["section"] == section:
-                name = first.setdefault(row["expected"], row["name"])
-                expected = row["expected"] if name == row["name"] else f"as of `{name}`"
-                rows.append([f"`{row['name']}`", row["tried"], expected, happened(row)])
-        texts.append(f"## {section}\n\n" + table(["case", "tried", "expected", "what happened"], rows))
+                expected = brief(row["expected"])
+                name = first.setdefault(expected, row["name"])
+                expected = expected if name == row["name"] else f"as `{name}`"
+                tried = re.sub(r" \([^()]{30,}\)", "", row["tried"]).split("; ")[0]
+                rows.append([f"`{row['name']}`", tried, expected, RESULTS[row["ok"]]])
+        texts.append(f"### {section}\n\n" + table(["case", "tried", "expected", "result"], rows))
     return "\n\n".join(texts)
 
 
@@ -121,11 +130,16 @@ def summary(record: list[dict]) -> str:
     return "\n".join([made_with(record) + "\n", text, *(line + "\n" for line in others)])
 
 
+def page(record: list[dict]) -> str:
+    """The page with the counts and tables of a record."""
+    text = replace_part(PAGE.read_text(), "stress", summary(record))
+    return replace_part(text, "cases", tables(record))
+
+
 def write(record: list[dict]) -> None:
-    """The record as data, as tables, and as counts in the page."""
+    """The record as data, and as counts and tables in the page."""
     write_text(RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
-    write_text(TABLES, page(record))
-    write_text(PAGE, replace_part(PAGE.read_text(), "stress", summary(record)))
+    write_text(PAGE, page(record))
 
 
 def tried(case: Case) -> dict:

@@ -4,7 +4,6 @@ import json
 
 import pytest
 import stress
-from mitsuba_bdpt.measure.report import replace_part
 
 from stress_cases import cases
 from stress_cases.agreement import Judged, worst
@@ -23,17 +22,15 @@ def test_what_is_expected_happens(name):
 def test_the_record_is_of_these_cases():
     """Rationale: a case that was changed after the last whole run would stand in the table with words that
     nothing has checked. Expected: the record's names, what was tried and what is expected are those of the
-    cases, in their order; the page with the counts and that with the tables show the record."""
+    cases, in their order; the counts and tables of the page show the record."""
     record = json.loads(stress.RECORD.read_text())
     recorded = [tuple(row[key] for key in ("name", "section", "tried", "expected")) for row in record]
     assert recorded == [(case.name, case.section, case.tried, case.expected) for case in cases()]
-    page = stress.PAGE.read_text()
-    assert page == replace_part(page, "stress", stress.summary(record))
-    assert stress.TABLES.read_text() == stress.page(record)
+    assert stress.PAGE.read_text() == stress.page(record)
 
 
 @pytest.mark.parametrize(
-    "ok, mark", [(True, "| done"), (False, "| **no**: done"), (None, "| **not tried**: done")]
+    "ok, mark", [(True, "as expected"), (False, "**no**: done"), (None, "**not tried**: done")]
 )
 def test_what_was_not_tried_is_not_called_well(ok, mark, monkeypatch, capsys):
     """Expected: the table marks what went wrong and what could not be tried, and the summary names both;
@@ -43,8 +40,8 @@ def test_what_was_not_tried_is_not_called_well(ok, mark, monkeypatch, capsys):
     assert stress.main(["black"]) == (ok is False)
     (case,) = [case for case in cases() if case.name == "black"]
     row = stress.tried(case)
-    assert mark in stress.page([row])
-    assert (f"* `black`: {mark.removeprefix('| ')}" in stress.summary([row])) == (ok is not True)
+    assert f"| {stress.RESULTS[ok]} |" in stress.tables([row])
+    assert (f"* `black`: {mark}" in stress.summary([row])) == (ok is not True)
 
 
 def test_the_source_of_the_rows_is_told(monkeypatch, capsys):
@@ -56,9 +53,9 @@ def test_the_source_of_the_rows_is_told(monkeypatch, capsys):
     row = stress.tried(case) | {"seconds": 120.0}
     assert row["source"] == stress.reference.source_digest()
     text = "cases, whose times add up to 2 minutes (2 run at a time); digest of the plugin's source: "
-    assert f"{text}`{row['source']}`." in stress.page([row])
+    assert f"{text}`{row['source']}`." in stress.summary([row])
     older = {key: value for key, value in row.items() if key != "source"}
-    several = stress.page([row, older, older])
+    several = stress.summary([row, older, older])
     assert f"`{row['source']}` (1 cases), an earlier one, not kept (2 cases)." in several
 
 
@@ -96,9 +93,9 @@ def test_other_figures_are_seen(tmp_path, monkeypatch, capsys):
 def test_rows_of_some_cases_are_written(monkeypatch, tmp_path):
     """``--write`` puts the rows of the named cases in the place of theirs, and leaves all others.
 
-    The page and the tables are of the new record.
+    The page is of the new record.
     """
-    for name in ("RECORD", "PAGE", "TABLES"):
+    for name in ("RECORD", "PAGE"):
         copy = tmp_path / getattr(stress, name).name
         copy.write_text(getattr(stress, name).read_text())
         monkeypatch.setattr(stress, name, copy)
@@ -112,5 +109,5 @@ def test_rows_of_some_cases_are_written(monkeypatch, tmp_path):
     assert [row["happened"] for row in after] == [
         "anew" if row["name"] == chosen else row["happened"] for row in before
     ]
-    assert stress.TABLES.read_text() == stress.page(after)
+    assert stress.PAGE.read_text() == stress.page(after)
     assert stress.summary(after) in stress.PAGE.read_text()

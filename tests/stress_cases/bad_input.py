@@ -155,7 +155,7 @@ def _render_arguments(examples: int) -> Outcome:
 
 
 OR_WORDS = (
-    "a finite image, or an error whose words name what is wrong: while loading the element or its line, its "
+    "a finite image, or an error that names what is wrong: while loading the element or its line, its "
     "parameter or its value, while rendering in words of ours; where a process dies or does not end, or an "
     "image is not finite, `path` does alike"
 )
@@ -174,13 +174,13 @@ CASES = (
         "400 dictionaries of parameters, by hypothesis, most with one value that is anything: a word, a "
         "number, "
         "NaN, an infinity, 10^5 letters; 24 that are accepted are rendered",
-        "accepted, or refused in words that name a parameter; images are finite",
+        "accepted, or an error that names a parameter; images are finite",
         partial(_parameters, 400, 24),
     ),
     _case(
         "fuzz-arguments",
         "150 times anything for `spp`, `seed` and `sensor` of `render`, by hypothesis",
-        "a finite image, or words that name the argument",
+        "a finite image, or an error that names the argument",
         partial(_render_arguments, 150),
         True,
     ),
@@ -208,7 +208,7 @@ CASES = (
     _case(
         "film-sizes",
         "films of 0, 1 x 1, 1 x 4097, 40000 x 2, ... pixels in a room of radiance 1",
-        "refused in words that name width, height, both as `0 x 8` or the crop window, or an image of that "
+        "an error that names width, height, both as `0 x 8` or the crop window, or an image of that "
         "size and radiance: within 20 %, for roulette leaves noise in one pixel, and no row or column below "
         "half of it, as one that lost a side of its pixels would be; path tracing alone",
         partial(films.seen, films.SIZES, {"light_paths": 0}),
@@ -230,7 +230,7 @@ CASES = (
     _case(
         "film-huge",
         "films larger than the memory, or of more than 2^32 numbers",
-        "refused in words before anything is allocated (a process has 8 GiB of address space)",
+        "an error before anything is allocated (a process has 8 GiB of address space)",
         films.huge,
     ),
     _case(
@@ -268,13 +268,13 @@ CASES = (
     _case(
         "missing-files",
         "`python -m mitsuba_bdpt render` without scene, mesh, texture, include; with half of one",
-        "one line that says so, status 2, nothing written",
+        "one line that names it, status 2, nothing written",
         outputs.missing_files,
     ),
     _case(
         "outputs-that-cant-be",
         "an output that is a folder, a pipe, a text, a name too long, in a folder that can't be written, ...",
-        "said before anything is rendered, nothing changed on the disk",
+        "an error before anything is rendered, nothing changed on the disk",
         outputs.output_names,
         True,
     ),

@@ -597,9 +597,9 @@ CASES = (
     _case(
         "lamp-in-the-ceiling",
         "a lamp in the plane of a black ceiling",
-        "which of them a ray meets is undefined: values finite, and 98 to 100.5 % of the light without the "
-        "ceiling: rays that meet the lamp by chance have 1.3 % of the weights at most, strategies that start "
-        "on it the rest",
+        "finite, and 98 to 100.5 % of the light without the ceiling; which of the two a ray hits is "
+        "undefined: hitting the lamp (s = 0) has at most 1.3 % of the weights, strategies that start on it "
+        "the rest",
         _lamp_in_the_ceiling,
     ),
     _case(
@@ -612,7 +612,7 @@ CASES = (
     _case(
         "lamp-without-area",
         "a lamp of nothing but triangles without area, beside a real one",
-        "refused in words of ours that name the lamp's shape, or an image of finite values",
+        "an error that names the lamp's shape, or an image of finite values",
         _lamp_without_area,
     ),
     *(
@@ -672,8 +672,8 @@ CASES = (
     _case(
         "scaled-spheres",
         "white spheres in instances that stretch, squash or shrink them, under a sky of radiance 1",
-        "1: by default to 2e-3 or twice the error of `path`, with all strategies to 10 % (Mitsuba's hits on "
-        "such spheres are off by more than rays leave a surface, where they are squashed or shrunk)",
+        "radiance 1; by default to 2e-3 or twice the error of `path`, with all strategies to 10 % (where "
+        "spheres are squashed or shrunk, Mitsuba's hits are off by more than the offset of rays)",
         _scaled_spheres,
     ),
     _case(

@@ -75,8 +75,8 @@ def distribution_cases():
         _case(
             "distribution-nan",
             "texels of an `envmap`, or of a `projector`, NaN",
-            "all light that takes Mitsuba's distribution is lost, and said so: black, counted, named; with a "
-            "number in their place there is light, and nothing to say",
+            "all light that takes Mitsuba's distribution is lost, with a warning: black, counted, named; "
+            "with a number in their place there is light, and nothing to say",
             lost,
         ),
         _case(

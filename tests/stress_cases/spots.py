@@ -111,11 +111,10 @@ def _narrow() -> Outcome:
 CASES = (
     _case(
         "narrow-spots",
-        f"spots of cutoff_angle 0.05 to 0.3 degrees in {ORIENTATIONS} orientations: light by next-event "
-        "estimation, as `path` has it, over the exact value, and by light subpaths over that",
-        "Mitsuba's falloff is a function of a cosine that has few steps there, and is rounded in another way "
-        "for each orientation: off by less than the warning says, 2^-24 over 1 - cos of the angle; warned of "
-        f"below 0.2 degrees; at 0.3 the strategies agree to {100 * MOST_APART:g} %",
+        f"spots of cutoff_angle 0.05 to 0.3 degrees in {ORIENTATIONS} orientations; light by next-event "
+        "estimation, as in `path`, over the exact value, and by light subpaths over that of `path`",
+        "errors below the warning's bound (2^-24 over 1 - cos of the angle, Mitsuba's rounding); a "
+        f"warning below 0.2 degrees; at 0.3 the strategies agree to {100 * MOST_APART:g} %",
         _narrow,
         True,
     ),

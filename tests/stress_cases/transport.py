@@ -442,7 +442,7 @@ CASES = (
     _case(
         "too-bright-unlimited",
         "a closed sphere whose texture reflects 1.2, no limit of the depth",
-        "there is no right value; finite, and warned of once",
+        "finite, and one warning; the true value is infinite",
         _too_bright_unlimited,
     ),
 )
