@@ -369,15 +369,39 @@ def test_a_film_that_takes_more_memory_than_is_asked_for_is_refused_before_the_r
 
 
 def test_threads_and_log(capfd):
-    """Expected: Dr.Jit has so many threads, and -v shows what the integrator logs."""
+    """Expected: Dr.Jit has one thread; -v shows what the integrator logs, with its time."""
     before, level = dr.thread_count(), mi.log_level()
     try:
         assert main([*SMALL, "--spp", "1", "--threads", "1", "-v"]) == 0
-        assert dr.thread_count() == 1 and mi.log_level() == mi.LogLevel.Info
+        assert dr.thread_count() == 1 and mi.log_level() == level
     finally:
         dr.set_thread_count(before)
-        mi.set_log_level(level)
-    assert "bdpt: " in capfd.readouterr().out
+    logged = r"^info: \d{4}-\d\d-\d\d [\d:]+ +\[messages.py:\d+\] bdpt: "
+    assert re.search(logged, capfd.readouterr().err, re.MULTILINE)
+
+
+WARNED = """<scene version="3.0.0">
+    <emitter type="point"><point name="position" x="0" y="0" z="1"/></emitter>
+    <shape type="rectangle">
+        <sensor type="irradiancemeter"><film type="hdrfilm">
+            <integer name="width" value="1"/><integer name="height" value="1"/><rfilter type="box"/>
+        </film></sensor>
+    </shape>
+</scene>"""
+
+
+def test_a_warning_is_one_line_on_standard_error(tmp_path, capfd):
+    """Expected: its text alone: no colours, no name of a function, no date; the log is as before then."""
+    scene = tmp_path / "scene.xml"
+    scene.write_text(WARNED)
+    output = str(tmp_path / "a.exr")
+    assert main(["render", str(scene), "--spp", "1", "-P", "light_paths=0", "-o", output]) == 0
+    shown = capfd.readouterr()
+    warnings = [line for line in shown.err.splitlines() if "bdpt: " in line]
+    assert warnings and all(line.startswith("warning: bdpt: ") for line in warnings)
+    assert "\x1b" not in shown.out + shown.err and "bdpt: " not in shown.out
+    mi.Log(mi.LogLevel.Warn, "after the command")
+    assert "WARN" in capfd.readouterr().out
 
 
 def test_version_names_mitsubas(capsys):

@@ -42,11 +42,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if mitsuba_bdpt.failure is not None:
         print(f"error: {mitsuba_bdpt.failure}", file=sys.stderr)
         return mistakes.FAILURE
-    if options.command in measuring.COMMANDS:
-        return measuring.run(options)
-    from . import render
+    from . import log, render
 
-    return render.explain(options) if options.command == "explain" else render.run(options)
+    with log.lines(getattr(options, "verbose", 0)):
+        if options.command in measuring.COMMANDS:
+            return measuring.run(options)
+        return render.explain(options) if options.command == "explain" else render.run(options)
 
 
 class Parser(argparse.ArgumentParser):

@@ -120,11 +120,8 @@ def is_done(job: Namespace, spp: int) -> bool:
 
 
 def loaded(options: Namespace) -> Loaded:
-    """`load`, with what holds for the whole process: its log, its memory and the number of its threads."""
+    """`load`, with what holds for the whole process: its memory and the number of its threads."""
     memory.set_limit(options.memory and options.memory * 2**30)
-    if options.verbose:
-        levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
-        mi.set_log_level(levels[min(options.verbose, len(levels)) - 1])
     try:
         found = load(options)
     except RuntimeError as error:

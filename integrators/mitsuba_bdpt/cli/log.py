@@ -1,0 +1,60 @@
+"""Mitsuba's log as lines of a command: on standard error, without colours and names of functions."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sys
+from collections.abc import Iterator
+
+import mitsuba as mi
+
+LEVELS = {
+    mi.LogLevel.Trace: "trace",
+    mi.LogLevel.Debug: "debug",
+    mi.LogLevel.Info: "info",
+    mi.LogLevel.Warn: "warning",
+    mi.LogLevel.Error: "error",
+}
+
+# `mi.Log` puts the name of the function that calls it before the text.
+CALLER = re.compile(r"[\w<>]+(\(\))?: (?=bdpt: )")
+
+
+class _Lines(mi.Appender):
+    """Prints messages as ``warning: TEXT``, as the command's own."""
+
+    def append(self, level: mi.LogLevel, text: str) -> None:
+        # A render must not end because nobody reads its log any more.
+        if sys.stderr is not None:
+            with contextlib.suppress(OSError, ValueError):
+                print(f"{LEVELS[level]}: {CALLER.sub('', text, count=1)}", file=sys.stderr, flush=True)
+
+    def log_progress(self, *_: object) -> None:
+        """Show nothing: `progress` does."""
+
+
+@contextlib.contextmanager
+def lines(verbose: int) -> Iterator[None]:
+    """Print Mitsuba's log as lines; ``verbose`` 1 to 3: from info, debug or trace, with date and class."""
+    logger, level = mi.logger(), mi.log_level()
+    before, formatter = [logger.appender(i) for i in range(logger.appender_count())], logger.formatter()
+    own = mi.DefaultFormatter()
+    own.set_has_log_level(False)
+    own.set_has_thread(False)
+    own.set_has_date(verbose > 0)
+    own.set_has_class(verbose > 0)
+    logger.clear_appenders()
+    logger.add_appender(_Lines())
+    logger.set_formatter(own)
+    if verbose:
+        levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
+        mi.set_log_level(levels[min(verbose, len(levels)) - 1])
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)
+        logger.set_formatter(formatter)
+        logger.clear_appenders()
+        for appender in before:
+            logger.add_appender(appender)
