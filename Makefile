@@ -122,5 +122,5 @@ $(INSTALLED): pyproject.toml
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
-		--editable '.[cluster,completion,denoise,measure]' --group dev
+		--editable '.[cluster,denoise,measure]' --group dev
 	touch $@

@@ -92,33 +92,13 @@ def test_lines_come_now_and_then(monkeypatch):
     assert len(at(3000.0, 60)) == 3 and len(at(3050.0, 61)) == 3 and len(at(3070.0, 61)) == 4
 
 
-def test_percentages_are_those_that_farms_read():
-    """Expected: each whole per cent once, in lines that the expressions of Deadline's plugins
-    (``.*Progress: (\\d+)%.*``) and of Alfred's readers (``ALF_PROGRESS\\s+([0-9]+)%``) find; 100 at the end
-    of a render that has ended before its samples or its time.
-    """
-    stream = io.StringIO()
-    show = progress.Percentages(10.0, stream=stream)
-    for done, seconds in ((0.2, 0.01), (1, 0.1), (1.4, 0.1), (50, 1.0), (60, 9.0)):
-        show(report(done, seconds=seconds))
-    show.finish()
-    show(report(100, seconds=9.5))
-    lines = stream.getvalue().splitlines()
-    assert lines == [f"ALF_PROGRESS {n}% Progress: {n}%" for n in (0, 1, 50, 90, 100)]
-    for expression in (r".*Progress: (\d+)%.*", r"ALF_PROGRESS\s+([0-9]+)%"):
-        found = [re.search(expression, line) for line in lines]
-        assert [match and match.group(1) for match in found] == ["0", "1", "50", "90", "100"]
-    assert all("alf_progress" in line.lower() for line in lines)  # as OpenCue's log view looks for it
-
-
 def test_which_display(monkeypatch):
     """Expected: of pytest, whose standard error is no terminal, lines, unless asked for something else."""
-    kinds = {"auto": "Lines", "bar": "Bar", "lines": "Lines", "deadline": "Percentages", "none": "Display"}
+    kinds = {"auto": "Lines", "bar": "Bar", "lines": "Lines", "none": "Display"}
     for name in progress.KINDS:
         shown = progress.display(name)
         assert type(shown).__name__ == kinds[name]
         shown(report(1))
-        shown.finish()
         shown.close()
 
 

@@ -1,10 +1,13 @@
 """The parameters are one record: reader, manual and documents are made from it."""
 
+import re
+
 import mitsuba as mi
 import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.settings import ALIASES, PARAMETERS, Settings
+from mitsuba_bdpt.removed import REMOVED
+from mitsuba_bdpt.settings import PARAMETERS, Settings
 
 
 def test_a_plugin_without_parameters_has_the_defaults():
@@ -29,33 +32,31 @@ def test_the_manual_lists_all():
     assert "| `max_depth` | `-1` | Longest path in edges, as in `path`:" in table
 
 
-def test_old_names_are_known():
-    """Rationale: scene files outlive names. Expected: an old name reads as the new one, both together are an
-    error, and the command's option of the new name replaces the scene file's parameter of the old one."""
-    old = {"type": "bdpt", "variance": True, "until_error": 0.25}
-    assert mi.load_dict(old).settings.target_error == 0.25
-    with pytest.raises(
-        (ValueError, RuntimeError), match="target_error is given twice, .*_error is its old name"
-    ):
-        mi.load_dict(old | {"target_error": 0.25})
-    assert all(name not in PARAMETERS and present in PARAMETERS for name, present in ALIASES.items())
+@pytest.mark.parametrize("entry", REMOVED)
+def test_what_was_removed_is_an_error_with_the_remedy(entry, capsys):
+    """Rationale: scene files and scripts outlive parameters. Expected: each entry of the table, as a
+    parameter, its value, an option or a command, is an error that names it and says what to use instead."""
+    parameter = not entry.startswith("--") and entry != "completion"
+    if parameter:
+        name, _, value = entry.partition("=")
+        with pytest.raises((ValueError, RuntimeError)) as error:
+            mi.load_dict({"type": "bdpt", name: value or 1.0})
+        said = str(error.value)
+        assert name in said and (not value or repr(value) in said)
+    else:
+        command = [] if entry == "completion" else ["render", "scene.xml"]
+        with pytest.raises(SystemExit) as ended:
+            main([*command, *entry.split()])
+        said = capsys.readouterr().err
+        assert ended.value.code == 2 and all(word in said for word in entry.split())
+    assert f"was removed; {REMOVED[entry]}" in said
 
 
-def test_the_option_replaces_the_old_name_in_a_scene_file(tmp_path):
-    """Expected: `--target-error`, and `--until-error`, over a scene file with ``until_error``, whose error no
-    render of 32 samples would reach."""
-    scene = tmp_path / "scene.xml"
-    scene.write_text(
-        """<scene version="3.0.0">
-        <integrator type="bdpt"><float name="until_error" value="1e-9"/>
-        <boolean name="variance" value="true"/>
-        <integer name="max_depth" value="2"/></integrator>
-        <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
-        <integer name="height" value="8"/></film></sensor>
-        <emitter type="constant"/></scene>"""
-    )
-    for option in ("--target-error", "--until-error"):
-        output = tmp_path / "image.exr"
-        assert main(["render", str(scene), option, "1", "-o", str(output)]) == 0
-        statistics = mi.Bitmap(str(output)).metadata()["bdptStatistics"]
-        assert '"spp": 32' in statistics
+def test_what_was_removed_is_gone():
+    """Expected: no entry of the table of removed names is a parameter or a choice of one; where an entry says
+    to use a parameter, there is one."""
+    for entry, remedy in REMOVED.items():
+        name, _, value = entry.partition("=")
+        assert value not in PARAMETERS[name].choices if value else name not in PARAMETERS
+        if (word := re.match(r"use (\w+)$", remedy)) is not None:
+            assert word[1] in PARAMETERS

@@ -12,7 +12,7 @@ from ._version import __version__
 from .errors import CommandError, FailureError, UnsupportedError, UsageError, UsageTypeError
 from .host import llvm as _llvm
 from .host.llvm import LLVMNotFoundError
-from .progress import Bar, Display, Lines, Percentages
+from .progress import Bar, Display, Lines
 
 __all__ = [
     "BDPTIntegrator",
@@ -23,7 +23,6 @@ __all__ = [
     "LLVMNotFoundError",
     "Lines",
     "PassReport",
-    "Percentages",
     "Snapshot",
     "Statistics",
     "UnsupportedError",

@@ -1,4 +1,4 @@
-"""What a render shows of its progress: a bar, lines for a log, or what farms read.
+"""What a render shows of its progress: a bar, lines for a log, or nothing.
 
 A display is a function that a render calls with a `run.rendering.PassReport` after each pass::
 
@@ -90,9 +90,6 @@ class Display:
 
     def __call__(self, report: Report) -> None:
         """Show the ``report`` of a pass."""
-
-    def finish(self) -> None:
-        """Show that the render has come to its end, which reports of passes need not say."""
 
     def close(self) -> None:
         """Take away what is shown."""
@@ -201,30 +198,7 @@ class Lines(Display):
         _say(f"{clock} {done:4.0%} {in_words(report, self._limit, self._open_ended)}", self._stream)
 
 
-class Percentages(Display):
-    """Whole per cents on standard output, for the schedulers of farms, each once.
-
-    In the words that Deadline's plugins look for (``Progress: 42%``) and those of Alfred, which OpenCue's and
-    others' logs know (``ALF_PROGRESS 42%``).
-    """
-
-    def __init__(self, limit: float | None = None, open_ended: bool = False, *, stream: TextIO | None = None):
-        super().__init__(limit, open_ended)
-        self._stream, self._last = stream, -1
-
-    def __call__(self, report: Report) -> None:
-        self._show(int(100 * share_done(report, self._limit)))
-
-    def finish(self) -> None:
-        self._show(100)
-
-    def _show(self, percent: int) -> None:
-        if percent > self._last:
-            self._last = percent
-            _say(f"ALF_PROGRESS {percent}% Progress: {percent}%", self._stream or sys.stdout)
-
-
-KINDS = ("auto", "bar", "lines", "deadline", "none")
+KINDS = ("auto", "bar", "lines", "none")
 """Names of displays on the command line."""
 
 
@@ -232,4 +206,4 @@ def display(kind: str, limit: float | None = None, open_ended: bool = False) -> 
     """The `Display` of this name; ``auto``: a bar on a terminal, lines elsewhere."""
     if kind == "auto":
         kind = "bar" if sys.stderr is not None and sys.stderr.isatty() else "lines"
-    return {"bar": Bar, "lines": Lines, "deadline": Percentages, "none": Display}[kind](limit, open_ended)
+    return {"bar": Bar, "lines": Lines, "none": Display}[kind](limit, open_ended)

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from . import removed
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import named
 from .image import denoising, features, film_limits
@@ -17,7 +18,7 @@ from .image.colour import Bands, film_colours
 from .image.layers import layer_names
 from .image.stokes import POLARIZED
 from .planning.decision import read_decisions
-from .settings import ALIASES, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
+from .settings import LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
 # What numbers that are arguments of a render mean, for messages; of parameters see `settings.PARAMETERS`.
 ARGUMENTS = {
@@ -95,6 +96,8 @@ def _choice(value, name: str) -> str:
     choices = PARAMETERS[name].choices
     if not isinstance(value, str):
         raise UsageTypeError(f"{name}={_shown(value)} must be a string, one of {', '.join(choices)}")
+    if remedy := removed.remedy(f"{name}={value}"):
+        raise UsageError(f"{name}={value!r} {remedy}")
     if value not in choices:
         raise UsageError(f"{name}={value!r} is not known; use one of {', '.join(choices)}")
     return value
@@ -164,28 +167,13 @@ def _check_layers(settings: Settings):
         seen.add(layer)
 
 
-def _given(props) -> dict:
-    """The parameters that are given, by their present names.
-
-    Raises ``UsageError`` for those that do not exist or are given twice.
-    """
-    given = {}
-    for name in props.keys():
-        present = ALIASES.get(name, name)
-        if present not in PARAMETERS:
-            raise UsageError(_not_a_parameter(name, props[name]))
-        if present in given:
-            old = next(former for former, now in ALIASES.items() if now == present)
-            raise UsageError(f"{present} is given twice, {old} is its old name; leave out one of them")
-        given[present] = props[name]
-    return given
-
-
 def _not_a_parameter(name: str, value) -> str:
     if isinstance(value, mi.Object):
         return (
             f"{name} ({value.class_name()}) cannot be nested in it: bdpt holds no other object; take it out"
         )
+    if remedy := removed.remedy(name):
+        return f"{name}={_shown(value)}: the parameter {remedy}"
     remedy = REMEDIES.get(name)
     if remedy is None:
         remedy = f"{did_you_mean(name, PARAMETERS)}Parameters: {', '.join(PARAMETERS)}"
@@ -194,7 +182,10 @@ def _not_a_parameter(name: str, value) -> str:
 
 def read_settings(props) -> Settings:
     """The plugin's parameters, checked; raises ``UsageError`` and ``UsageTypeError``."""
-    given = _given(props)
+    given = {name: props[name] for name in props.keys()}
+    for name, value in given.items():
+        if name not in PARAMETERS:
+            raise UsageError(_not_a_parameter(name, value))
     values = {}
     for name, parameter in PARAMETERS.items():
         read = _READERS.get(name) or _READERS_OF_KINDS[parameter.kind]

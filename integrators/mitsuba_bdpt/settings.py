@@ -209,8 +209,7 @@ class Settings:
         "the relMSE to stop at, or 0 for none",
         """Stop when the estimate of the relMSE is this or less; needs ``variance``. It is looked at after 32
         samples per pixel, 64, 128, …; ``spp`` is the most that is spent. An estimate that is too small by
-        chance ends a render too early: see docs/user/long_renders.md for by how much. (Its old name
-        ``until_error`` is known too.)""",
+        chance ends a render too early: see docs/user/long_renders.md for by how much.""",
         low=0,
     )
     aovs: str = _parameter(
@@ -246,10 +245,6 @@ class Settings:
 
 
 PARAMETERS: dict[str, Parameter] = {f.name: f.metadata["parameter"] for f in fields(Settings)}
-
-# Old names, which are read as the new ones.
-ALIASES = {"until_error": "target_error"}
-
 _MANUAL_KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
 
 

@@ -1,4 +1,4 @@
-"""``render`` on a farm: signals, sizes, frames, more samples, what schedulers read."""
+"""``render`` on a farm: signals, sizes, frames."""
 
 import errno
 import json
@@ -58,42 +58,6 @@ def test_sigterm_ends_as_ctrl_c_does():
     assert out.rstrip().endswith("interrupted")
     # The signal may come between the end of a pass and its report.
     assert 0 < read(Path("ended.checkpoint.npz")).spp <= statistics["spp"]
-
-
-def test_a_finished_render_goes_on_with_more_samples(capsys):
-    """Expected: 8 and then 24 samples more are a render of 32, whose image is the mean of both parts, with
-    seeds of their own; both counts are its; then 32 more. What it has already is an error, and other
-    parameters are, before anything is rendered.
-    """
-    arguments = [*SMALL, "-o", "more.exr", "--checkpoint", "60", "--keep-checkpoint"]
-    assert main([*arguments, "--spp", "8"]) == 0
-    first, before = rendered.image("more.exr", "RGB")
-    for others, words in (
-        (["--spp", "4"], "has 8 samples per pixel already"),
-        (["--spp", "32", "-P", "max_depth=3"], "its max_depth is"),
-        (["--spp", "32", "--size", "8x8"], "is of another scene"),
-    ):
-        assert main([*arguments, "--resume", *others]) == 2
-        assert words in capsys.readouterr().err
-    assert main([*arguments, "--resume", "--spp", "32"]) == 0
-    whole, after = rendered.image("more.exr", "RGB")
-    kept = read(Path("more.checkpoint.npz"))
-    assert after["spp"] == 32 and kept.spp == 32 and len(set(kept.identity["seed"])) == 2
-    assert after["rays"]["camera"] > 3 * before["rays"]["camera"]
-    rest = (32 * whole - 8 * first) / 24
-    assert abs(rest.mean() / first.mean() - 1) < 0.1 and not np.allclose(rest, first, rtol=0.05)
-    assert main([*arguments, "--resume", "--spp", "64"]) == 0
-    assert (
-        rendered.image("more.exr", "RGB")[1]["spp"] == 64
-        and len(set(read(Path("more.checkpoint.npz")).identity["seed"])) == 3
-    )
-    assert main([*arguments[:-1], "--resume", "--spp", "96"]) == 0
-    assert not Path("more.checkpoint.npz").exists()
-
-
-def test_what_is_kept_needs_checkpoints(capsys):
-    assert main([*SMALL, "--keep-checkpoint"]) == 2
-    assert "keep_checkpoint needs --checkpoint MINUTES" in capsys.readouterr().err
 
 
 def test_size_and_crop():
@@ -411,19 +375,6 @@ def test_version_names_mitsubas(capsys):
     assert re.fullmatch(r"mitsuba-bdpt \S+ \(mitsuba 3\.\S+, drjit \S+\)\n", capsys.readouterr().out)
 
 
-def test_progress_for_farms(capsys):
-    """Expected: per cents on standard output before the closing line, none twice, the last is 100."""
-    assert main([*SMALL, "--spp", "16", "--progress", "deadline", "-o", "a.exr"]) == 0
-    *lines, last = capsys.readouterr().out.splitlines()
-    found = [int(re.fullmatch(r"ALF_PROGRESS (\d+)% Progress: \1%", line)[1]) for line in lines]
-    assert found == sorted(set(found)) and found[-1] == 100 and last.startswith("a.exr: ")
-    plain = SMALL[: SMALL.index("-P")]
-    path = [*plain, "--integrator", "path"]
-    for words in ([*SMALL, "--target-error", "0.5"], [*path, "--spp", "4"], [*path, "--time", "0.2"]):
-        assert main([*words, "--progress", "deadline", "-o", "b.exr"]) == 0
-        assert "ALF_PROGRESS 100% Progress: 100%" in capsys.readouterr().out
-
-
 def test_a_full_disk_is_said_with_the_file_and_a_remedy(capsys, monkeypatch):
     """Expected: the error of the system names the file, and what to do."""
 
@@ -464,20 +415,6 @@ def test_a_scheduler_that_does_not_answer_is_said_soon(capsys, monkeypatch):
         address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
         assert main([*SMALL, "--spp", "16", "--scheduler", address]) == 1
     assert "error: " in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
-def test_completion(shell, capsys):
-    """Expected: a script that knows commands and options."""
-    assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
-    assert "explain" in script and ("keep-checkpoint" in script or shell == "tcsh")
-
-
-def test_completion_without_shtab(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    assert main(["completion", "bash"]) == 2
-    assert "pip install 'mitsuba-bdpt[completion]'" in capsys.readouterr().err
 
 
 def test_a_preview_is_rewritten(monkeypatch):
@@ -541,18 +478,7 @@ def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, caps
 
 def test_nobody_listens_any_more():
     """Expected: a render whose standard output is closed writes its image and ends well."""
-    command = [
-        sys.executable,
-        "-m",
-        "mitsuba_bdpt",
-        *SMALL,
-        "--spp",
-        "8",
-        "--progress",
-        "deadline",
-        "-o",
-        "a.exr",
-    ]
+    command = [sys.executable, "-m", "mitsuba_bdpt", *SMALL, "--spp", "8", "-o", "a.exr"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()
     assert process.wait(timeout=PATIENCE) == 0, process.stderr.read()

@@ -107,6 +107,7 @@ def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsy
         (["--seed", "6"], "its seed is 5, here it is 6"),
         (["--resume", "--seed", "6"], "its seed is 5, here it is 6"),
         (["-P", "max_depth=3"], "its max_depth is"),
+        (["--spp", "64"], "its spp is 32, here it is 64"),
         (["-D", "resolution=8"], "is of another scene"),
         (["--resume", "-D", "resolution=8"], "or begin anew by --resume never"),
     ):

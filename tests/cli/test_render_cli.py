@@ -830,8 +830,7 @@ def test_what_bdpt_cannot_replace_is_rendered_by_the_files_own(around, capsys):
     assert main(["render", str(around), "--integrator", "scene", "-o", "a.exr"]) == 0
 
 
-@pytest.mark.parametrize("words", [["explain", "plain.xml"], ["completion", "bash"]], ids=" ".join)
-def test_a_pipe_that_closes_ends_the_command_quietly(scene, monkeypatch, capsys, words):
+def test_a_pipe_that_closes_ends_the_command_quietly(scene, monkeypatch, capsys):
     """Rationale: ``explain | head -1``. Expected: status 0, and nothing on standard error."""
 
     class Closed:
@@ -842,7 +841,7 @@ def test_a_pipe_that_closes_ends_the_command_quietly(scene, monkeypatch, capsys,
 
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", Closed())
-        assert main(words) == 0
+        assert main(["explain", "plain.xml"]) == 0
     assert capsys.readouterr().err == ""
 
 

@@ -18,11 +18,11 @@ from typing import NoReturn
 
 import mitsuba_bdpt
 
+from .. import removed
 from ..errors import did_you_mean
 from ..progress import KINDS
 from . import measuring, mistakes
-from .tev import PORT
-from .values import crop, definition, frames, number, property_, resume, size, tev_address
+from .values import crop, definition, frames, number, property_, resume, size
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -31,10 +31,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line `arguments` (default: the process's own) and return its exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)
-    if options.command == "completion":
-        from . import completion
-
-        return completion.run(options.shell, parser)
     if options.command == "doctor":
         from . import doctor
 
@@ -67,17 +63,24 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End the process with a usage error."""
+        wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
+        value = re.search(r"argument (--\S+): invalid choice: '(.*?)'", message)
+        question = ""
+        if wrong:
+            question = self._question(wrong[1] or wrong[2], command=bool(wrong[1]))
+        elif value:
+            question = removed.remedy(f"{value[1]} {value[2]}")
+        super().error(f"{message}; {question}".rstrip("; "))
+
+    def _question(self, name: str, command: bool) -> str:
+        """What may be meant by an unknown ``name``, of a ``command`` or an option."""
         known = [*self._options, *self._commands]
         known += [name for parser in self._commands.values() for name in parser._options]
-        wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
-        if wrong:
-            name = wrong[1] or wrong[2]
-            scene = wrong[1] and name.lower().endswith(".xml")
-            question = f"did you mean render {name}?" if scene else did_you_mean(name, known)
-            if name in known:
-                question = f"that is an option of {' and '.join(self._commands_with(name))}"
-            message = f"{message}; {question}".rstrip("; ")
-        super().error(message)
+        if name in known:
+            return f"that is an option of {' and '.join(self._commands_with(name))}"
+        if command and name.lower().endswith(".xml"):
+            return f"did you mean render {name}?"
+        return removed.remedy(name) or did_you_mean(name, known)
 
     def add_command(self, name: str, help_text: str) -> Parser:
         """The parser of a new command."""
@@ -106,10 +109,6 @@ def build_parser() -> argparse.ArgumentParser:
     help_text = "say what is installed and render a tiny image to prove that it works"
     doctor = parser.add_command("doctor", help_text)
     doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
-
-    help_text = "print a script that completes commands and options: source it in the shell's start-up file"
-    completion = parser.add_command("completion", help_text)
-    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
 
     help_text = "render a Mitsuba scene file to an EXR and a PNG image"
     add_render_arguments(parser.add_command("render", help_text))
@@ -179,22 +178,12 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
-    add(
-        "--target-error",
-        "--until-error",
-        dest="target_error",
-        type=number(float, 1e-12),
-        metavar="X",
-        help=text,
-    )
+    add("--target-error", type=number(float, 1e-12), metavar="X", help=text)
     text = "write what is done beside the image so often, for --resume; removed in the end"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
-    text = "keep the last checkpoint of a finished render, so that --resume --spp MORE can go on from it"
-    add("--keep-checkpoint", action="store_true", help=text)
     text = (
-        "go on from the checkpoint of an earlier render, with a larger --spp also of a finished one: auto "
-        "(default with --checkpoint) if there is one, must (also --resume alone) or end with an error, never "
-        "(begin anew, in place of it)"
+        "continue from the checkpoint of an interrupted render: auto (default with --checkpoint) if there is "
+        "one, must (also --resume alone) or end with an error, never (begin anew, in place of it)"
     )
     add("--resume", nargs="?", type=resume, const="must", metavar="WHEN", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
@@ -202,14 +191,12 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"
     add("--frames", type=frames, metavar="RANGE", help=text)
     text = (
-        "bar, lines (for logs, the first after ten seconds), deadline (per cents on standard output, as "
-        "Deadline and Alfred have them) or none; default: a bar on a terminal, lines elsewhere"
+        "bar, lines (for logs, the first after ten seconds) or none; default: a bar on a terminal, lines "
+        "elsewhere"
     )
     add("--progress", choices=KINDS, default="auto", help=text)
     text = "rewrite the PNG with the image so far, so often"
     add("--preview", type=number(float, 0), metavar="SECONDS", help=text)
-    text = f"show the image in the viewer tev while it is rendered; default port: {PORT}"
-    add("--tev", type=tev_address, metavar="HOST:PORT", help=text)
     text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
     add("--scheduler", metavar="ADDRESS", help=text)
     text = "number of parts of a render on a cluster; default: 4 for each worker"

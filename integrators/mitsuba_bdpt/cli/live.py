@@ -1,4 +1,4 @@
-"""The image of a render while it goes on: a PNG that is rewritten, the viewer tev."""
+"""The image of a render while it goes on: a PNG that is rewritten."""
 
 from __future__ import annotations
 
@@ -6,18 +6,12 @@ import sys
 import time
 from argparse import Namespace
 from collections.abc import Callable
-from contextlib import contextmanager
 from pathlib import Path
 
 import mitsuba as mi
-import numpy as np
 
-from ..files.images import screen_image, write_png
+from ..files.images import write_png
 from ..run.rendering import PassReport
-from .tev import Tev
-
-TEV_EVERY = 1.0
-"""Seconds between two images for tev, at least."""
 
 
 class Often:
@@ -32,21 +26,12 @@ class Often:
             self._last = time.monotonic()
 
 
-@contextmanager
-def watchers(options: Namespace, film: mi.Film, output: Path):
-    """What shows the image of a render into ``film`` as ``options`` say, a list of functions of a report."""
-    found, tev = [], None
-    if options.preview is not None:
-        path = output.with_suffix(".png")
-        found.append(Often(options.preview, lambda report: _rewrite(report, film, path, options.exposure)))
-    if options.tev is not None:
-        tev = Tev(*options.tev, output.name)
-        found.append(Often(TEV_EVERY, lambda report: tev.show(_pixels(report, film))))
-    try:
-        yield found
-    finally:
-        if tev is not None:
-            tev.close()
+def watchers(options: Namespace, film: mi.Film, output: Path) -> list[Often]:
+    """Functions of a `PassReport` that show the image of a render into ``film`` as ``options`` ask."""
+    if options.preview is None:
+        return []
+    path = output.with_suffix(".png")
+    return [Often(options.preview, lambda report: _rewrite(report, film, path, options.exposure))]
 
 
 def _rewrite(report: PassReport, film: mi.Film, path: Path, exposure: float) -> None:
@@ -56,10 +41,3 @@ def _rewrite(report: PassReport, film: mi.Film, path: Path, exposure: float) -> 
         write_png(film, film.bitmap(), path, exposure)
     except OSError as error:
         print(f"warning: no preview {str(path)!r}: {error}", file=sys.stderr)
-
-
-def _pixels(report: PassReport, film: mi.Film) -> np.ndarray:
-    """The colours of the image so far, linear, shape (height, width, 3)."""
-    report.image()
-    shown = screen_image(film, film.bitmap())
-    return np.array(shown.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))

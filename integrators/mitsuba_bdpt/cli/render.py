@@ -25,7 +25,7 @@ from ..host import memory
 from ..host.versions import versions
 from ..progress import display, readable
 from ..run.rendering import PassReport
-from . import checkpoints, cluster, extension, live
+from . import checkpoints, cluster, live
 from .mistakes import INTERRUPTED, answered, in_words, is_mistake
 from .signals import Ending, terminable
 
@@ -35,7 +35,7 @@ UNLIMITED_SPP = 1 << 16
 PASS_SPP = 16
 """Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
 
-SETS = {"time": {"timeout"}, "target_error": {"target_error", "until_error", "variance"}}
+SETS = {"time": {"timeout"}, "target_error": {"target_error", "variance"}}
 """The integrator's parameters that an option sets, see `loading.load`."""
 
 
@@ -228,9 +228,8 @@ def _explain(options: Namespace) -> int:
 
 def check_options(options: Namespace) -> None:
     """Raise ``CommandError`` for options that contradict one another."""
-    for name in ("resume", "keep_checkpoint"):
-        if getattr(options, name) and options.checkpoint is None:
-            raise CommandError(f"{name} needs --checkpoint MINUTES: how often to write them.")
+    if options.resume and options.checkpoint is None:
+        raise CommandError("resume needs --checkpoint MINUTES: how often to write them.")
     if options.parts is not None and options.scheduler is None:
         raise CommandError("parts needs --scheduler: without one, a render is made in one piece.")
     for name in ("checkpoint", "target_error", "time", "threads", "memory"):
@@ -257,7 +256,7 @@ def check_options(options: Namespace) -> None:
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
     """Raise ``CommandError`` for options that only ``bdpt`` can follow, and for what these cannot."""
-    for name in ("checkpoint", "scheduler", "preview", "tev", "memory"):
+    for name in ("checkpoint", "scheduler", "preview", "memory"):
         if getattr(options, name) is not None and not is_ours(integrator):
             raise CommandError(
                 f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "
@@ -275,21 +274,21 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
 def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
     """Render into the sensor's film, and show what is done meanwhile."""
     film = choose_sensor(scene, options.sensor).film()
-    with live.watchers(options, film, options.output) as watchers:
-        if options.scheduler is None:
-            if options.time is not None and not hasattr(integrator, "on_pass"):
-                return render_repeatedly(scene, integrator, options, spp)
-            return render_here(scene, integrator, options, spp, watchers)
-        started = time.perf_counter()
-        shown = display(options.progress)
-        try:
-            watch = all_of([shown, *watchers])
-            statistics, ended = cluster.render(scene, integrator, options, spp, watch)
-        finally:
-            shown.close()
-        seconds, done = time.perf_counter() - started, sum(statistics["passes"])
-        error = ended if isinstance(ended, Exception) else None
-        return Outcome(seconds, done, ended is not None, statistics, error)
+    watchers = live.watchers(options, film, options.output)
+    if options.scheduler is None:
+        if options.time is not None and not hasattr(integrator, "on_pass"):
+            return render_repeatedly(scene, integrator, options, spp)
+        return render_here(scene, integrator, options, spp, watchers)
+    started = time.perf_counter()
+    shown = display(options.progress)
+    try:
+        watch = all_of([shown, *watchers])
+        statistics, ended = cluster.render(scene, integrator, options, spp, watch)
+    finally:
+        shown.close()
+    seconds, done = time.perf_counter() - started, sum(statistics["passes"])
+    error = ended if isinstance(ended, Exception) else None
+    return Outcome(seconds, done, ended is not None, statistics, error)
 
 
 def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
@@ -304,39 +303,32 @@ def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
 
 def render_here(scene, integrator, options: Namespace, spp: int, watchers: list) -> Outcome:
     """Render in one go, with checkpoints if they are wanted."""
-    started, interrupted, seed, rest = time.perf_counter(), False, options.seed, None
+    started, interrupted = time.perf_counter(), False
     if hasattr(integrator, "statistics"):
         integrator.statistics = {}  # of the render before
-    kept, limit, asked = None, options.time, spp
+    kept, limit = None, options.time
     start = checkpoints.start(options, options.output)
     if start is not None:
         print(f"resume: goes on from {start.spp} of {spp} samples per pixel", file=sys.stderr)
         limit = limit and limit + start.progress.work.seconds
-        if extension.is_needed(start, spp):
-            rest, start = extension.Extension(start, scene, integrator, options), None
-            seed, spp = rest.seed, spp - rest.whole.spp
     if options.checkpoint is not None:
         kept = checkpoints.Checkpoints(options, options.output)
         watchers = [kept.after_pass, *watchers]
     shown = display(options.progress, limit, is_open_ended(options))
     try:
         if hasattr(integrator, "on_pass"):
-            watch = all_of([*watchers, shown])
-            integrator.on_pass = watch if rest is None else rest.watching(watch)
+            integrator.on_pass = all_of([*watchers, shown])
         arguments = {} if start is None else {"start": start}
-        integrator.render(scene, options.sensor, seed, spp, not is_ours(integrator), **arguments)
+        integrator.render(scene, options.sensor, options.seed, spp, not is_ours(integrator), **arguments)
         dr.sync_thread()
-        shown.finish()
     except KeyboardInterrupt:
         interrupted = True
     finally:
         shown.close()
         if hasattr(integrator, "on_pass"):
             integrator.on_pass = None
-    if rest is not None:
-        rest.assemble()
     statistics = getattr(integrator, "statistics", None) or {}
-    done = asked
+    done = spp
     if "passes" in statistics:
         done = int(sum(statistics["passes"]))
     elif interrupted:
@@ -344,10 +336,10 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
         done = 0
     outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics)
     if kept is not None:
-        whole = done == asked or reached(asked_error(integrator), statistics)
+        whole = done == spp or reached(asked_error(integrator), statistics)
         finished = not interrupted and whole
         # Of a finished render at the end only: its image may fail to be written.
-        if finished and not options.keep_checkpoint:
+        if finished:
             outcome.written = kept.remove
         else:
             kept.write()
@@ -395,7 +387,6 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
             total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
             done += size
             shown(_Report(done, spp, time.perf_counter() - started))
-        shown.finish()
     except KeyboardInterrupt:
         interrupted = True
     finally:

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable
 
 from ..measure.options import Number
-from . import tev
 
 PropertyValue = bool | int | float | str
 
@@ -79,14 +78,6 @@ def resume(text: str) -> str:
         scene = "; write the scene before --resume" if text.lower().endswith(".xml") else ""
         raise argparse.ArgumentTypeError(f"got {text!r}, which must be {', '.join(RESUME)} or nothing{scene}")
     return text
-
-
-def tev_address(text: str) -> tuple[str, int]:
-    """Host and port of the viewer tev, see `tev.address`."""
-    try:
-        return tev.address(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def definition(text: str) -> tuple[str, str]:

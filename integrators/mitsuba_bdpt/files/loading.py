@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ..errors import CommandError, did_you_mean
 from ..image import features
-from ..settings import ALIASES, PARAMETERS
+from ..settings import PARAMETERS
 
 SCENES_OWN = "scene"
 """What ``--integrator`` calls the integrator of the scene file."""
@@ -551,9 +551,6 @@ def integrator_properties(
                 properties[key] = given[key]
                 # Not every integrator has all of them; that is no mistake of the user's.
                 properties.mark_queried(key)
-    for old, present in ALIASES.items():
-        if present in overrides and old in properties:
-            del properties[old]
     for key, value in overrides.items():
         properties[key] = value
     return properties

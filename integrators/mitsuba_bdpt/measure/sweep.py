@@ -28,7 +28,6 @@ from ..errors import CommandError, message
 from ..files.images import check_output
 from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
-from ..settings import ALIASES
 from . import analysis, probes, showing
 from .bench import Bench, measure, measured
 from .cells import FIRST_SEED, Cell, Cells, machine, software
@@ -238,8 +237,7 @@ def short_of_target(table: list[dict]) -> list[str]:
     """A text about each integrator of which renders ended before they reached the preset's target error."""
     renders = {}
     for row in table:
-        parameters = {ALIASES.get(name, name): value for name, value in json.loads(row["parameters"]).items()}
-        target = parameters.get("target_error", 0)
+        target = json.loads(row["parameters"]).get("target_error", 0)
         if target > 0:
             key = row["scene"], row["budget"], row["method"], target
             error = json.loads(row["statistics"])["error"]

@@ -1,0 +1,22 @@
+"""What the plugin and its command had in earlier versions, and what to use instead.
+
+The errors of the parameters' reader and of the command line are made from this table.
+"""
+
+from __future__ import annotations
+
+# By name: a parameter, "parameter=value", a command, an option, "--option value".
+REMOVED = {
+    "until_error": "use target_error",
+    "--until-error": "use --target-error",
+    "--keep-checkpoint": "a finished render cannot be continued; for more samples render with another --seed "
+    "and combine both (mitsuba_bdpt.Snapshot.joined)",
+    "--progress deadline": "use --progress lines, whose lines on standard error have the percentage",
+    "--tev": "use --preview SECONDS, which rewrites the PNG, and a viewer that watches files",
+    "completion": "generate completions from --help with a tool such as shtab or your shell's own",
+}
+
+
+def remedy(name: str) -> str:
+    """What to use instead of ``name``, a key of `REMOVED`; empty if it never existed."""
+    return f"was removed; {REMOVED[name]}" if name in REMOVED else ""
