@@ -30,7 +30,7 @@ def test_what_it_does_to_the_error(name):
     Expected: in six scenes of 16 samples per pixel the relMSE of the denoised image is at most three quarters
     of the raw one's, of `path` as of bdpt; the colours are those of a render without the parameter. (In
     `veach_mis` the denoiser makes halos about a lamp whose radiance is a thousand times the image's mean:
-    docs/reports/denoise.md.)
+    docs/development/experiments.md, "Denoising".)
     """
     scene, depth = repository.load_scene(name, resolution=SIZE), repository.benchmark_depth(name)
     expected = repository.load_reference(name, SIZE, depth).image

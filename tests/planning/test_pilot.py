@@ -674,7 +674,7 @@ def test_candidates_draw_their_connections():
     render = of(cornell())
     found = candidates(render.prepared, render.plan, render.settings)
     assert {c.connections for c in found} == {"none", "one"}
-    assert len(set(found)) == len(found) == 30  # as docs/method/skipping.md says
+    assert len(set(found)) == len(found) == 30
 
 
 @cache

@@ -53,7 +53,7 @@ WAYS = {
 MERGING_RADIUS = 0.25
 """Of "merging" unless the recipe says another one.
 
-Merging blurs, and the halves do not show it: docs/reports/merging.md has what is left.
+Merging blurs, and the halves do not show it: docs/development/experiments.md has what is left.
 """
 
 FOCUS_TIMES = 16  # of the samples, in windows

@@ -21,7 +21,7 @@ LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 
 # Costs of a pilot's kernel in a scene of many BSDFs (`bsdf.MANY`), in samples of a render without a pilot:
 # compiling per kind of BSDF, recording per BSDF. Longer renders run a pilot
-# (docs/development/experiments.md, "Pilots in rooms").
+# (docs/development/experiments.md, "Choice of strategies").
 SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
 
 # Multiple of that length from which on the pilot also predicts the gain of guided s = 0 (two more kernels).

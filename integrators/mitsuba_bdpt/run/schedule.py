@@ -17,7 +17,7 @@ from ..transport.batch import Batch
 LAUNCH_SAMPLES = 1 << 21
 
 # The same on a GPU, which traces 2^21 camera subpaths in less time than Python needs to record the pass
-# (docs/reports/cuda.md, "Where the time goes").
+# (docs/development/experiments.md, "CUDA").
 LAUNCH_SAMPLES_CUDA = 1 << 24
 
 # Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
