@@ -46,9 +46,6 @@ pictures: $(INSTALLED)
 	done
 	$(VENV)/bin/python scripts/equal_time.py lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
 	$(VENV)/bin/python scripts/equal_time.py fog_caustic --spp 64 -o docs/images/fog_caustic_equal_time.png
-	$(VENV)/bin/python scripts/equal_time.py veach_mis --spp 16 -o docs/images/veach_mis_heuristics.png \
-		-i "bdpt skip=none heuristic=uniform" "bdpt skip=none heuristic=maximum" \
-		"bdpt skip=none heuristic=power" "bdpt skip=none heuristic=balance"
 	$(VENV)/bin/python scripts/strategies.py veach_bidir -o renders/pyramid.exr
 	cp renders/pyramid_weighted.png renders/pyramid_unweighted.png docs/images
 

@@ -452,25 +452,11 @@ MUTANTS = (
         ("tests/transport/test_bsdf.py::test_both_sides_carry_the_same[dielectric-0.0]",),
     ),
     Mutant(
-        "weights: the maximum heuristic adds up",
-        "transport/mis.py",
-        "total = dr.maximum(a, b)",
-        "total = a + b",
-        ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[n1c1-maximum]",),
-    ),
-    Mutant(
         "weights: the power heuristic adds up",
         "transport/mis.py",
         "total = dr.hypot(a, b)",
         "total = a + b",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[n1c1-power]",),
-    ),
-    Mutant(
-        "weights: uniform counts what cannot be made",
-        "transport/mis.py",
-        "return dr.select(factor > 0, x, 0)",
-        "return x",
-        ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[n1c1-uniform]",),
     ),
     Mutant(
         "weights: no density from the other side",
@@ -781,13 +767,6 @@ MUTANTS = (
             "tests/images/test_media_edges.py::test_light_from_infinity_hits_a_lens[null-sky]",
             "tests/images/test_media_edges.py::test_light_from_infinity_hits_a_lens[mask-sun]",
         ),
-    ),
-    Mutant(
-        "media: maximum decides before the ray",
-        "transport/contribution.py",
-        "if kernel.strategy_images or kernel.space is not None:",
-        "if kernel.strategy_images:",
-        ("tests/images/test_media_edges.py::test_maximum_in_fog[all]",),
     ),
     Mutant(
         "media: the back of a shell is sampled from outside",

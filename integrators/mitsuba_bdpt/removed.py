@@ -7,6 +7,8 @@ from __future__ import annotations
 
 # By name: a parameter, "parameter=value", a command, an option, "--option value".
 REMOVED = {
+    "heuristic=maximum": "use balance, whose variance is lower (E. Veach's thesis, section 9.2)",
+    "heuristic=uniform": "use balance; for unweighted estimates of all strategies set strategy_images",
     "until_error": "use target_error",
     "--until-error": "use --target-error",
     "--keep-checkpoint": "a finished render cannot be continued; for more samples render with another --seed "

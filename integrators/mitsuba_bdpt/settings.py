@@ -20,7 +20,7 @@ MAX_STORED = 1024
 # Edges of paths that use all strategies if ``stored_vertices`` is not given; with media `MAX_STORED`.
 DEFAULT_STORED = 64
 
-HEURISTICS = ("balance", "power", "maximum", "uniform")
+HEURISTICS = ("balance", "power")
 SKIP = ("auto", "impossible", "none")
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
 GUIDING = ("auto", "always", "never")
@@ -93,8 +93,7 @@ class Settings:
     heuristic: str = _parameter(
         "balance",
         "a heuristic",
-        """How multiple importance sampling weighs strategies: ``balance``, ``power``, ``maximum`` or
-        ``uniform``.""",
+        "Heuristic of multiple importance sampling: ``balance`` or ``power`` (exponent 2).",
         choices=HEURISTICS,
     )
     skip: str = _parameter(

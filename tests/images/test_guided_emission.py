@@ -102,8 +102,6 @@ def test_images_with_a_wide_lens(lamps):
     "parameters",
     [
         {"heuristic": "power"},
-        {"heuristic": "maximum"},
-        {"heuristic": "uniform"},
         {"points": "independent"},
         {"hide_emitters": True},
         {"stored_vertices": 2},

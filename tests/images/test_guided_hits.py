@@ -157,8 +157,6 @@ def test_a_wide_lens():
     "parameters",
     [
         {"heuristic": "power"},
-        {"heuristic": "maximum"},
-        {"heuristic": "uniform"},
         {"light_paths": 0},
         {"connections": "none"},
         {"rr_depth": 1},

@@ -97,8 +97,6 @@ def test_images_are_those_of_all_connections(material):
     "parameters",
     [
         {"heuristic": "power"},
-        {"heuristic": "maximum"},
-        {"heuristic": "uniform"},
         {"points": "independent"},
         {"max_depth": 3},
         {"stored_vertices": 3},

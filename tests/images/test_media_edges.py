@@ -60,17 +60,6 @@ def open_air(light, medium=None, **more):
     return {"type": "scene", "sensor": eye, "matte": matte, "light": light, **more}
 
 
-@pytest.mark.parametrize("connections", ["all", "one"])
-def test_maximum_in_fog(connections):
-    """Rationale: the heuristic `maximum` decides by densities with T~, which are known after the ray only.
-    Decided before it as well, half of the light in thick fog was lost. Expected: the image of ``balance``.
-    """
-    scene = mi.load_dict(parts.foggy(parts.fog(2.0, 0.8)))
-    more = {"light_paths": 1, "connections": connections}
-    a = means(scene, 10, heuristic="maximum", **more)
-    assert_agree(a, means(scene, 300, **more))
-
-
 @pytest.mark.parametrize("light", ["sky", "sun"])
 @pytest.mark.parametrize("boundary", ["null", "mask"])
 def test_light_from_infinity_hits_a_lens(boundary, light):

@@ -280,10 +280,9 @@ def test_paths_longer_than_stored():
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
-@pytest.mark.parametrize("heuristic", ["power", "maximum", "uniform"])
-def test_heuristics(heuristic):
+def test_power_heuristic():
     """Expected: the same tiles as with the balance heuristic without merging."""
-    a = images(lit_by_a_ball("diffuse"), 256, 8, merging=True, merging_radius=0.25, heuristic=heuristic)
+    a = images(lit_by_a_ball("diffuse"), 256, 8, merging=True, merging_radius=0.25, heuristic="power")
     st.assert_agree(st.compare_images(st.tiles(a), without_merging("diffuse")), at_least=16)
 
 

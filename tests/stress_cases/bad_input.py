@@ -47,7 +47,7 @@ SENSIBLE = {
     "target_error": (0.0, 0.1),
     "spp_per_pass": (0, 1, 3),
     "timeout": (-1.0, 0.0, 1e9),
-    "heuristic": ("balance", "power", "maximum", "uniform"),
+    "heuristic": ("balance", "power"),
     "skip": ("auto", "impossible", "none"),
     "connections": ("auto", "all", "one", "none"),
     "points": ("sobol", "sampler", "independent"),

@@ -69,7 +69,7 @@ def bsdf_cases():
 
 
 def heuristics_case():
-    """Densities that are not finite under the other heuristics, which may give weights of 0 or 1 for them."""
+    """Densities that are not finite under both heuristics."""
 
     def plate(value):
         register()
@@ -88,7 +88,7 @@ def heuristics_case():
         return together(outcomes)
 
     tried = (
-        "densities NaN or infinite, of half a plate or of half a user's environment, under every heuristic"
+        "densities NaN or infinite, of half a plate or of half a user's environment, under both heuristics"
     )
     return _case("heuristics-nan", tried, TWIN, run, True)
 

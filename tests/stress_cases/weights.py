@@ -55,19 +55,16 @@ class Tally:
     off: int = 0
     worst: float = 0.0
     bad: int = 0
-    ties: int = 0
     span: float = 0.0
     wide: int = 0
     differ: float = 0.0
     wrong: int = 0
     unsure: int = 0
 
-    def add(self, weights, used, tied=None):
-        """Weights of paths, (n, k + 2); which strategies can make them; which paths do not count."""
+    def add(self, weights, used):
+        """Weights of paths, (n, k + 2), and which strategies can make them."""
         self.bad += int((used & ~((weights >= 0) & (weights <= 1))).any(1).sum())
-        counted = used.any(1) if tied is None else used.any(1) & ~tied
-        error = np.abs(np.where(used, weights, 0).sum(1) - 1)[counted]
-        self.ties += 0 if tied is None else int((tied & used.any(1)).sum())
+        error = np.abs(np.where(used, weights, 0).sum(1) - 1)[used.any(1)]
         self.paths += len(error)
         self.off += int((~(error <= TOLERANCE)).sum())
         self.worst = max(self.worst, float(error.max(initial=0)))
@@ -83,7 +80,6 @@ class Tally:
         text = f"{self.paths:,} paths, sums off by {self.worst:.1e} at most"
         text += f", {self.bad} with a weight outside [0, 1]"
         text += f", {self.off} sums off by more than {TOLERANCE}" if self.off else ""
-        text += f", {self.ties} ties left out" if self.ties else ""
         text += f", {self.wrong} weights wrong by more than {TOLERANCE}" if self.wrong else ""
         judged = self.unsure <= MOST_UNSURE * self.paths  # else a fault may hide there
         return Outcome(
@@ -122,7 +118,7 @@ def chains(heuristic: str, batches: int, size: int) -> Outcome:
         paths = wide_paths(rng, size, k)
         weights = recursion(paths, kappa, heuristic)
         explicit = oracle.Explicit(paths, kappa)
-        tally.add(weights, explicit.used, explicit.ambiguous if heuristic == "maximum" else None)
+        tally.add(weights, explicit.used)
         orders = span(explicit.size)
         tally.span, tally.wide = max(tally.span, orders.max()), tally.wide + int((orders > WIDE).sum())
     more = (
@@ -186,8 +182,7 @@ def extremes(batches: int, size: int) -> Outcome:
             explicit, within = oracle.Explicit(paths, kappa), held(paths)
             weights = recursion(paths, kappa, heuristic)
             tally.add(weights, explicit.used)
-            tied = explicit.ambiguous[within] if heuristic == "maximum" else None
-            sound.add(weights[within], explicit.used[within], tied)
+            sound.add(weights[within], explicit.used[within])
     text = (
         f"{tally.paths:,} paths, {tally.bad} weights outside [0, 1]; of {sound.paths:,} whose products are "
     )
@@ -212,12 +207,10 @@ def weigh(tally: Tally, capture: Capture, heuristic: str):
         at = np.arange(len(own)), np.repeat([m.s for m in group], [len(m.weights) for m in group])
         explicit = oracle.Explicit(paths, capture.coefficients)
         expected = explicit.weights(heuristic)
-        maximum = heuristic == "maximum"
         weights, used = recursion(paths, capture.coefficients, heuristic), explicit.used.copy()
         weights[at], used[at] = own, True
-        tally.add(weights, used, explicit.ambiguous if maximum else None)
-        sure = ~(maximum & explicit.tied)
-        tally.compare(own[sure], expected[at][sure])
+        tally.add(weights, used)
+        tally.compare(own, expected[at])
         tally.unsure += sum(m.unsure for m in group)
 
 
@@ -297,10 +290,6 @@ OWN = (
     "; the kernel's own weight is that by explicit densities within 1e-3: edges may be turned by 1e-3 of a "
     "cosine, and what they say of densities is off by as much"
 )
-TIES = {
-    "maximum": "; paths with a density 5e-5 to 2e-4 below the largest are left out: below 1e-4 the kernel "
-    "takes densities for equal"
-}
 
 
 def _chains(heuristic: str, batches: int, size: int, quick=False) -> Case:
@@ -309,10 +298,7 @@ def _chains(heuristic: str, batches: int, size: int, quick=False) -> Case:
         SECTION,
         f"`{heuristic}`: weights of all strategies of random chains of 1 to 8 edges by the recursion, "
         "densities over up to 12 orders of magnitude each, larger from one end all along a path",
-        SUMS
-        + TIES.get(heuristic, "")
-        + f"; densities of {LEAST_WIDE:.1%} of the paths at least are more than "
-        f"10^{WIDE} apart",
+        SUMS + f"; densities of {LEAST_WIDE:.1%} of the paths at least are more than 10^{WIDE} apart",
         partial(chains, heuristic, batches, size),
         quick,
     )
@@ -331,7 +317,7 @@ def _paths(name: str, heuristic: str, count: int, lanes: int, number: int, least
         f"`{heuristic}`: paths that the kernel makes in random scenes (hypothesis: shapes, BSDFs, emitters, "
         "sensors, coefficients, all connections or one); its own weight, and those of all other strategies "
         "from densities asked of the scene anew",
-        SUMS + OWN + TIES.get(heuristic, "") + f"{asked}; {left_out}",
+        SUMS + OWN + f"{asked}; {left_out}",
         partial(of_the_kernel, heuristic, count, lanes, number, least),
         quick=name == "few",
     )
@@ -340,8 +326,6 @@ def _paths(name: str, heuristic: str, count: int, lanes: int, number: int, least
 CASES = (
     _paths("balance", "balance", 26, 150_000, 3, 10**7),
     _paths("power", "power", 8, 3 << 14, 4, 10**6),
-    _paths("maximum", "maximum", 8, 3 << 15, 5, 5 * 10**5),
-    _paths("uniform", "uniform", 4, 1 << 14, 6, 10**5),
     _paths("few", "balance", 3, 1 << 11, 7, 10**4),
     Case(
         "weights-glint",
@@ -355,8 +339,6 @@ CASES = (
     ),
     _chains("balance", 26, 1 << 17),
     _chains("power", 26, 1 << 17),
-    _chains("maximum", 26, 1 << 17),
-    _chains("uniform", 4, 1 << 14, quick=True),
     Case(
         "weights-extremes",
         SECTION,

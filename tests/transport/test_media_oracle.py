@@ -48,19 +48,15 @@ def test_recursion_with_transmittances(name, classes):
 
     500 random paths each of k = 1 ... 7 edges, transmittances of 1e-4 to 1, extinctions of 1e-3 to 1e3,
     otherwise as `test_oracle.test_recursion_agrees_with_explicit_densities`. Expected: every weight is the
-    oracle's to 1e-4 of its own size, and the weights of a path sum to 1 within 1e-4. For ``maximum``, paths
-    whose two best strategies tie are left out.
+    oracle's to 1e-4 of its own size, and the weights of a path sum to 1 within 1e-4.
     """
     rng = np.random.default_rng(1)
     for k in range(1, 8):
         paths = in_media(rng, random_paths(rng, 500, k), 4)
         explicit = oracle.Explicit(paths, COEFFICIENTS[classes])
         weights = np.where(explicit.used, recursion(paths, COEFFICIENTS[classes], name), 0)
-        keep = ~explicit.tied if name == "maximum" else np.ones(500, dtype=bool)
-        expected = explicit.weights(name)
-        np.testing.assert_allclose(weights[keep], expected[keep], rtol=1e-4, atol=1e-30, err_msg=f"k={k}")
-        possible = explicit.used.any(1) & keep
-        np.testing.assert_allclose(weights[possible].sum(1), 1, atol=1e-4)
+        np.testing.assert_allclose(weights, explicit.weights(name), rtol=1e-4, atol=1e-30, err_msg=f"k={k}")
+        np.testing.assert_allclose(weights[explicit.used.any(1)].sum(1), 1, atol=1e-4)
 
 
 def test_any_transmittance_is_a_partition():

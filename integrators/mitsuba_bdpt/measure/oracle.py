@@ -213,20 +213,6 @@ class Explicit:
         best = self.size.max(1, keepdims=True, initial=-1e300)
         self._ratio = np.where(self.used, np.exp(np.minimum(self.size - best, 0)), 0)
 
-    @property
-    def tied(self):
-        """Mask (n,) of paths whose two best strategies are within 1e-4 of each other."""
-        return np.sort(self._ratio, axis=1)[:, -2] > 1 - 1e-4
-
-    @property
-    def ambiguous(self):
-        """Mask (n,) of paths of which rounding decides under ``maximum``.
-
-        A strategy lies about 1e-4 below the best. Closer ones are equal to the kernel: that with the fewest
-        light vertices counts.
-        """
-        return ((self._ratio < 1 - 5e-5) & (self._ratio > 1 - 2e-4)).any(1)
-
     def weights(self, heuristic: str):
         """Weights in the shape of ``size``, zero where a strategy is not in use."""
         ratio = self._ratio
@@ -234,10 +220,6 @@ class Explicit:
             part = ratio
         elif heuristic == "power":
             part = ratio**2
-        elif heuristic == "maximum":
-            part = (ratio >= 1).astype(float)
-        elif heuristic == "uniform":
-            part = self.used.astype(float)
         else:
             raise ValueError(heuristic)
         total = part.sum(1, keepdims=True)

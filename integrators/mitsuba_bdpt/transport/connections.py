@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
 from . import mis, scattering, spectra
-from .contribution import Contribution, drop_non_finite, foreseen, roulette, size_of, worth_a_ray
+from .contribution import Contribution, drop_non_finite, roulette, size_of
 from .counters import MEDIA, Counters, counted_in_media, one
 from .inputs import Kernel
 from .sketches import Sketch, guess
@@ -57,7 +57,6 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     )
     sides = kernel.kappa.inner, light_side, camera_side
     weight, shares = h.weigh(*sides)
-    active &= worth_a_ray(kernel, value, weight)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
 
 
@@ -179,7 +178,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
-        of_this = foreseen(kernel, _as_drawn(kernel, z, y, c))
+        of_this = _as_drawn(kernel, z, y, c).weighted()
         size = size_of(of_this)
         before, total = total, total + size
         # What is left of the number after the decision, u / share or (u - share) / (1 - share).
@@ -241,7 +240,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     probability = dr.select(guessed, EVENLY / count + (1 - EVENLY) * size / total, 1 / count)
     y = read_light_vertex(kernel, path, drawn, some)
     c = drop_non_finite(inner(kernel, replace(z, hit=z.hit & some), y))
-    value = dr.select(some & c.active, foreseen(kernel, c) / probability, 0)
+    value = dr.select(some & c.active, c.weighted() / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
     return _Drawn(value, size_of(value), end, left, one(some), one(c.active), c.counted.non_finite)
 

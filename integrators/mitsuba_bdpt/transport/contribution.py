@@ -74,28 +74,6 @@ def roulette(
     return active & survived, survival, Counters(rouletted=one(active & ~survived))
 
 
-def worth_a_ray(kernel: Kernel, value: mi.Spectrum, weight: mi.Float) -> mi.Bool:
-    """Mask: a strategy of this ``value`` and weight is worth a ray, or `drop_non_finite` has to count it.
-
-    Of what is not finite the weight may be 0. Technique images show unweighted ones too. With media the
-    weight is not known before the ray, see `visibility.seen`, and may have been 0 (heuristic ``maximum``).
-    """
-    if kernel.strategy_images or kernel.space is not None:
-        return mi.Bool(True)
-    return ~(weight == 0) | ~spectra.is_finite(value)
-
-
-def foreseen(kernel: Kernel, c: Contribution) -> mi.Spectrum:
-    """What ``c`` adds if nothing is in the way, for draws and roulette before its ray: not 0 where f is not.
-
-    With media the weight is known after the ray only, and the heuristic ``maximum`` may still turn it from 0
-    to 1.
-    """
-    if kernel.space is not None and kernel.heuristic.name == "maximum":
-        return dr.select(c.active, c.value, 0)
-    return c.weighted()
-
-
 def size_of(value: mi.Spectrum):
     """A measure of a contribution's size; any will do as long as it is positive where f is."""
     return spectra.brightest(value)

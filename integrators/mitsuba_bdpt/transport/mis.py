@@ -21,7 +21,7 @@ What differs from the report: (1) each strategy class has a coefficient kappa wi
 every weight, w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know yet which class its
 newest alternative will belong to, so the coefficient joins when a strategy is evaluated or when
 the term is folded into ``d_vc``, never when it is stored. (2) Sums are kept in linear units and
-combined by the heuristic (``a + b``, ``hypot``, ``max`` or a count); squares are never stored, so
+combined by the heuristic (``a + b`` or ``hypot``); squares are never stored, so
 ratios of densities over 60 orders of magnitude stay finite. (3) The density of next-event
 estimation may depend on the vertex that is lit; see ``emitters``.
 
@@ -100,7 +100,7 @@ def times(coefficient: Coefficient, pdf: mi.Float) -> PartialSum:
 
 
 class Heuristic:
-    """How alternatives are combined: ``balance``, ``power`` (exponent 2), ``maximum``, ``uniform``.
+    """How alternatives are combined: ``balance`` or ``power`` (exponent 2).
 
     Raises ``UsageError`` for any other name.
     """
@@ -114,8 +114,6 @@ class Heuristic:
         """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
         if is_absent(x) or is_absent(factor):
             return 0
-        if self.name == "uniform":  # counts strategies: only whether a density is zero matters
-            return dr.select(factor > 0, x, 0)
         # The factor as well: 0 times an infinite product of densities would be NaN.
         return dr.minimum(x * dr.minimum(factor, SATURATION), SATURATION)
 
@@ -123,12 +121,7 @@ class Heuristic:
         """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
         if is_absent(a) or is_absent(b):
             return b if is_absent(a) else a
-        if self.name == "power":
-            total = dr.hypot(a, b)
-        elif self.name == "maximum":
-            total = dr.maximum(a, b)
-        else:
-            total = a + b
+        total = dr.hypot(a, b) if self.name == "power" else a + b
         return dr.minimum(total, SATURATION)
 
     def zero(self) -> mi.Float | mi.Vector4f:
@@ -141,8 +134,6 @@ class Heuristic:
 
     def start(self, inverse_pdf: mi.Float):
         """Partial sum of one strategy whose ratio is ``inverse_pdf`` so far: 1 / a density in any measure."""
-        if self.name == "uniform":
-            return dr.select(inverse_pdf > 0, 1.0, 0.0)
         return dr.minimum(inverse_pdf, SATURATION)
 
     def weigh(
@@ -172,18 +163,9 @@ class Heuristic:
         ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
         alternatives with fewer and with more light vertices (eq. 37).
         """
-        if self.name == "maximum":
-            # Of equal ones, that with the fewest light vertices counts. Rounding must not decide:
-            # each strategy computes the ratio by itself. (Of three, each within 1e-4 of the next, none
-            # may count.)
-            near = coefficient * (1 + 1e-4)
-            best = (near >= camera_side) & (coefficient > light_side * (1 + 1e-4))
-            return dr.select(best, 1.0, 0.0)
         others = self.combine(light_side, camera_side)
         if is_absent(others):
             return mi.Float(1)
-        if self.name == "uniform":
-            return dr.rcp(1 + others)
         ratio = others / coefficient
         return dr.rcp(1 + (dr.square(ratio) if self.name == "power" else ratio))
 

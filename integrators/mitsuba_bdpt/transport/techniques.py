@@ -20,7 +20,7 @@ from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraJoin, SensorHit
 from . import bsdf, mis, spectra
-from .contribution import Contribution, foreseen, roulette, worth_a_ray
+from .contribution import Contribution, roulette
 from .counters import Counters, one
 from .inputs import Kernel
 from .visibility import Sight, seen
@@ -126,7 +126,6 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     )
     sides = kernel.kappa.direct, light_side, camera_side
     weight, shares = h.weigh(*sides)
-    active &= worth_a_ray(kernel, value, weight)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
@@ -170,7 +169,6 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
         camera_side = h.scale(h.start(pdf_second * join.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.endpoints, light_side, camera_side
     weight, shares = h.weigh(*sides)
-    active &= worth_a_ray(kernel, value, weight)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
     if kernel.space is not None:  # the sensor knows its medium in every direction
@@ -217,11 +215,10 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
         camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
     weight, shares = h.weigh(*sides)
-    active &= worth_a_ray(kernel, value, weight)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
-    active, survival, rouletted = roulette(kernel, foreseen(kernel, c), u, active)
+    active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
     sight = Sight(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
@@ -267,7 +264,6 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
             merges = h.scale(merges, kernel.merging.aim.density(emission) / emission.pdf_second)
         light_side = h.combine(light_side, dr.select(mis.is_joined(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
-    active &= worth_a_ray(kernel, value, weight)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & _hidden(kernel, z.surroundings, asked))
