@@ -12,6 +12,7 @@ import sys
 from types import SimpleNamespace
 
 import drjit as dr
+import internals
 import mitsuba as mi
 import mitsuba_bdpt
 import numpy as np
@@ -28,7 +29,7 @@ T = mi.ScalarTransform4f
 
 
 def integrator(**parameters):
-    return mi.load_dict({"type": "bdpt", **parameters})
+    return internals.bdpt(**parameters)
 
 
 def diffuse(reflectance=0.5):
@@ -101,7 +102,6 @@ def image(bdpt, scene, **keywords):
         ({"light_paths": -1}, "light_paths=-1"),
         ({"connections": "two"}, "connections='two'.*all, one, none"),
         ({"points": "halton"}, "points='halton'.*sobol, sampler, independent"),
-        ({"stored_vertices": 0}, "stored_vertices=0"),
         ({"spp_per_pass": -1}, "spp_per_pass=-1"),
         ({"timeout": "soon"}, "timeout='soon'"),
         ({"timeout": float("nan")}, "timeout=nan"),
@@ -145,7 +145,7 @@ def test_defaults():
     s = bdpt.settings
     assert (bdpt.max_depth, bdpt.rr_depth, s.hide_emitters, s.heuristic) == (-1, 5, False, "balance")
     assert (s.skip, s.light_paths, s.connections, s.points) == ("auto", "auto", "auto", "sobol")
-    assert (s.stored_vertices, s.strategy_images, s.spp_per_pass, s.timeout) == (-1, False, 0, -1)
+    assert (s.strategy_images, s.spp_per_pass, s.timeout) == (False, 0, -1)
     assert bdpt.statistics == {}
     assert "max_depth = -1" in str(integrator()) and "skip = none" in str(integrator(skip="none"))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABCMeta
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import wraps
 from importlib import import_module
 from typing import cast
@@ -25,7 +24,7 @@ from .run.arguments import check_made_for, check_resumable, resolve_sensor, samp
 from .run.rendering import PassReport, Render
 from .run.snapshot import Snapshot
 from .run.statistics import Statistics, statistics
-from .settings import UNLIMITED, Settings, manual
+from .settings import PARAMETERS, UNLIMITED, Settings, manual
 
 DOCUMENTATION = f"""Bidirectional path tracer (plugin ``bdpt``).
 
@@ -267,7 +266,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
 
     def to_string(self) -> str:
         """The parameters, one a line."""
-        values = asdict(self.settings) | {"max_depth": self.max_depth}
+        values = {name: getattr(self.settings, name) for name in PARAMETERS} | {"max_depth": self.max_depth}
         lines = "".join(f"  {k} = {v},\n" for k, v in values.items())
         return f"BDPTIntegrator[\n{lines}]"
 

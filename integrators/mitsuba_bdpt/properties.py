@@ -108,12 +108,6 @@ def _max_depth(value, name: str) -> int:
     return UNLIMITED if depth < 0 else depth
 
 
-def _stored_vertices(value, name: str) -> int:
-    if (stored := _integer(value, name)) == 0:
-        raise UsageError(f"{name}=0 must be {PARAMETERS[name].what}; for path tracing set light_paths=0")
-    return stored
-
-
 def _light_paths(value, name: str) -> float | str:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
@@ -144,7 +138,6 @@ def _aovs(value, name: str) -> str:
 # Parameters that more is to be said of than their kind and bounds.
 _READERS = {
     "max_depth": _max_depth,
-    "stored_vertices": _stored_vertices,
     "light_paths": _light_paths,
     "decisions": _decisions,
     "aovs": _aovs,

@@ -9,6 +9,9 @@ from __future__ import annotations
 REMOVED = {
     "heuristic=maximum": "use balance, whose variance is lower (E. Veach's thesis, section 9.2)",
     "heuristic=uniform": "use balance; for unweighted estimates of all strategies set strategy_images",
+    "merging_radius": "leave it out: the radius is about a pixel and shrinks from pass to pass; for a "
+    "smaller one render more samples, or a larger film",
+    "stored_vertices": "leave it out; for path tracing alone set light_paths=0",
     "until_error": "use target_error",
     "--until-error": "use --target-error",
     "--keep-checkpoint": "a finished render cannot be continued; for more samples render with another --seed "

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from math import inf
 from typing import Any
 
@@ -17,7 +17,7 @@ UNLIMITED = 2**32 - 1
 # on a thread's stack.
 MAX_STORED = 1024
 
-# Edges of paths that use all strategies if ``stored_vertices`` is not given; with media `MAX_STORED`.
+# Longest path in edges that uses all strategies, longer ones use s = 0 and s = 1; with media `MAX_STORED`.
 DEFAULT_STORED = 64
 
 HEURISTICS = ("balance", "power")
@@ -63,6 +63,16 @@ def _converted(default: Value, value: Value | None, what: str, meaning: str, **b
     """A field of `Settings` that holds ``value`` for the parameter's ``default``."""
     text = " ".join(meaning.split())
     return field(default=value, metadata={"parameter": Parameter(default, what, text, **bounds)})
+
+
+@dataclass(frozen=True)
+class Internals:
+    """Values of the method that no parameter sets; tests and the makers of references vary them."""
+
+    merging_radius: float = 1.0
+    """Radius of vertex merging in the first pass, in pixels as they are seen directly."""
+    stored_vertices: int | None = None
+    """Longest path in edges that uses all strategies; None: `DEFAULT_STORED`, with media `MAX_STORED`."""
 
 
 @dataclass(frozen=True)
@@ -136,13 +146,6 @@ class Settings:
         render is then consistent, not unbiased: it blurs these paths by about a pixel, less from pass to
         pass.""",
     )
-    merging_radius: float = _parameter(
-        1.0,
-        "a radius in pixels, greater than 0",
-        """Radius of the first pass within which ``merging`` takes photons, in pixels as they are seen
-        directly.""",
-        low=1e-3,
-    )
     photon_guiding: str = _parameter(
         "auto",
         "when s = 0 is guided",
@@ -164,15 +167,6 @@ class Settings:
         None,
         "a string of JSON",
         """JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.""",
-    )
-    stored_vertices: int = _parameter(
-        -1,
-        f"the longest path that uses all strategies, 1 to {MAX_STORED}, or -1 to choose",
-        """Longest path in edges that uses all strategies; longer ones use s = 0 and s = 1. -1: 64, in scenes
-        with participating media 1024 (subpaths are long there, and of the later vertices some are kept for
-        all).""",
-        low=-1,
-        high=MAX_STORED,
     )
     strategy_images: bool = _parameter(
         False,
@@ -232,6 +226,12 @@ class Settings:
         """Seconds after which no further pass is started (passes take about a tenth of it); -1: never.""",
     )
 
+    internals: Internals = Internals()
+
+    def varied(self, **internals: Any) -> Settings:
+        """These settings with other values of `Internals`."""
+        return replace(self, internals=replace(self.internals, **internals))
+
     @property
     def strategy_depth(self) -> int:
         """The largest path length of the strategy images, 0 for none."""
@@ -243,7 +243,9 @@ class Settings:
         return self.strategy_images and self.merging
 
 
-PARAMETERS: dict[str, Parameter] = {f.name: f.metadata["parameter"] for f in fields(Settings)}
+PARAMETERS: dict[str, Parameter] = {
+    f.name: f.metadata["parameter"] for f in fields(Settings) if "parameter" in f.metadata
+}
 _MANUAL_KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
 
 

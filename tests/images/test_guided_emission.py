@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -365,7 +366,7 @@ def spotlit(size=32):
 
 
 def rendered(scene, seed=0, spp=64, **parameters):
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
+    method = internals.bdpt(**{"max_depth": 6, **parameters})
     image = np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64)[..., :3]
     return image, method
 

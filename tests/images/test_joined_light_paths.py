@@ -3,6 +3,7 @@
 import json
 from types import SimpleNamespace
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -216,7 +217,7 @@ def cornell(size=64, **more):
 
 
 def rendered(scene, spp=64, seed=0, **parameters):
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
+    method = internals.bdpt(**{"max_depth": 6, **parameters})
     return np.array(method.render(scene, seed=seed, spp=spp)), method
 
 
@@ -294,14 +295,13 @@ def fog():
     [
         (fog, {}, "in scenes with media"),
         (tiny, {}, "in scenes with shapes so small"),
-        (dict, {"stored_vertices": 300}, "on paths of up to 300 edges, of which a lane"),
         (
             lambda: {"glass": {"type": "sphere", "radius": 0.2, "bsdf": {"type": "dielectric"}}},
             {"merging": True},
             "with merging",
         ),
     ],
-    ids=["media", "tiny shapes", "long paths", "merging"],
+    ids=["media", "tiny shapes", "merging"],
 )
 def test_decisions_that_are_impossible(more, parameters, why):
     """Expected: an error that names ``decisions`` and says why, before anything is rendered."""
@@ -309,13 +309,6 @@ def test_decisions_that_are_impossible(more, parameters, why):
     method = mi.load_dict({"type": "bdpt", "decisions": decided(), **parameters})
     with pytest.raises(ValueError, match=f"decisions: joined=4 is not possible {why}"):
         method.render(scene, spp=1)
-
-
-def test_as_many_vertices_as_lanes_can_keep():
-    """Expected: with paths of 258 edges, of which four light subpaths fill a lane's memory, an image."""
-    scene = scene_of("diffuse", "point")
-    method = mi.load_dict({"type": "bdpt", "decisions": decided(), "stored_vertices": 258})
-    assert np.isfinite(np.array(method.render(scene, spp=16))).all()
 
 
 def test_what_is_counted():

@@ -9,6 +9,7 @@ number of values tested at once. Seeds are fixed, so a test passes or fails alwa
 
 from functools import partial
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def sphere_lit_by(kind, sensor=None):
 
 
 def integrator(**parameters):
-    return mi.load_dict({"type": "bdpt", **parameters})
+    return internals.bdpt(**parameters)
 
 
 def render(scene, bdpt, seeds, spp):

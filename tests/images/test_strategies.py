@@ -22,6 +22,7 @@ from __future__ import annotations
 import itertools
 from functools import cache
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def load(name):
 
 
 def bdpt(**more):
-    return mi.load_dict({"type": "bdpt", "skip": "none", "rr_depth": 100, "max_depth": DEPTH, **more})
+    return internals.bdpt(**{"skip": "none", "rr_depth": 100, "max_depth": DEPTH, **more})
 
 
 def renders(scene, integrator, spp, first_seed, seeds=SEEDS):

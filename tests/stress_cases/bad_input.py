@@ -10,7 +10,6 @@ import numpy as np
 import repository
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from mitsuba_bdpt.settings import Settings
 
 import mitsuba as mi  # isort: skip
 
@@ -37,9 +36,7 @@ SENSIBLE = {
     "rr_depth": (1, 3, 100),
     "hide_emitters": (False, True),
     "merging": (False, True),
-    "merging_radius": (0.1, 1.0, 4.0),
     "light_paths": ("auto", 0, 1, "1/2", 0.25, "1/16"),
-    "stored_vertices": (1, 2, 64),
     "strategy_images": (False, True),
     "variance": (False, True),
     "denoise": (False, True),
@@ -56,7 +53,7 @@ SENSIBLE = {
     "aovs": ("", "albedo:albedo", "dd:depth,nn:sh_normal"),
     "decisions": ("", "[]"),
 }
-NAMES = tuple(Settings.__dataclass_fields__)
+NAMES = tuple(SENSIBLE)
 
 
 # Sensible values, and among them mostly one that is not: of many the first alone would be tried.

@@ -13,13 +13,15 @@ d = mi.cornell_box()
 d["sensor"]["film"]["width"] = d["sensor"]["film"]["height"] = 8
 %s
 scene = mi.load_dict(d)
-for parameters in %s:
+for parameters, stored in %s:
     integrator = mi.load_dict({"type": "bdpt", "skip": "none"} | parameters)
+    integrator.settings = integrator.settings.varied(stored_vertices=stored)
     print(np.array(mi.render(scene, integrator=integrator, spp=256)).mean())
 """
 
 
 def means(edit, parameters):
+    """Of images of these parameters, each with its `settings.Internals.stored_vertices`."""
     code = CODE % (edit, repr(parameters))
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
     assert result.returncode == 0, result.stderr[-2000:]
@@ -31,7 +33,7 @@ def test_sizes_of_local_memory_are_kernels_of_their_own():
     vertices must not serve a render with many (it crashed). Expected: small, large and small again run,
     and the same parameters give the same mean. Tolerance: 1e-5, the order of atomic sums.
     """
-    small, large = {"max_depth": 3, "stored_vertices": 2}, {"max_depth": 90, "stored_vertices": 90}
+    small, large = ({"max_depth": 3}, 2), ({"max_depth": 90}, 90)
     a, b, c, d = means("", [small, large, small, large])
     assert a == pytest.approx(c, rel=1e-5) and b == pytest.approx(d, rel=1e-5)
     assert b > a

@@ -281,13 +281,21 @@ class Aim:
 
 
 def _way(scene: MeasuredScene, by: str, merging_radius: float = MERGING_RADIUS) -> dict:
-    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`.
+    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`, for `_loaded`.
 
     ``merging_radius``: that of "merging", in pixels.
     """
     if by == "path":
         return {"type": path_tracers(scene.has_media)[0]}
     return WAYS[by] | ({"merging_radius": merging_radius} if by == "merging" else {})
+
+
+def _loaded(way: dict) -> mi.Integrator:
+    """The integrator of these parameters, among which ``merging_radius`` is one of `settings.Internals`."""
+    integrator = mi.load_dict({name: value for name, value in way.items() if name != "merging_radius"})
+    if "merging_radius" in way:
+        integrator.settings = integrator.settings.varied(merging_radius=way["merging_radius"])
+    return integrator
 
 
 def _same(stored: Reference, **wanted) -> bool:
@@ -321,7 +329,7 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     """As `_known`, by an integrator; False if the time was over first."""
     by = job.by or recipe.by
     parameters = _way(job.scene, by, recipe.merging_radius) | {"max_depth": job.depth}
-    integrator = mi.load_dict(parameters)
+    integrator = _loaded(parameters)
     sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
     scene = job.scene.load(job.resolution, sampler)

@@ -19,7 +19,7 @@ _RESTS = {
     Rest.VERTEX_BETWEEN_DELTA: ", a single other {vertex}, delta surfaces, sensor (no two neighbours can be "
     "joined)",
     Rest.SENSOR: ", sensor",
-    Rest.LONG: ", ... on paths longer than {longest} edges (stored_vertices)",
+    Rest.LONG: ", ... on paths longer than {longest} edges",
 }
 
 

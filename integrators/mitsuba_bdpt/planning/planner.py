@@ -223,13 +223,13 @@ class Planner:
             or self._prepared.traits.transmits
             or self._settings.points == "sampler"
             or dr.backend_v(mi.Float) != dr.JitBackend.LLVM
-            or self._why_not_joined(JOINED[-1])
+            or self._why_not_joined()
         ):
             return row
         return replace(row, candidate=replace(candidate, joined=JOINED[-1]))
 
-    def _why_not_joined(self, joined: int) -> str:
-        return why_not_joined(self._prepared, self._settings, self.full.merging, joined)
+    def _why_not_joined(self) -> str:
+        return why_not_joined(self._prepared, self.full.merging)
 
     def _learnt(self, moments: Moments, samples: int) -> emission.Learnt:
         """What the pilots teach about emission, remembered of the first (20 ms under a sky)."""
@@ -286,7 +286,7 @@ class Planner:
         If that differs from before, with points of their own: lanes serve other samples, and what was half
         done of the old sequence would not be finished.
         """
-        if decision.joined > 1 and (why := self._why_not_joined(decision.joined)):
+        if decision.joined > 1 and (why := self._why_not_joined()):
             raise UsageError(
                 f"decisions: joined={decision.joined} is not possible {why}; set it to 1, or leave it out"
             )

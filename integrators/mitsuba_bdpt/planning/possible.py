@@ -14,7 +14,7 @@ from ..geometry.boxes import scene_box
 from ..host.introspection import world_matrix
 from ..scene.prepared import PreparedScene
 from ..sensors.records import Sensor
-from ..settings import DEFAULT_STORED, MAX_STORED, Settings
+from ..settings import Settings
 from ..transport.plan import GUIDED, Plan
 from .budget import EVEN
 
@@ -62,12 +62,6 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         skip("t=0, t=1, (1,1), inner", "by hand", "light_paths=0")
     if inner and connections == "none":
         inner = skip("inner", "by hand", "connections=none")
-    if light_paths and 0 < settings.stored_vertices < min(settings.max_depth, DEFAULT_STORED):
-        skip(
-            f"t=0, t=1 and inner for paths longer than {settings.stored_vertices} edges",
-            "by hand",
-            f"stored_vertices={settings.stored_vertices}: such paths use s=0 and s=1",
-        )
     contradiction = prepared.light_media.contradiction if prepared.light_media else ""
     if contradiction and (splat or endpoints or arrival or inner):
         splat = endpoints = arrival = inner = skip("t=0, t=1, (1,1), inner", "impossible", contradiction)
@@ -94,19 +88,14 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     )
 
 
-def why_not_joined(prepared: PreparedScene, settings: Settings, merging: bool, joined: int) -> str:
-    """Why camera subpaths cannot be joined with so many light subpaths at a time; empty if they can."""
-    longest = min(settings.max_depth, prepared.stored_vertices(settings))
+def why_not_joined(prepared: PreparedScene, merging: bool) -> str:
+    """Why camera subpaths cannot be connected with several light subpaths at a time; empty if they can."""
     if prepared.space is not None:
         return "in scenes with media"
     if merging:
         return "with merging"
     if prepared.emitters.shape_errors.small:
         return "in scenes with shapes so small that rays ask which shape they meet"
-    if joined * (longest - 2) > MAX_STORED:
-        return (
-            f"on paths of up to {longest} edges, of which a lane cannot keep the vertices (stored_vertices)"
-        )
     return ""
 
 

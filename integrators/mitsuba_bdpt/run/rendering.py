@@ -256,7 +256,7 @@ class Render:
 
     def _radius_in_pixels(self, done: int) -> float:
         """Of the pass after ``done`` others of the same image, or replicate."""
-        return self.settings.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
+        return self.settings.internals.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
 
     def _photons(self, step: Step, footprints: Footprints) -> Merging:
         """The photons of a pass, whose radius follows from the passes done of the same image or replicate."""

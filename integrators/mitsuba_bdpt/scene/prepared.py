@@ -53,9 +53,9 @@ class PreparedScene:
         self.delta = any(b.flags() & delta for b in found)
 
     def stored_vertices(self, settings: Settings) -> int:
-        """The longest path in edges that uses all strategies: as given, else by whether there are media."""
-        if settings.stored_vertices > 0:
-            return settings.stored_vertices
+        """The longest path in edges that uses all strategies."""
+        if settings.internals.stored_vertices is not None:
+            return settings.internals.stored_vertices
         return DEFAULT_STORED if self.space is None else MAX_STORED
 
 

@@ -79,7 +79,6 @@ class Kernel:
         depth = settings.max_depth
         reach = min(depth, prepared.stored_vertices(settings))
         kept = plan.joined * (min(reach - 2, KEPT) if self.space is not None else reach - 2)
-        # More are refused where they are asked for, see `planning.possible.why_not_joined`.
         self.store_size = next(size for size in STORE_SIZES if size >= kept)
         self.strategy_images = settings.strategy_images
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
