@@ -183,9 +183,9 @@ MUTANTS = (
     ),
     Mutant(
         "numbers of the light subpath for the camera's",
-        "transport/kernel.py",
-        'points.stream("camera", lane.place.index(slot), slot)',
-        'points.stream("light", lane.place.index(slot), slot)',
+        "transport/subpaths.py",
+        'points.stream("camera", place.index(slot), slot)',
+        'points.stream("light", place.index(slot), slot)',
         ("tests/images/test_plausible_bugs.py::test_subpaths_draw_from_their_own_streams",),
     ),
     Mutant(
@@ -197,7 +197,7 @@ MUTANTS = (
     ),
     Mutant(
         "camera rays past hidden lamps keep their start",  # as in `path`
-        "transport/kernel.py",
+        "transport/subpaths.py",
         "        pi, ray = rays.intersect_past_emitters(",
         "        pi, _ = rays.intersect_past_emitters(",
         ("tests/images/test_plausible_bugs.py::test_a_ball_is_seen_as_it_is_through_a_hidden_lamp",),
@@ -307,7 +307,7 @@ MUTANTS = (
     ),
     Mutant(
         "emission: start of a light subpath lacks its density",
-        "transport/kernel.py",
+        "transport/subpaths.py",
         "partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))",
         "partial = mis.Partial(h.start(dr.rcp(e.pdf_second)), h.present(hit))",
         ("tests/transport/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-n1c1]",),
@@ -659,7 +659,7 @@ MUTANTS = (
     ),
     Mutant(
         "polarized: merged photons are not",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "value = z.throughput * f.value * estimate",
         "value = z.throughput * f.value * mi.Spectrum(mi.unpolarized_spectrum(estimate))",
         ("tests/images/test_polarized.py::test_isolated_paths_are_polarized",),
@@ -1045,7 +1045,7 @@ MUTANTS = (
     ),
     Mutant(
         "guided s = 0: several samples count as one",
-        "transport/guided_hits.py",
+        "transport/photons/guided_hits.py",
         "    return kernel.plan.guided * photon_guide",
         "    return photon_guide",
         ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-4]",),
@@ -1059,14 +1059,14 @@ MUTANTS = (
     ),
     Mutant(
         "guided s = 0: the density's normalisation",
-        "transport/photon_guide.py",
+        "transport/photons/photon_guide.py",
         "return total / (4 * dr.pi * len(WINDOW))",
         "return total / (2 * dr.pi * len(WINDOW))",
         ("tests/images/test_guided_hits.py::test_directions_follow_the_density[50]",),
     ),
     Mutant(
         "guided s = 0: photons of one place stay in the order of threads",
-        "transport/photon_guide.py",
+        "transport/photons/photon_guide.py",
         "(place << _LANE_BITS) | mi.UInt64(found.lane)",
         "place << _LANE_BITS",
         ("tests/images/test_guided_hits.py::test_the_guide_is_the_same_in_any_order",),
@@ -1094,35 +1094,35 @@ MUTANTS = (
     ),
     Mutant(
         "merging: photons of other cells in the same bucket count",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "(dr.gather(mi.UInt64, photons.cell, place, tried) == cell)",
         "True",
         ("tests/images/test_merging.py::test_cells_may_share_a_bucket",),
     ),
     Mutant(
         "merging: photons of other wavelengths count",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "index += wavelength_set << (_CELL_BITS - SET_BITS)",
         "index += 0",
         ("tests/images/test_merging.py::test_spectral",),
     ),
     Mutant(
         "merging: normals are not compared",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "return within & flat & (dr.dot(photon.n, z.si.n) > _SAME_SIDE)",
         "return within & flat",
         ("tests/images/test_merging.py::test_which_photons_are_near",),
     ),
     Mutant(
         "merging: discs of another pass",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "    eta = merging.eta(z.si.p)",
         "    eta = merging.eta(z.si.p) / 2",
         ("tests/images/test_merging.py::test_floor_under_glass[sun]",),
     ),
     Mutant(
         "merging: the camera's density for the light's",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "light_side = h.scale(photon.older, f.pdf_fwd_w)",
         "light_side = h.scale(photon.older, f.pdf_rev_w)",
         (
@@ -1131,7 +1131,7 @@ MUTANTS = (
     ),
     Mutant(
         "merging: merges at other vertices do not count",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "h.combine(older, z.partial.d_vm)",
         "older",
         (
@@ -1140,7 +1140,7 @@ MUTANTS = (
     ),
     Mutant(
         "merging: merges count as independent",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "return min(1.0, 1 / (samples * math.pi * radius**2))",
         "return 1.0",
         ("tests/images/test_merging.py::test_merges_do_not_outweigh_what_is_better",),
@@ -1185,28 +1185,28 @@ MUTANTS = (
     ),
     Mutant(
         "merging: merges take t = 0 for aimed",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "older = h.scale(older, photon.aim)",
         "older = h.scale(older, 1)",
         ("tests/images/test_merging.py::test_a_lens_where_photons_are_aimed",),
     ),
     Mutant(
         "merging: photons of the sky, without which s = 0 counts on them",
-        "transport/aim.py",
+        "transport/photons/aim.py",
         "return dr.select(hit, self._mixed(p, d, pdf_second), mi.Float(0) if self.no_sky else pdf_second)",
         "return dr.select(hit, self._mixed(p, d, pdf_second), pdf_second)",
         ("tests/images/test_merging.py::test_an_even_sky_sends_no_photons",),
     ),
     Mutant(
         "merging: photons stay in the order of threads",
-        "transport/photons.py",
+        "transport/photons/photon_pass.py",
         "order = dr.argsort(key |",
         "order = dr.argsort(mi.UInt64(bucket) |",
         ("tests/images/test_merging.py::test_photons_are_in_the_same_order_on_any_number_of_threads",),
     ),
     Mutant(
         "merging: paths an edge longer than max_depth",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "    most = kernel.max_depth - z.edges\n",
         "    most = kernel.max_depth - z.edges + 1\n",
         (
@@ -1216,28 +1216,28 @@ MUTANTS = (
     ),
     Mutant(
         "merging: t = 0 makes paths of any length",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)",
         "older = z.partial.d_vc",
         ("tests/images/test_sds_paths.py::test_merges_beyond_stored_vertices_have_no_other_strategy",),
     ),
     Mutant(
         "merging: photons of the coarsest grid of a disc alone",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "lowest = level_of(radius, r * (1 - 1.01 * radius.angle))",
         "lowest = level_of(radius, r * (1 + 1.01 * radius.angle))",
         ("tests/images/test_sds_paths.py::test_all_photons_of_a_disc_are_found",),
     ),
     Mutant(
         "merging: photons of the finest grid of a disc alone",
-        "transport/merging.py",
+        "transport/photons/merging.py",
         "corners = (level_of(radius, r * (1 + 1.01 * radius.angle)) - lowest + 1) * 8",
         "corners = mi.UInt32(8)",
         ("tests/images/test_sds_paths.py::test_all_photons_of_a_disc_are_found",),
     ),
     Mutant(
         "guided s = 0: paths an edge longer than max_depth",
-        "transport/guided_hits.py",
+        "transport/photons/guided_hits.py",
         "        kernel.max_depth,\n",
         "        kernel.max_depth + 1,\n",
         (
@@ -1247,14 +1247,14 @@ MUTANTS = (
     ),
     Mutant(
         "guided s = 0: t = 0 counts it at all diffuse vertices of a light subpath",
-        "transport/guided_hits.py",
+        "transport/photons/guided_hits.py",
         "y.hit & walk.only_delta & y.connectible() & ~joined",
         "y.hit & y.connectible() & ~joined",
         ("tests/images/test_sds_paths.py::test_light_subpaths_with_two_diffuse_vertices",),
     ),
     Mutant(
         "guided s = 0: hidden surroundings are hidden from guided subpaths too",
-        "transport/guided_hits.py",
+        "transport/photons/guided_hits.py",
         "techniques.sees_emitter(kernel, vertex),",
         "techniques.sees_emitter(kernel, vertex) & (vertex.hit | (not kernel.plan.hide_emitters)),",
         ("tests/images/test_sds_paths.py::test_a_sun_with_hide_emitters",),

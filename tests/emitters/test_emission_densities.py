@@ -16,7 +16,7 @@ from mitsuba_bdpt.geometry import boxes
 from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.sensors import kinds as sensors
-from mitsuba_bdpt.transport.aim import Aim
+from mitsuba_bdpt.transport.photons.aim import Aim
 from scipy import stats
 
 COUNT = 200_000

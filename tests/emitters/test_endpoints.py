@@ -17,7 +17,7 @@ from mitsuba_bdpt.emitters.kinds import GROUPS, group_of
 from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.sensors import kinds as sensors
-from mitsuba_bdpt.transport.kernel import Shared
+from mitsuba_bdpt.transport.inputs import Shared
 from scene_parts import (
     EGG,
     EMITTERS,

@@ -20,8 +20,8 @@ from mitsuba_bdpt.planning.moments import GROUPS, Moments
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
-from mitsuba_bdpt.transport import photon_guide
-from mitsuba_bdpt.transport.photon_guide import Guide, GuidePhoton
+from mitsuba_bdpt.transport.photons import photon_guide
+from mitsuba_bdpt.transport.photons.photon_guide import Guide, GuidePhoton
 from mitsuba_bdpt.transport.plan import GUIDED
 from snapshots import ROUNDING
 from test_merging import (
@@ -461,8 +461,8 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
 def test_no_photon_of_the_guide_is_dropped(monkeypatch):
     """Expected: with memory for one photon at first the same image, to the rounding of sums."""
     scene = mi.load_dict(under_glass(ball(0.1)))
-    monkeypatch.setattr("mitsuba_bdpt.transport.photons.FEWEST_PHOTONS", 1 << 8)
+    monkeypatch.setattr("mitsuba_bdpt.transport.photons.photon_pass.FEWEST_PHOTONS", 1 << 8)
     a = images(scene, 16, 1, photon_guiding="always")
-    monkeypatch.setattr("mitsuba_bdpt.transport.photons._CAPACITY", 0.0)
+    monkeypatch.setattr("mitsuba_bdpt.transport.photons.photon_pass._CAPACITY", 0.0)
     b = images(scene, 16, 1, photon_guiding="always")
     np.testing.assert_allclose(a, b, **ROUNDING)

@@ -16,9 +16,9 @@ import views
 import welch as st
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import aim, merging, photons, wavelength_sets
 from mitsuba_bdpt.transport.inputs import Kernel
-from mitsuba_bdpt.transport.merge_radius import Footprints
+from mitsuba_bdpt.transport.photons import aim, merging, photon_pass, wavelength_sets
+from mitsuba_bdpt.transport.photons.merge_radius import Footprints
 from snapshots import ROUNDING, stopped
 
 import drjit as dr  # isort: skip
@@ -154,7 +154,7 @@ def test_blur_goes_as_the_square_of_the_radius(monkeypatch):
     (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4, with a standard error of 0.5; between 3 and 7 (of the radius
     itself it would be 2.5, of its cube 8.3).
     """
-    monkeypatch.setattr(photons, "_PER_DISC", 1 << 18)
+    monkeypatch.setattr(photon_pass, "_PER_DISC", 1 << 18)
     scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
         images(scene, 128, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
@@ -352,8 +352,8 @@ def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
     0.02 for the perspective, in which edges look smaller than the middle; standard errors of the ball: 0.03.
     """
     monkeypatch.setattr(rendering, "coefficient", lambda *_: 1.0)
-    monkeypatch.setattr(photons, "FEWEST_PHOTONS", 1 << 18)
-    monkeypatch.setattr(photons, "_PER_DISC", 1 << 18)
+    monkeypatch.setattr(photon_pass, "FEWEST_PHOTONS", 1 << 18)
+    monkeypatch.setattr(photon_pass, "_PER_DISC", 1 << 18)
     scene, expected = small(shape)
     pixel = Footprints.of(scene, scene.sensors()[0]).angle * np.linalg.norm(CAMERA)
     found = images(scene, 16, 8, merging=True, merging_radius=radius / pixel).mean()
@@ -463,7 +463,7 @@ def traced(count=1 << 14):
     kernel: Kernel = render.kernel
     radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
     of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1), render.aim)
-    of_pass, counts = photons.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
+    of_pass, counts = photon_pass.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
     found = of_pass.photons.found
     arrays = [np.array(column) for column in vars(found).values()]
     return arrays, np.array(of_pass.photons.starts), counts.numpy()
@@ -493,7 +493,7 @@ def test_cells_may_share_a_bucket(monkeypatch):
     """
     scene = mi.load_dict(under_glass(point()))
     expected = images(scene, 16, 1, merging=True)
-    for module in (photons, merging):
+    for module in (photon_pass, merging):
         monkeypatch.setattr(module, "BUCKET_BITS", 2)
     np.testing.assert_allclose(images(scene, 16, 1, merging=True), expected, **ROUNDING)
 
@@ -512,9 +512,9 @@ def test_discs_hold_few_photons():
     """Rationale: merges of very many photons are slow. Expected: one photon's subpath for eight of a pass's
     samples, and no more than 64 for each disc that its film has room for.
     """
-    assert photons.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 17
-    assert photons.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
-    assert photons.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
+    assert photon_pass.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 17
+    assert photon_pass.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
+    assert photon_pass.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
 
 
 def test_no_photon_is_dropped(monkeypatch):
@@ -522,7 +522,7 @@ def test_no_photon_is_dropped(monkeypatch):
     photons and counts, which are traced again.
     """
     first, _, counts = traced()
-    monkeypatch.setattr(photons, "_CAPACITY", 1e-3)
+    monkeypatch.setattr(photon_pass, "_CAPACITY", 1e-3)
     again, _, others = traced()
     np.testing.assert_array_equal(counts, others)
     for a, b in zip(first, again, strict=True):

@@ -12,8 +12,8 @@ import pytest
 import views
 import welch as st
 from mitsuba_bdpt.sampling import sobol
-from mitsuba_bdpt.transport import merging, photon_guide, photons
-from mitsuba_bdpt.transport.merge_radius import Footprints
+from mitsuba_bdpt.transport.photons import merging, photon_guide, photon_pass
+from mitsuba_bdpt.transport.photons.merge_radius import Footprints
 from snapshots import ROUNDING
 from test_merging import ball, images, matte, point, strategy_images, transform, under_glass
 
@@ -86,7 +86,7 @@ def test_all_photons_of_a_disc_are_found():
     radius = Footprints((0.0, 0.0, 0.3), 0.0, 0.1, 0.2).radius(4.0)
     found = random_photons(n)
     of_pass = merging.Merging(radius, mi.Float(n), mi.Float(1), None)
-    of_pass.photons = photons._sorted(of_pass, found, n)
+    of_pass.photons = photon_pass._sorted(of_pass, found, n)
     rng = np.random.default_rng(2)
     p, edges = rng.uniform(-3, 3, (2, n)), rng.integers(1, 4, n)
     z = SimpleNamespace(

@@ -14,7 +14,7 @@ import pytest
 import scene_parts as parts
 from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.sensors import kinds as sensors
-from mitsuba_bdpt.transport.kernel import Shared
+from mitsuba_bdpt.transport.inputs import Shared
 
 COUNT = 200_000
 T = parts.T

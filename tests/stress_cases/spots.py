@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.scene import diagnostics
-from mitsuba_bdpt.transport.kernel import Shared
+from mitsuba_bdpt.transport.inputs import Shared
 
 import mitsuba as mi  # isort: skip
 

@@ -41,15 +41,16 @@ from mitsuba_bdpt.transport import (
     connections,
     inputs,
     kernel,
-    merging,
     mis,
-    photons,
     stored_vertices,
+    subpaths,
     techniques,
 )
 from mitsuba_bdpt.transport.counters import Counters
-from mitsuba_bdpt.transport.merge_radius import Radius
+from mitsuba_bdpt.transport.inputs import Shared
 from mitsuba_bdpt.transport.observer import Observer
+from mitsuba_bdpt.transport.photons import merging, photon_pass
+from mitsuba_bdpt.transport.photons.merge_radius import Radius
 
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
@@ -613,7 +614,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         sensor_medium=None,
         scatters=True,
     )
-    shared = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+    shared = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     if merges is not None:
         k_.merging = traced_photons(world, k_, merges, shared, monkeypatch)
         record_merges(world, monkeypatch)
@@ -692,11 +693,11 @@ def traced_photons(world: World, k_, merges: merging.Merging, shared, monkeypatc
     """The photons of one light subpath for each path, traced, sorted and kept by the unchanged code."""
     k_.bound = lambda *_: SimpleNamespace(**vars(k_))
     with monkeypatch.context() as patch:
-        patch.setattr(photons, "_CAPACITY", float(world.k))  # else they are traced again
-        patch.setattr(kernel, "shared_by_lane", lambda *_: shared)
+        patch.setattr(photon_pass, "_CAPACITY", float(world.k))  # else they are traced again
+        patch.setattr(subpaths, "shared_by_lane", lambda *_: shared)
         patch.setattr(dr, "while_loop", python_loop(world.k - 1))
         world.scene.begin(from_light=True)
-        return photons.trace(k_, merges, k_.points, world.n)[0]
+        return photon_pass.trace(k_, merges, k_.points, world.n)[0]
 
 
 def record_merges(world: World, monkeypatch):
@@ -788,8 +789,8 @@ def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
     ],
 )
 def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
-    """Rationale: as above, also of ``photons.trace``, ``merging.possible`` and ``merging.merge``: photons are
-    traced along the paths, sorted into the grid and found again from the camera's side, in discs so small
+    """Rationale: as above, also of ``photon_pass.trace``, ``merging.possible`` and ``merging.merge``: photons
+    are traced along the paths, sorted into the grid and found again from the camera's side, in discs so small
     that each holds the vertex of its own path alone. Radii depend on the place, so that eta is spread over
     three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.
 
@@ -908,7 +909,7 @@ def test_densities_of_emission_are_those_of_hits(name):
     scene, n = real_scene(name), 4096
     assert scene.shapes()  # as a render does first: it decides of which Python class they are
     lights = emitters.Emitters(scene)
-    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(n)
 
     def pair():
@@ -964,7 +965,7 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
     )
     scene = mi.load_dict({"type": "scene"})
     camera = sensors.prepare(sensor, rounding.ShapeErrors(scene), scene)
-    like = kernel.Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
+    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     rng = mi.PCG32(4096)
     u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]
     width, height = (int(x) for x in sensor.film().crop_size())

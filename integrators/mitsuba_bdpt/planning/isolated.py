@@ -2,7 +2,7 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""The part of a pilot that asks whether guiding s = 0 pays, see `transport.isolated_light`."""
+"""The part of a pilot that asks whether guiding s = 0 pays, see `transport.photons.guiding_benefit`."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from ..scene.prepared import PreparedScene
 from ..sensors.records import Region
 from ..settings import Settings
 from ..transport import mis
-from ..transport.aim import Aim
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
-from ..transport.isolated_light import MOMENTS, Found, Gauge
-from ..transport.kernel import trace_isolated
-from ..transport.photons import photons_of, trace_guide
+from ..transport.photons.aim import Aim
+from ..transport.photons.guiding_benefit import MOMENTS, Found, Gauge, trace
+from ..transport.photons.photon_pass import photons_of, trace_guide
 from ..transport.plan import Plan
 from .moments import FINE, GROUPS, Isolated, tile_of
 
@@ -59,7 +58,7 @@ def measure(
     chosen = min(LANES, pixels)
     batch = Batch(0, chosen, 0, LANES // chosen, spread=pixels)
     sums = Sums(region)
-    trace_isolated(kernel, gauge, batch, Points("sobol", seed), sums.add)
+    trace(kernel, gauge, batch, Points("sobol", seed), sums.add)
     found, aimed = sums.evaluated()
     return Isolated(found, aimed / batch.size, batch.size)
 

@@ -184,7 +184,7 @@ def group(lane: Lanes) -> Lanes:
 class Isolated:
     """Light that s = 0 finds where it can be guided.
 
-    ``sums`` of its moments (`isolated_light.Found`) over ``lanes`` camera samples, shape (`GROUPS`, fine
+    ``sums`` of its moments (`guiding_benefit.Found`) over ``lanes`` camera samples, shape (`GROUPS`, fine
     tiles, moments); ``aimed``: vertices of one where s = 0 can be guided.
     """
 

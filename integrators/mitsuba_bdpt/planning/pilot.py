@@ -58,7 +58,8 @@ if TYPE_CHECKING:
     from ..sensors.records import CameraStart, Region
     from ..transport.contribution import Contribution
     from ..transport.inputs import Shared
-    from ..transport.kernel import CameraSample, Lane
+    from ..transport.kernel import Lane
+    from ..transport.subpaths import CameraSample
     from ..transport.walk import Vertex
 
     # One number for each of the last weightings; of a camera sample by the name of a part of its row.

@@ -9,7 +9,7 @@ from ..sampling.points import Points, sequential
 from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, WAVELENGTHS, sequence_seed
 from ..settings import Settings
 from ..transport.batch import Batch
-from ..transport.wavelength_sets import WavelengthSets
+from ..transport.photons.wavelength_sets import WavelengthSets
 from .schedule import Step
 
 

@@ -27,15 +27,16 @@ from ..planning.planner import Planner
 from ..properties import check_film, check_merging, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport import mis, photons
-from ..transport.aim import Aim
+from ..transport import mis
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
-from ..transport.merge_radius import SHRINKING, Footprints
-from ..transport.merging import Merging, coefficient
-from ..transport.photon_guide import Guide
+from ..transport.photons import photon_pass
+from ..transport.photons.aim import Aim
+from ..transport.photons.merge_radius import SHRINKING, Footprints
+from ..transport.photons.merging import Merging, coefficient
+from ..transport.photons.photon_guide import Guide
+from ..transport.photons.wavelength_sets import SETS
 from ..transport.plan import Plan
-from ..transport.wavelength_sets import SETS
 from . import messages
 from .pass_points import PassPoints
 from .progress import Progress
@@ -263,7 +264,7 @@ class Render:
         done = passes_since(self.passes, step.done)
         factor = self._radius_in_pixels(done)
         pixels = int(self.prepared.camera.region.size.prod())
-        count = photons.photons_of_pass(step.size * pixels, pixels, factor)
+        count = photon_pass.photons_of_pass(step.size * pixels, pixels, factor)
         changes = self.planner.changes
         sets, wavelengths = 1, None
         if mi.is_spectral:
@@ -274,16 +275,16 @@ class Render:
         merging = Merging(footprints.radius(factor), met, kappa, self.aim, wavelengths=wavelengths)
         points = self.points.of_photons(step, done, changes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-            merging, counts = photons.trace(self.kernel, merging, points, count)
+            merging, counts = photon_pass.trace(self.kernel, merging, points, count)
         self.meter.launched(counts)
         return merging
 
     def _guide(self) -> Guide | None:
         """What guides s = 0 in all passes, traced before the first; None if there are no photons."""
         if self._guides is None:
-            count = photons.photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
+            count = photon_pass.photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
             with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-                guide, counts = photons.trace_guide(self.kernel, self.aim, self.points.of_guide(), count)
+                guide, counts = photon_pass.trace_guide(self.kernel, self.aim, self.points.of_guide(), count)
             self.meter.launched(counts)
             self._guides = (guide,)
         return self._guides[0]

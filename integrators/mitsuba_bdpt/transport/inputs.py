@@ -90,11 +90,11 @@ class Kernel:
         self.served = u32(plan.served)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
-        # The photons of a pass, a `merging.Photons`; None where vertices are not merged.
+        # The photons of a pass, a `photons.merging.Merging`; None where vertices are not merged.
         self.merging = None
-        # What guides s = 0, a `photon_guide.Guide`; None where nothing does.
+        # What guides s = 0, a `photons.photon_guide.Guide`; None where nothing does.
         self.guide = None
-        # Whether s = 0 makes no paths on which it might be guided: a pilot knows those by `isolated_light`.
+        # Whether s = 0 makes no paths on which it might be guided: see `photons.guiding_benefit`.
         self.without_isolated = False
         # Whether contributions say where their path is emitted, see `Contribution.emission`.
         self.tells_emission = False

@@ -8,12 +8,12 @@ size. (With ``points=sampler`` the random numbers of a pass do, and in a pilot w
 What a lane does. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
 k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
-    time, wavelengths <- drawn for all subpaths of the lane                 shared_by_lane
+    time, wavelengths <- drawn for all subpaths of the lane                 subpaths.shared_by_lane
 
     # The light subpath, or M of them one after the other                   _light_subpath, _light_subpaths
-    y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   emission
+    y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   subpaths.emission
     (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
-    the first edge <- a ray; it ends here for want of a throughput          light_walk
+    the first edge <- a ray; it ends here for want of a throughput          subpaths.light_walk
     d_vcm <- 1 / densities of y_0 and direction (eq. 31)
     d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
     for y in y_1, y_2, ... up to where the subpath misses or ends:          walk.random_walk
@@ -31,9 +31,9 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
     # Its camera subpaths
     for M S pixels (fewer in the last lanes; one without light subpaths):   _serve_all, _camera_subpath
-        z_0, direction, throughput <- the sensor, at a point of the pixel   _camera_sample
-        the first edge <- a ray                                             _camera_walk
-        d_vcm <- 1 / density of the direction (of z_0, if all are parallel) _first_partial
+        z_0, direction, throughput <- the sensor, at a point of the pixel   subpaths.camera_sample
+        the first edge <- a ray                                             subpaths.camera_walk
+        d_vcm <- 1 / density of the direction (of z_0, if all are parallel) subpaths._first_partial
         d_vc <- kappa of t = 0 * cos / densities of z_0 and direction;
             0 without area
         total <- 0
@@ -41,7 +41,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             if z is a hit: d_vcm, d_vc <- in the area measure               walk._vertex
             a point of an emitter; direction of the next edge and BSDF      walk._interact
                 towards that point <- one virtual call
-            where vertices are merged: total += z merged with a photon      merging.merge
+            where vertices are merged: total += z merged with a photon      photons.merging
             s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
                         (eqs. 42, 43)
             s = 1:  total += z lit by the point (eqs. 44, 45)               techniques.next_event
@@ -88,31 +88,27 @@ those of one each.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from ..emitters.emission_tables import Cell
-from ..geometry import rays
-from ..media import flight
-from ..sampling.points import Points, Purpose, Stream
-from ..sensors.records import CameraStart
+from ..sampling.points import Points, Purpose
 from . import (
     contribution,
-    guided_hits,
-    isolated_light,
-    merging,
-    mis,
-    spectra,
     stored_vertices,
+    subpaths,
     techniques,
 )
 from .batch import Batch, Places
 from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Shared
 from .observer import Observer
+from .photons import guided_hits, merging
 from .sharing import Sharing
-from .walk import Side, Walk, not_finite, random_walk
+from .subpaths import CameraSample
+from .walk import random_walk
 
 
 @dataclass
@@ -126,16 +122,6 @@ class Lane:
     shared: Shared
     path: stored_vertices.LightPath
     emission: Cell | None = None
-
-
-@dataclass
-class CameraSample:
-    """A camera sample: its `CameraStart`, random numbers, point of the lens, and whether there is one."""
-
-    start: CameraStart
-    stream: Stream
-    u_lens: mi.Point2f
-    covered: mi.Bool
 
 
 def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UInt64:
@@ -174,30 +160,6 @@ def retrace(
     return (of_light + _camera_subpath(kernel, sink, lane, slot, mi.Bool(True))).summed()
 
 
-def trace_isolated(kernel: Kernel, gauge: isolated_light.Gauge, batch: Batch, points: Points, add):
-    """Follow a pilot's camera subpaths as long as they are isolated, and ask the ``gauge`` of their vertices.
-
-    ``add(lane, position, found)`` gets what each lane found, see `isolated_light`.
-    """
-    kernel = kernel.bound(points, 1.0, Observer())
-    index = dr.arange(mi.UInt32, batch.size)
-    place = Places(kernel, batch, batch.samples)
-    in_sequence = place.index(index)
-    shared = shared_by_lane(kernel, points.stream("light", in_sequence, index), in_sequence)
-    sample = _camera_sample(kernel, Lane(place, shared, None), index, mi.Bool(True))
-    walk = _camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
-    side = replace(_camera_side(kernel, None, sample, shared, walk), join=None, guide=None, isolated=True)
-
-    def visit(z, state, walk):
-        found = isolated_light.look(kernel, gauge, z, walk, sample.stream)
-        moments = [a + b for a, b in zip(state.moments, found.moments, strict=True)]
-        return isolated_light.Found(moments, state.aimed + found.aimed)
-
-    nothing = isolated_light.nothing()
-    found, walk = random_walk(kernel, side, walk, sample.stream, visit, nothing)
-    add(index, sample.start.position, found)
-
-
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     """Which camera samples of a batch share a light subpath.
 
@@ -220,7 +182,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     """The lanes of these numbers with their light subpaths, which are traced."""
     place_in_sequence = place.index(index)
     stream = kernel.points.stream("light", place_in_sequence, index)
-    shared = shared_by_lane(kernel, stream, place_in_sequence)
+    shared = subpaths.shared_by_lane(kernel, stream, place_in_sequence)
     path = stored_vertices.allocate_light_path(kernel, dr.width(index))
     counters, emitted = Counters(), None
     if kernel.plan.joined > 1:
@@ -247,25 +209,6 @@ def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path)
     return path, counters
 
 
-def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
-    """Time and wavelengths of the subpaths of a lane, whose light subpath has this ``index``."""
-    sensor, points = kernel.camera.sensor, kernel.points
-    time = mi.Float(sensor.shutter_open())
-    if sensor.shutter_open_time() > 0:
-        u = points.draw_1d("light", stream, Purpose.TIME)
-        time += u * sensor.shutter_open_time()
-    if not mi.is_spectral:
-        return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
-    number = None
-    if kernel.merging is None:
-        u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
-    else:
-        number = kernel.merging.wavelengths.number(index)
-        u = kernel.merging.wavelengths.u(number)
-    wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
-    return Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u, number)
-
-
 # -- the light subpath ------------------------------------------------------------------------
 
 
@@ -275,7 +218,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     Returns the latter, what was counted, and in a pilot where it was emitted.
     """
     plan = kernel.plan
-    e = emission(kernel, stream, shared)
+    e = subpaths.emission(kernel, stream, shared)
     emitted = None
     if kernel.tells_emission:
         emitted = kernel.emitters.cell(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
@@ -303,79 +246,14 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         # No purpose is left to name this number (`points`); that of vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=stored_vertices.Thinning.begin(u))
-    walk = light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 makes isolated paths
-    active, side = walk.active, light_side(kernel, e, stream, shared, walk)
+    walk = subpaths.light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 makes SDS paths
+    guide = None if walk.only_delta is None else partial(guided_hits.look_back, kernel)
+    active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, guide)
     state = path, counted_by_light(plan, kernel.space)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters += counted + walk.counted(active)
     counters += Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
     return path, counters, emitted
-
-
-def emission(kernel: Kernel, stream, shared):
-    """y_0 and the first direction, an `emitters.Emission`."""
-    points = kernel.points
-    e = kernel.emitters.sample_emission(
-        points.draw_2d("light", stream, Purpose.EMISSION_POINT),
-        points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
-        shared,
-        mi.Bool(True),
-    )
-    if kernel.light_media is not None and kernel.light_media.hides_infinity:
-        e = replace(e, weight=dr.select(e.infinite, 0, e.weight))
-    kernel.observer.emitted(e)
-    return e
-
-
-def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
-    """A light subpath on its first edge; ``merges``: whether it asks for those of its vertices."""
-    h = kernel.heuristic
-    active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
-    broken = not_finite(active, e.weight)
-    active &= ~broken
-    inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
-    ray = rays.spawn(e.anchor, e.d, shared)
-    pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    # s = 0 is an older alternative, that of making y_0 by a hit.
-    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
-    partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))
-    edge = None
-    if kernel.space is not None:
-        edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
-    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
-    only_delta = mi.Bool(True) if merges and kernel.guide is not None else None
-    return replace(walk, broken=broken, only_delta=only_delta)
-
-
-def _no_merges(kernel: Kernel, asked: bool):
-    """``d_vm`` of a subpath that begins; the number 0 where it is not ``asked`` for."""
-    used = kernel.merging is not None or kernel.guide is not None
-    return kernel.heuristic.zero() if asked and used else 0
-
-
-def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
-    """The first edge of a subpath in a scene with media, along ``ray``, which starts in ``medium``."""
-    points = kernel.points
-
-    def u_channel():
-        return points.draw_1d(side, stream, Purpose.CHANNEL)
-
-    u = points.draw_1d(side, stream, Purpose.FLIGHT, 1)
-    return flight.Edge.begin(kernel.space.media, medium, ray.maxt, u, u_channel)
-
-
-def light_side(kernel: Kernel, e, stream, shared, walk) -> Side:
-    return Side(
-        "light",
-        shared,
-        spectra.brightest(walk.throughput),
-        True,
-        kernel.last_light,
-        kernel.kappa.direct,
-        complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
-        join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
-        guide=None if walk.only_delta is None else lambda y, walk, _: guided_hits.look_back(kernel, y, walk),
-    )
 
 
 # -- its camera subpaths ----------------------------------------------------------------------
@@ -406,10 +284,10 @@ def _camera_counters(kernel: Kernel) -> Counters:
 
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and join it with the lane's light subpath."""
-    sample = _camera_sample(kernel, lane, slot, active)
+    sample = subpaths.camera_sample(kernel, lane.place, lane.shared, slot, active)
     active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
-    walk = _camera_walk(kernel, sample, active)
-    side = _camera_side(kernel, sink, sample, lane.shared, walk)
+    walk = subpaths.camera_walk(kernel, sample, active)
+    side = subpaths.camera_side(kernel, sample, lane.shared, walk, sink.alpha, _camera_guide(kernel))
     visit = _camera_visit(kernel, sink, lane, sample)
     state = sink.begin(), _camera_counters(kernel)
     (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
@@ -418,65 +296,11 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 
-def _camera_sample(kernel: Kernel, lane: Lane, slot, active) -> CameraSample:
-    """z_0 and the first direction."""
-    points = kernel.points
-    stream = points.stream("camera", lane.place.index(slot), slot)
-    u_film = points.draw_2d("camera", stream, Purpose.FILM)
-    u_lens = mi.Point2f(0.5)
-    if kernel.camera.needs_aperture_sample:
-        u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
-    start = kernel.camera.start(lane.place.pixel(slot), u_film, u_lens, lane.shared)
-    return CameraSample(start, stream, u_lens, active)
-
-
-def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
-    """A camera subpath on its first edge."""
-    start, edge = sample.start, None
-    ray = start.ray
-    if kernel.space is not None:
-        edge = _first_edge(kernel, "camera", sample.stream, kernel.sensor_medium, ray)
-    if kernel.plan.hide_emitters and edge is None:
-        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
-    else:
-        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    partial = _first_partial(kernel, start)
-    walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
-    if kernel.guide is None and not kernel.without_isolated:
-        return walk
-    return replace(walk, isolated=mi.Bool(True), guided=mi.Float(0))
-
-
-def _first_partial(kernel: Kernel, start):
-    """Partial sums of a camera subpath's first edge: t = 1 is its newest alternative, t = 0 an older one."""
-    h = kernel.heuristic
-    arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
-    if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
-        arrival = h.present(arrival)
-    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival, _no_merges(kernel, kernel.guide is None))
-
-
-def _camera_side(kernel: Kernel, sink, sample: CameraSample, shared, walk) -> Side:
-    def choose_emitter(z):
-        return techniques.choose_emitter(kernel, z, sample.stream)
-
-    def advise(z, walk, step):
-        if kernel.without_isolated:
-            return guided_hits.mark(kernel, z, walk, step)
-        return guided_hits.advise(kernel, z, walk, step)
-
-    return Side(
-        "camera",
-        shared,
-        spectra.brightest(walk.throughput),
-        False,
-        kernel.max_depth,
-        kernel.kappa.splat,
-        alpha=sink is not None and sink.alpha,
-        parallel=kernel.camera.parallel,
-        join=choose_emitter if kernel.plan.direct else None,
-        guide=advise if kernel.guide is not None or kernel.without_isolated else None,
-    )
+def _camera_guide(kernel: Kernel):
+    """`Side.guide` of camera subpaths; None where s = 0 is not guided."""
+    if kernel.without_isolated:
+        return partial(guided_hits.mark, kernel)
+    return None if kernel.guide is None else partial(guided_hits.advise, kernel)
 
 
 def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):

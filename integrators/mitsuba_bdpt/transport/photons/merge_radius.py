@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..geometry.boxes import scene_box
-from ..host.introspection import world_matrix
+from ...geometry.boxes import scene_box
+from ...host.introspection import world_matrix
 
 # Camera rays by which a scene is asked for the size of its pixels: so many columns and rows of them.
 _PROBES = 64

@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..emitters.emitters import Emitters
-from ..emitters.infinite import contrast
-from ..emitters.records import Emission
-from ..geometry.boxes import box_of
-from ..host.introspection import grouped_shapes, is_instance
+from ...emitters.emitters import Emitters
+from ...emitters.infinite import contrast
+from ...emitters.records import Emission
+from ...geometry.boxes import box_of
+from ...host.introspection import grouped_shapes, is_instance
 
 # Spheres; one for all where they would be more.
 MOST_SPHERES = 8

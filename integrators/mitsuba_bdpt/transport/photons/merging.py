@@ -26,15 +26,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling import sobol
-from ..sampling.points import Purpose, Stream, sequential
-from . import bsdf, mis, spectra
+from ...sampling import sobol
+from ...sampling.points import Purpose, Stream, sequential
+from .. import bsdf, mis, spectra
+from ..contribution import Contribution, size_of
+from ..inputs import Kernel
+from ..walk import Vertex, Walk, may_merge
 from .aim import Aim
 from .columns import Columns
-from .contribution import Contribution, size_of
-from .inputs import Kernel
 from .merge_radius import Radius
-from .walk import Vertex, Walk, may_merge
 from .wavelength_sets import SET_BITS, WavelengthSets
 
 # Bits of a bucket's number in the hash table, and of each coordinate of a cell.

@@ -13,18 +13,21 @@ The photons of the guide are others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling.points import Purpose, Stream, sequential
-from . import bsdf, photon_guide
-from .contribution import size_of
-from .inputs import Kernel
+from ...sampling.points import Points, Purpose, Stream, sequential
+from .. import bsdf, subpaths
+from ..batch import Batch, Places
+from ..contribution import size_of
+from ..inputs import Kernel
+from ..observer import Observer
+from ..plan import GUIDED
+from ..walk import Vertex, Walk, may_merge, random_walk
+from . import photon_guide
 from .photon_guide import WINDOW, Guide
-from .plan import GUIDED
-from .walk import Vertex, Walk, may_merge
 
 # How many moments a vertex has, see `Found`.
 MOMENTS = 2 + len(GUIDED)
@@ -60,6 +63,29 @@ class Found:
 def nothing() -> Found:
     """Of a vertex where s = 0 cannot be guided."""
     return Found([mi.Float64(0) for _ in range(MOMENTS)], mi.UInt32(0))
+
+
+def trace(kernel: Kernel, gauge: Gauge, batch: Batch, points: Points, add):
+    """Follow a pilot's camera subpaths along SDS paths, and evaluate the ``gauge`` at their vertices.
+
+    ``add(lane, position, found)`` gets what each lane found, see `Found`.
+    """
+    kernel = kernel.bound(points, 1.0, Observer())
+    index = dr.arange(mi.UInt32, batch.size)
+    place = Places(kernel, batch, batch.samples)
+    in_sequence = place.index(index)
+    shared = subpaths.shared_by_lane(kernel, points.stream("light", in_sequence, index), in_sequence)
+    sample = subpaths.camera_sample(kernel, place, shared, index, mi.Bool(True))
+    walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
+    side = replace(subpaths.camera_side(kernel, sample, shared, walk), join=None, isolated=True)
+
+    def visit(z, state, walk):
+        found = look(kernel, gauge, z, walk, sample.stream)
+        moments = [a + b for a, b in zip(state.moments, found.moments, strict=True)]
+        return Found(moments, state.aimed + found.aimed)
+
+    found, walk = random_walk(kernel, side, walk, sample.stream, visit, nothing())
+    add(index, sample.start.position, found)
 
 
 def look(kernel: Kernel, gauge: Gauge, z: Vertex, walk: Walk, stream: Stream) -> Found:

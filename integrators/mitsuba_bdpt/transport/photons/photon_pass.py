@@ -9,16 +9,15 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling.points import Points, Purpose
-from . import kernel as kernels
-from . import mis, spectra
+from ...sampling.points import Points, Purpose
+from .. import mis, spectra, subpaths
+from ..counters import Counters, one
+from ..inputs import Kernel
+from ..observer import Observer
+from ..walk import may_merge, newest_coefficient, random_walk
 from .aim import Aim
-from .counters import Counters, one
-from .inputs import Kernel
 from .merging import BUCKET_BITS, Merging, Photon, Photons, bucket_of, cell_at, level_of
-from .observer import Observer
 from .photon_guide import Guide, GuidePhoton
-from .walk import may_merge, newest_coefficient, random_walk
 
 # Photons that memory is taken for at first, over the number of subpaths: few subpaths have more.
 _CAPACITY = 0.5
@@ -109,16 +108,16 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out, photon) -> tuple[Any, int
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
-    shared = kernels.shared_by_lane(kernel, stream, mi.UInt64(lanes))
+    shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
     e, aimed = aim.emission(
         kernel.emitters,
         kernel.points.draw_2d("light", stream, Purpose.EMISSION_POINT),
         kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
         shared,
     )
-    walk = kernels.light_walk(kernel, e, stream, shared, True)
+    walk = subpaths.light_walk(kernel, e, stream, shared, True)
     merges = kernel.merging is not None
-    side = kernels.light_side(kernel, e, stream, shared, walk)
+    side = subpaths.light_side(kernel, e, stream, shared, walk)
     side = replace(side, join=None, isolated=merges, only_delta=not merges)
 
     def visit(y, counters, walk):

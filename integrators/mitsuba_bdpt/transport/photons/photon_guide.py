@@ -41,7 +41,7 @@ class GuidePhoton(Columns):
 
     ``slope``: by how much directions change over a distance; one over the length of its last edge, until a
     `Guide` knows better.
-    For `isolated_light` also ``n`` geometric normal, ``flux`` the throughput of its subpath, ``hit`` the
+    For `guiding_benefit` also ``n`` geometric normal, ``flux`` the throughput of its subpath, ``hit`` the
     partial sum of s = 0, in the area measure, and ``edges`` of its path. ``lane`` of its subpath, which has
     no other photon.
     """

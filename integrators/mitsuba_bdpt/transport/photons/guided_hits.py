@@ -18,13 +18,14 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..geometry import rays
-from ..sampling import sobol
-from ..sampling.points import Purpose, Stream
-from . import bsdf, mis, photon_guide, spectra, techniques
-from .counters import one
-from .inputs import Kernel
-from .walk import Side, Vertex, Walk, may_merge, newest_coefficient, not_finite, random_walk
+from ...geometry import rays
+from ...sampling import sobol
+from ...sampling.points import Purpose, Stream
+from .. import bsdf, mis, spectra, techniques
+from ..counters import one
+from ..inputs import Kernel
+from ..walk import Side, Vertex, Walk, may_merge, newest_coefficient, not_finite, random_walk
+from . import photon_guide
 
 # Tells the numbers of guided subpaths from those of the camera subpath that they branch off.
 _SEED = 0x5BD1E995
@@ -59,8 +60,11 @@ def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
     return _asked(kernel, z, z.si.to_world(step.wo), _possible(kernel, z, walk))
 
 
-def look_back(kernel: Kernel, y: Vertex, walk: Walk) -> Advice:
-    """What the guide says at the light vertex ``y``; ``other``: of the direction the light came from."""
+def look_back(kernel: Kernel, y: Vertex, walk: Walk, step) -> Advice:
+    """What the guide says at the light vertex ``y``; ``other``: of the direction the light came from.
+
+    ``step`` is not used; `Side.guide` gets it.
+    """
     joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
     return _asked(kernel, y, -walk.d, y.hit & walk.only_delta & y.connectible() & ~joined)
 

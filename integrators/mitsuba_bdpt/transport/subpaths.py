@@ -1,0 +1,183 @@
+"""The start of both subpaths: time and wavelengths, the endpoint, the first edge and its partial sums.
+
+What a subpath carries from there on is a `walk.Walk`; what stays the same along it a `walk.Side`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
+from ..media import flight
+from ..sampling.points import Purpose, Stream
+from ..sensors.records import CameraStart
+from . import mis, spectra, techniques
+from .batch import Places
+from .inputs import Kernel, Shared
+from .walk import Side, Walk, not_finite
+
+
+@dataclass
+class CameraSample:
+    """A camera sample: its `CameraStart`, random numbers, point of the lens, and whether there is one."""
+
+    start: CameraStart
+    stream: Stream
+    u_lens: mi.Point2f
+    covered: mi.Bool
+
+
+def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
+    """Time and wavelengths of the subpaths of a lane, whose light subpath has this ``index``."""
+    sensor, points = kernel.camera.sensor, kernel.points
+    time = mi.Float(sensor.shutter_open())
+    if sensor.shutter_open_time() > 0:
+        u = points.draw_1d("light", stream, Purpose.TIME)
+        time += u * sensor.shutter_open_time()
+    if not mi.is_spectral:
+        return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
+    number = None
+    if kernel.merging is None:
+        u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
+    else:
+        number = kernel.merging.wavelengths.number(index)
+        u = kernel.merging.wavelengths.u(number)
+    wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
+    return Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u, number)
+
+
+# -- the light subpath -------------------------------------------------------------------------
+
+
+def emission(kernel: Kernel, stream, shared):
+    """y_0 and the first direction, an `emitters.Emission`."""
+    points = kernel.points
+    e = kernel.emitters.sample_emission(
+        points.draw_2d("light", stream, Purpose.EMISSION_POINT),
+        points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
+        shared,
+        mi.Bool(True),
+    )
+    if kernel.light_media is not None and kernel.light_media.hides_infinity:
+        e = replace(e, weight=dr.select(e.infinite, 0, e.weight))
+    kernel.observer.emitted(e)
+    return e
+
+
+def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
+    """A light subpath on its first edge; ``merges``: whether it asks for those of its vertices."""
+    h = kernel.heuristic
+    active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
+    broken = not_finite(active, e.weight)
+    active &= ~broken
+    inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
+    ray = rays.spawn(e.anchor, e.d, shared)
+    pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    # s = 0 is an older alternative, that of making y_0 by a hit.
+    hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
+    partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))
+    edge = None
+    if kernel.space is not None:
+        edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
+    walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
+    only_delta = mi.Bool(True) if merges and kernel.guide is not None else None
+    return replace(walk, broken=broken, only_delta=only_delta)
+
+
+def light_side(kernel: Kernel, e, stream, shared, walk, guide=None) -> Side:
+    """What stays the same along a light subpath; ``guide`` see `Side`."""
+    return Side(
+        "light",
+        shared,
+        spectra.brightest(walk.throughput),
+        True,
+        kernel.last_light,
+        kernel.kappa.direct,
+        complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
+        join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
+        guide=guide,
+    )
+
+
+# -- a camera subpath --------------------------------------------------------------------------
+
+
+def camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> CameraSample:
+    """z_0 and the first direction."""
+    points = kernel.points
+    stream = points.stream("camera", place.index(slot), slot)
+    u_film = points.draw_2d("camera", stream, Purpose.FILM)
+    u_lens = mi.Point2f(0.5)
+    if kernel.camera.needs_aperture_sample:
+        u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
+    start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
+    return CameraSample(start, stream, u_lens, active)
+
+
+def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
+    """A camera subpath on its first edge."""
+    start, edge = sample.start, None
+    ray = start.ray
+    if kernel.space is not None:
+        edge = _first_edge(kernel, "camera", sample.stream, kernel.sensor_medium, ray)
+    if kernel.plan.hide_emitters and edge is None:
+        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
+    else:
+        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    partial = _first_partial(kernel, start)
+    walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
+    if kernel.guide is None and not kernel.without_isolated:
+        return walk
+    return replace(walk, isolated=mi.Bool(True), guided=mi.Float(0))
+
+
+def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False, guide=None) -> Side:
+    """What stays the same along a camera subpath; ``alpha`` and ``guide`` see `Side`."""
+
+    def choose_emitter(z):
+        return techniques.choose_emitter(kernel, z, sample.stream)
+
+    return Side(
+        "camera",
+        shared,
+        spectra.brightest(walk.throughput),
+        False,
+        kernel.max_depth,
+        kernel.kappa.splat,
+        alpha=alpha,
+        parallel=kernel.camera.parallel,
+        join=choose_emitter if kernel.plan.direct else None,
+        guide=guide,
+    )
+
+
+# -- the first edge of either ------------------------------------------------------------------
+
+
+def _first_partial(kernel: Kernel, start):
+    """Partial sums of a camera subpath's first edge: t = 1 is its newest alternative, t = 0 an older one."""
+    h = kernel.heuristic
+    arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
+    if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
+        arrival = h.present(arrival)
+    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival, _no_merges(kernel, kernel.guide is None))
+
+
+def _no_merges(kernel: Kernel, asked: bool):
+    """``d_vm`` of a subpath that begins; the number 0 where it is not ``asked`` for."""
+    used = kernel.merging is not None or kernel.guide is not None
+    return kernel.heuristic.zero() if asked and used else 0
+
+
+def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
+    """The first edge of a subpath in a scene with media, along ``ray``, which starts in ``medium``."""
+    points = kernel.points
+
+    def u_channel():
+        return points.draw_1d(side, stream, Purpose.CHANNEL)
+
+    u = points.draw_1d(side, stream, Purpose.FLIGHT, 1)
+    return flight.Edge.begin(kernel.space.media, medium, ray.maxt, u, u_channel)
