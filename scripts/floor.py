@@ -1,4 +1,4 @@
-"""Kernel time over that of its rays alone, see `mitsuba_bdpt.measure.floor`.
+"""Kernel time over that of its rays alone, see `instruments.floor`.
 
 python scripts/floor.py cornell_box uplight_room veach_mis
 """
@@ -9,13 +9,34 @@ import argparse
 import statistics
 import sys
 
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import number
-from mitsuba_bdpt.measure import floor
-from repository import PROJECT
+from mitsuba_bdpt.measure import probes
+from mitsuba_bdpt.measure.project import Project
+from repository import PROJECT, ROOT
 
 import mitsuba as mi  # isort: skip
+
+from instruments import floor
+
+# One or two camera subpaths per light subpath: with 16 the replay is cut into so many small kernels that it
+# is no floor.
+PROBED = ("veach_mis", "many_lights", "glass_caustics")
+
+CODE = """
+import sys, mitsuba_bdpt, mitsuba as mi
+sys.path.append(sys.argv[1])
+from repository import PROJECT
+from instruments import floor
+mi.set_variant("llvm_ad_rgb")
+print(*floor.measure(PROJECT.scene(sys.argv[2]), int(sys.argv[3])))
+"""
+
+
+def probe(project: Project, rounds: int) -> dict:
+    """Kernel time over that of its rays alone, by scene, a value per round: a probe of sweeps."""
+    scripts = str(ROOT / "scripts")
+    return {name: probes.numbers(CODE, scripts, name, str(rounds)) for name in PROBED}
 
 
 def main(arguments=None) -> int:

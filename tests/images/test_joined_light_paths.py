@@ -10,12 +10,13 @@ import pytest
 import scene_parts as parts
 import variants
 import welch as st
-from mitsuba_bdpt.measure import recording
 from mitsuba_bdpt.planning import choice, planner
 from mitsuba_bdpt.planning.configuration import Configuration
 from mitsuba_bdpt.transport import connections, sketches
 from snapshots import ROUNDING, stopped
 from test_merging import images as rendered_images
+
+from instruments import recording
 
 import drjit as dr  # isort: skip
 

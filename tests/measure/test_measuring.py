@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import fireflies
 import mitsuba as mi
 import numpy as np
 import pyarrow.parquet
@@ -107,7 +108,7 @@ def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
 
 
 def test_other_commands_take_the_users_scene(here, capsys):
-    """Expected: compare, equal-time, pyramid and fireflies make their reference in the project, once, and
+    """Expected: compare, equal-time and pyramid make their reference in the project, once, and
     leave their pictures there."""
     common = ["--resolution", "16", "--project", "project"]
     room = "elsewhere/room.xml"
@@ -117,7 +118,7 @@ def test_other_commands_take_the_users_scene(here, capsys):
     assert "making one" in out and "| `room` | 4 |" in out
     assert main(["equal-time", room, "--spp", "4", *common]) == 0
     assert main(["pyramid", room, "--spp", "4", *common]) == 0
-    assert main(["fireflies", room, "--spp", "4", "--seeds", "1", "--level", "0.05", *common]) == 0
+    assert fireflies.main([room, "--spp", "4", "--seeds", "1", "--level", "0.05", *common]) == 0
     out = capsys.readouterr().out
     assert "making one" not in out and "SmoothDiffuse" in out
     made = {path.name for path in (here / "project" / "renders").iterdir()}
@@ -136,7 +137,6 @@ def test_a_terminal_sees_how_far_a_command_is(here, monkeypatch, capsys):
         (compare, "room, 2 spp, seed 1"),
         (["equal-time", *common], "bdpt"),
         (["pyramid", *common], "room: samples per pixel"),
-        (["fireflies", *common, "--seeds", "2"], "room, seed 2"),
     ):
         monkeypatch.setattr(showing, "Console", lambda **_: plain(**terminal))
         assert main(words) == 0 and text in shown.getvalue()
@@ -301,7 +301,6 @@ def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, ca
         "compare": ["bdpt", "path", "--scenes", "x"],
         "equal-time": ["x"],
         "pyramid": ["x"],
-        "fireflies": ["x"],
     }[command]
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "scipy" else find(name))
@@ -371,7 +370,7 @@ def test_mistakes_that_only_a_render_finds_are_one_line(here):
     assert "sampler of 'power'" in refused("sweep", "mine", "--project", "project")
     assert not (here / "project" / "references").exists()
     room.write_text(ROOM.format(height=64, sampler="").replace("<emitter", f"{REFUSED}<emitter", 1))
-    words = ["fireflies", str(room), "--resolution", "16", "--spp", "4", "--project", "project"]
+    words = ["pyramid", str(room), "--resolution", "16", "--spp", "4", "--project", "project"]
     assert "sigma_t of class GridVolume" in refused(*words)
 
 
@@ -417,7 +416,7 @@ def test_damaged_files_are_named_with_what_to_do(here, capsys):
         (
             made,
             20,
-            ["fireflies", *reference_words[1:-2]],
+            ["equal-time", *reference_words[1:-2]],
             "room_16_4.exr' is .*anew, by mitsuba-bdpt reference",
         ),
         (here / "out" / "probes.json", 0, report_words, "probes.json' is damaged .*; delete it"),
@@ -443,9 +442,9 @@ def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
     """Expected: the file that stands in the way, and what to do; nothing is rendered."""
     (here / "project" / "references").write_text("")
     (here / "file").write_text("")
-    words = ["elsewhere/room.xml", "--resolution", "16", "--project", "project"]
+    words = ["--scenes", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
     remedy = "; a file stands where a folder is needed: move it away, or give another path"
-    assert main(["fireflies", *words]) == 2
+    assert main(["compare", "bdpt", "path", *words]) == 2
     assert f"'project/references': File exists{remedy}" in capsys.readouterr().err
     assert main(["sweep", "mine", "--project", "project", "-o", "file"]) == 2
     assert f"'file': File exists{remedy}" in capsys.readouterr().err

@@ -34,6 +34,21 @@ def test_one_module_knows_what_mitsuba_renames():
     assert found == {"host/renamed.py"}
 
 
+def test_the_package_has_no_instruments_of_tests():
+    """Rationale: a recorder that replaced functions of the renderer by ``unittest.mock`` was in the wheel.
+    Expected: no module of the package imports a framework of tests, or what lies in tests/ and scripts/.
+    """
+    folders = (ROOT / "tests", ROOT / "scripts")
+    beside = {path.stem for folder in folders for path in folder.glob("*.py")}
+    beside |= {path.parent.name for folder in folders for path in folder.glob("*/__init__.py")}
+    imported = re.compile(r"^\s*(?:from|import)\s+(\w+)", re.MULTILINE)
+    package = Path(mitsuba_bdpt.__path__[0])
+    assert {"instruments", "stress_cases", "repository"} <= beside
+    for path in package.rglob("*.py"):
+        found = set(imported.findall(path.read_text()))
+        assert not found & (beside | {"unittest", "pytest", "hypothesis"}), path
+
+
 def _records():
     """All dataclasses of the package."""
     for module in pkgutil.walk_packages(mitsuba_bdpt.__path__, "mitsuba_bdpt."):

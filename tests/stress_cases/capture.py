@@ -23,13 +23,14 @@ from mitsuba_bdpt.transport.batch import Batch
 import mitsuba as mi  # isort: skip
 
 from mitsuba_bdpt.host.jit import float64
-from mitsuba_bdpt.measure.endpoints import Camera, disks_of, dot, lamps_of, length2
-from mitsuba_bdpt.measure.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
-from mitsuba_bdpt.measure.recording import stepwise
 from mitsuba_bdpt.transport import connections
 from mitsuba_bdpt.transport.counters import Counters
 from mitsuba_bdpt.transport.observer import Observer
 from mitsuba_bdpt.transport.stored_vertices import StoredVertex
+
+from instruments.endpoints import Camera, disks_of, dot, lamps_of, length2
+from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
+from instruments.recording import stepwise
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.

@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
-from mitsuba_bdpt.measure import fireflies
 from repository import benchmark_depth, load_reference, load_scene
+
+from instruments import fireflies
 
 import mitsuba as mi  # isort: skip
 

@@ -18,13 +18,12 @@ from mitsuba_bdpt.settings import HEURISTICS
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_bdpt.measure import oracle
-from mitsuba_bdpt.measure.oracle import Paths
-
 from .capture import Capture
 from .case import Case, Outcome
 from .chains import COEFFICIENTS, random_paths, recursion
 from .random_scenes import LAMPS, SHAPES, T, diffuse, kinds_of, renders, shining, sides
+from instruments import oracle
+from instruments.oracle import Paths
 
 SECTION = "Weights"
 TOLERANCE = 1e-3

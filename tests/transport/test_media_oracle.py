@@ -1,7 +1,7 @@
 """The weights in media against explicit densities, with transmittances and extinctions written out.
 
-The oracle (`measure.oracle`) has T of every edge and c = sigma_t of every volume vertex in each density; the
-recursion has T~ of the joining edge alone. As in ``test_oracle.py``: first arithmetic, then the unchanged
+The oracle (`instruments.oracle`) has T of every edge and c = sigma_t of every volume vertex in each density;
+the recursion has T~ of the joining edge alone. As in ``test_oracle.py``: first arithmetic, then the unchanged
 kernel in a real scene, vertex by vertex.
 """
 
@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.host.jit import float64
-from mitsuba_bdpt.measure import endpoints, oracle, recording
-from mitsuba_bdpt.measure.oracle import AREA, POSITION
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import kernel
 from mitsuba_bdpt.transport.batch import Batch
 
+from instruments import endpoints, oracle, recording
+from instruments.oracle import AREA, POSITION
 from stress_cases.chains import COEFFICIENTS, random_paths, recursion
 
 

@@ -32,8 +32,6 @@ from mitsuba_bdpt import settings
 from mitsuba_bdpt.emitters import emitters
 from mitsuba_bdpt.geometry import rays, rounding
 from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.measure import oracle
-from mitsuba_bdpt.measure.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
 from mitsuba_bdpt.transport import (
@@ -52,6 +50,8 @@ from mitsuba_bdpt.transport.observer import Observer
 from mitsuba_bdpt.transport.photons import merging, photon_pass
 from mitsuba_bdpt.transport.photons.merge_radius import Radius
 
+from instruments import oracle
+from instruments.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------

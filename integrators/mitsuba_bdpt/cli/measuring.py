@@ -128,11 +128,6 @@ def _declare_pyramid(parser) -> None:
     declare(parser, options.Pyramid)
 
 
-def _declare_fireflies(parser) -> None:
-    parser.add_argument("scenes", nargs="+", help=SCENES)
-    declare(parser, options.Fireflies)
-
-
 def _sweep(asked: Namespace) -> int:
     from ..measure import sweep
 
@@ -175,12 +170,6 @@ def _pyramid(asked: Namespace) -> int:
     return pyramid.run(asked)
 
 
-def _fireflies(asked: Namespace) -> int:
-    from ..measure import fireflies
-
-    return fireflies.run(asked)
-
-
 COMMANDS: dict[str, tuple[str, Callable, Callable[[Namespace], int]]] = {
     "sweep": (
         "render scenes by several integrators, budgets and seeds: a row of times and errors for each render",
@@ -201,6 +190,5 @@ COMMANDS: dict[str, tuple[str, Callable, Callable[[Namespace], int]]] = {
     ),
     "equal-time": ("a picture of integrators side by side at equal time", _declare_equal_time, _equal_time),
     "pyramid": ("an image of each strategy (s, t), as EXR and PNG", _declare_pyramid, _pyramid),
-    "fireflies": ("the paths behind the worst values of a scene's renders", _declare_fireflies, _fireflies),
 }
 """Help, declaration of the arguments and run of each subcommand."""

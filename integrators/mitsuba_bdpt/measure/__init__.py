@@ -24,16 +24,14 @@ Needs the extra ``[measure]``. Within the package nothing but the commands impor
 * Sweeps: `preset` (what is rendered), `cells`, `bench` (renders), `rows` (what is kept), `sweep`, `probes`.
 * What they show: `analysis` (figures with their reasons), `tables`, `figures`, `report`, `page`.
 * Two or a few ways to render: `compare`, `equal_time`.
-* Single strategies and paths: `pyramid`; `fireflies` with `recording`, `reconstruct`, `oracle`, `endpoints`.
+* Single strategies: `pyramid`.
 * What a terminal shows meanwhile: `showing`.
-* Kernels: `floor`.
 """
 
 from .api import (
     SceneDict,
     compare_at_equal_time,
     compare_integrators,
-    find_fireflies,
     make_reference,
     render_pyramid,
     run_sweep,
@@ -43,7 +41,6 @@ __all__ = [
     "SceneDict",
     "compare_at_equal_time",
     "compare_integrators",
-    "find_fireflies",
     "make_reference",
     "render_pyramid",
     "run_sweep",

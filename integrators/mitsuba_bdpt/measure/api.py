@@ -96,18 +96,6 @@ def render_pyramid(scene: Scene, *, project: str | Path = ".", **options) -> dic
         return module.pictured(found, name, asked)[1]
 
 
-def find_fireflies(scenes: Scene | Sequence[Scene], *, project: str | Path = ".", **options) -> str:
-    """Find the paths behind the worst values of renders.
-
-    ``options``: those of `options.Fireflies`. Returns a table in Markdown, and the errors of the renders.
-    """
-    from . import fireflies as module
-
-    asked = _options(available.Fireflies, options)
-    with _measured(scenes, project) as (found, names):
-        return module.text(found, names, asked)
-
-
 def run_sweep(
     preset: str | Path, dictionaries: Sequence[SceneDict] = (), *, project: str | Path = ".", **options
 ) -> list[dict]:

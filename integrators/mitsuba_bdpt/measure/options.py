@@ -199,26 +199,6 @@ class Pyramid(Options):
     exposure: float = option(0.0, STOPS, "exposure of the pictures in stops; default: %(default)g")
 
 
-@dataclass(frozen=True)
-class Fireflies(Options):
-    """Options of the search for the paths behind the worst values."""
-
-    seeds: int = option(5, WHOLE, "renders of each scene; default: %(default)s")
-    spp: int = option(64, WHOLE, "samples per pixel; default: %(default)s")
-    resolution: int = _width()
-    max_depth: int | None = option(
-        None,
-        WHOLE,
-        "longest path in edges; default: that of presets/benchmark.toml, else of the scene's file",
-    )
-    level: float = option(
-        0.5, Number(float, 1e-9), "values of its pixel by which a sample is off; default: %(default)s"
-    )
-    top: int = option(12, WHOLE, "samples examined of each render; default: %(default)s")
-    lines: int = option(6, WHOLE, "kinds of paths of each scene; default: %(default)s")
-    reference_seconds: float = _reference_seconds()
-
-
 def _documented(kind: type[Options]) -> str:
     """The docstring of a dataclass of options with the meaning of each."""
     lines = [kind.__doc__ or "", ""]

@@ -1,7 +1,7 @@
 """What a render costs besides its samples: the first image from an empty kernel cache, and memory.
 
 Each probe takes the project and the number of repetitions, and returns plain numbers; a repetition is a
-process of its own.
+process of its own. Scripts add probes of their own to `PROBES`.
 """
 
 from __future__ import annotations
@@ -12,14 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ..errors import CommandError
 from .options import VARIANT
 from .project import Project
-from .scenes import SceneFile
-
-# One or two camera subpaths per light subpath: with 16 the replay is cut into so many small kernels that it
-# is no floor.
-FLOOR_SCENES = ("veach_mis", "many_lights", "glass_caustics")
 
 COLD = f"""
 import time; start = time.perf_counter()
@@ -40,14 +34,6 @@ d = mi.cornell_box()
 d['sensor']['film']['width'], d['sensor']['film']['height'] = 1920, 1080
 mi.render(mi.load_dict(d), integrator=mi.load_dict({{'type': 'bdpt', 'max_depth': 8}}), spp=%d)
 print(memory.peak() / 2**30)
-"""
-
-FLOOR = f"""
-import sys, pathlib, mitsuba_bdpt, mitsuba as mi
-from mitsuba_bdpt.measure import floor, scenes
-mi.set_variant({VARIANT!r})
-file = pathlib.Path(sys.argv[1])
-print(*floor.measure(scenes.SceneFile(file.stem, file), int(sys.argv[2])))
 """
 
 
@@ -95,18 +81,4 @@ def memory(project: Project, rounds: int) -> dict:
     return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
 
 
-def _file(project: Project, name: str) -> Path:
-    """The file of a scene; raises ``CommandError`` for a dictionary, which another process cannot load."""
-    scene = project.scene(name)
-    if not isinstance(scene, SceneFile):
-        raise CommandError(f"the probe floor renders {name!r} in another process: it has to be a file")
-    return scene.file
-
-
-def kernel_floor(project: Project, rounds: int) -> dict:
-    """Kernel time over that of its rays alone, by scene, a value per round."""
-    files = {name: str(_file(project, name).resolve()) for name in FLOOR_SCENES}
-    return {name: numbers(FLOOR, file, str(rounds)) for name, file in files.items()}
-
-
-PROBES = {"coldstart": coldstart, "memory": memory, "floor": kernel_floor}
+PROBES = {"coldstart": coldstart, "memory": memory}

@@ -605,8 +605,7 @@ def page(results: Results, made: dict, goals: list, notes: dict) -> str:
 By budget, over {stronger(results)} that passes the bias check:
 
 {budgets_table(results)}
-How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel
-(`mitsuba-bdpt fireflies SCENE` names their paths):
+How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel:
 
 {gaps_table(results)}"""
     )

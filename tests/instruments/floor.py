@@ -13,15 +13,14 @@ import gc
 
 import drjit as dr
 import mitsuba as mi
-
-from ..host import renamed
-from ..host.jit import evaluated_mode
-from ..image import sink
-from ..run import rendering, schedule
-from ..sampling import points
-from ..transport.kernel import trace
-from .options import RESOLUTION
-from .scenes import SceneFile, integrator_of
+from mitsuba_bdpt.host import renamed
+from mitsuba_bdpt.host.jit import evaluated_mode
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.measure.options import RESOLUTION
+from mitsuba_bdpt.measure.scenes import SceneFile, integrator_of
+from mitsuba_bdpt.run import rendering, schedule
+from mitsuba_bdpt.sampling import points
+from mitsuba_bdpt.transport.kernel import trace
 
 SPP = 16
 

@@ -16,19 +16,18 @@ from unittest import mock
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
-from ..errors import CommandError
-from ..geometry import polarization
-from ..host.jit import evaluated_mode, float64, gc_paused
-from ..image import sink
-from ..planning import planner
-from ..run import rendering
-from ..sampling.points import Points
-from ..transport import connections, kernel
-from ..transport.batch import Batch
-from ..transport.counters import Counters
-from ..transport.inputs import Kernel
-from ..transport.observer import Observer
+from mitsuba_bdpt.errors import CommandError
+from mitsuba_bdpt.geometry import polarization
+from mitsuba_bdpt.host.jit import evaluated_mode, float64, gc_paused
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.planning import planner
+from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.sampling.points import Points
+from mitsuba_bdpt.transport import connections, kernel
+from mitsuba_bdpt.transport.batch import Batch
+from mitsuba_bdpt.transport.counters import Counters
+from mitsuba_bdpt.transport.inputs import Kernel
+from mitsuba_bdpt.transport.observer import Observer
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8

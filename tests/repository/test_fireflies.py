@@ -8,8 +8,9 @@ import media_parts
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.measure import fireflies, reconstruct, recording
 from scene_parts import T, grey
+
+from instruments import fireflies, reconstruct, recording
 
 
 def between_mirrors(bsdf="conductor"):

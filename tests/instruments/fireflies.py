@@ -28,16 +28,15 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_bdpt.host.jit import evaluated_mode
+from mitsuba_bdpt.measure.making import Job, obtained
+from mitsuba_bdpt.measure.metrics import TRIM, rel_mse, rel_mse_epsilon
+from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.scenes import MeasuredScene, integrator_of
+from mitsuba_bdpt.measure.showing import steps
+from mitsuba_bdpt.measure.tables import table
 
-from ..host.jit import evaluated_mode
 from . import oracle, reconstruct, recording
-from .making import Job, obtained
-from .metrics import TRIM, rel_mse, rel_mse_epsilon
-from .options import VARIANT, Fireflies
-from .project import Project
-from .scenes import MeasuredScene, integrator_of
-from .showing import steps
-from .tables import table
 
 # Estimates and weights are the same up to this.
 AGREE = 1e-2
@@ -207,7 +206,7 @@ HEAD = [
 ]
 
 
-def lines(project: Project, file: MeasuredScene, options: Fireflies | Namespace) -> tuple[list, str]:
+def lines(project: Project, file: MeasuredScene, options: Namespace) -> tuple[list, str]:
     """The rows of a scene, those with most error first, and what its renders were like."""
     name, seconds = file.name, options.reference_seconds
     job = Job(project, file, options.resolution, options.max_depth, options.spp, seconds)
@@ -231,17 +230,10 @@ def lines(project: Project, file: MeasuredScene, options: Fireflies | Namespace)
     ], f"`{name}`: {pairs}, found anew {anew} of {examined}"
 
 
-def text(project: Project, names: Sequence[str], options: Fireflies | Namespace) -> str:
+def text(project: Project, names: Sequence[str], options: Namespace) -> str:
     """The table of the scenes with these ``names``, and the renders' errors, raw and trimmed."""
     rows, said = [], []
     for scene in [project.scene(name) for name in names]:
         more, errors = lines(project, scene, options)
         rows, said = rows + more, [*said, errors]
     return f"{table(HEAD, rows)}\nrelMSE of the renders (trimmed): {'; '.join(said)}"
-
-
-def run(options: Namespace) -> int:
-    """Print what the command line ``options`` ask for."""
-    mi.set_variant(VARIANT)
-    print(text(Project(options.project), options.scenes, options))
-    return 0

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_bdpt.host.introspection import world_matrix
+from mitsuba_bdpt.measure.scenes import has_media
+from mitsuba_bdpt.transport import draws
 
-from ..host.introspection import world_matrix
-from ..transport import draws
 from . import endpoints, oracle
-from .scenes import has_media
 
 # Lobes of a delta BSDF are looked for with these numbers; a direction is the same up to this cosine, a vertex
 # is the same up to this part of the edge to it.

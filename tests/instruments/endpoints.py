@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_bdpt.host.introspection import matrix_of, world_matrix
 
-from ..host.introspection import matrix_of, world_matrix
 from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
 
 KINDS = {
