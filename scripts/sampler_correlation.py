@@ -1,6 +1,6 @@
 """How far Mitsuba's samplers are from independent between dimensions, and what error they leave.
 
-    python scripts/sampler_correlation.py     # the tables of docs/user/samplers.md, some minutes on two cores
+    python scripts/sampler_correlation.py     # the source of docs/user/samplers.md, some minutes on two cores
 
 Each number that a sampler draws is uniform by itself, and the samples of a pixel are spread evenly in it.
 What matters besides is how two numbers of the same sample, one deciding a light and one a direction, say,
