@@ -18,6 +18,7 @@ REMOVED = {
     "and combine both (mitsuba_bdpt.Snapshot.joined)",
     "--progress deadline": "use --progress lines, whose lines on standard error have the percentage",
     "--tev": "use --preview SECONDS, which rewrites the PNG, and a viewer that watches files",
+    "fireflies": "run scripts/fireflies.py of the repository",
     "completion": "generate completions from --help with a tool such as shtab or your shell's own",
 }
 
