@@ -37,16 +37,16 @@ gallery: $(INSTALLED)
 # The pictures of docs/reports/pictures.md.
 pictures: $(INSTALLED)
 	mkdir -p docs/images
-	$(VENV)/bin/python scripts/equal_time.py veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
-	$(VENV)/bin/python scripts/equal_time.py glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
-	$(VENV)/bin/python scripts/polarization.py pictures
+	$(VENV)/bin/mitsuba-bdpt equal-time veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
+	$(VENV)/bin/mitsuba-bdpt equal-time glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
+	$(VENV)/bin/python scripts/polarization.py
 	for scene in glass_caustics pool_floor lamp_in_glass_seen; do \
-		$(VENV)/bin/python scripts/equal_time.py $$scene --spp 64 -o docs/images/$${scene}_merging.png \
+		$(VENV)/bin/mitsuba-bdpt equal-time $$scene --spp 64 -o docs/images/$${scene}_merging.png \
 			-i bdpt path "bdpt merging=true" || exit 1; \
 	done
-	$(VENV)/bin/python scripts/equal_time.py lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
-	$(VENV)/bin/python scripts/equal_time.py fog_caustic --spp 64 -o docs/images/fog_caustic_equal_time.png
-	$(VENV)/bin/python scripts/strategies.py veach_bidir -o renders/pyramid.exr
+	$(VENV)/bin/mitsuba-bdpt equal-time lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
+	$(VENV)/bin/mitsuba-bdpt equal-time fog_caustic --spp 64 -o docs/images/fog_caustic_equal_time.png
+	$(VENV)/bin/mitsuba-bdpt pyramid veach_bidir -o renders/pyramid.exr
 	cp renders/pyramid_weighted.png renders/pyramid_unweighted.png docs/images
 
 # The tutorial of docs/user/tutorial.py as a notebook that was run, some minutes.
@@ -74,7 +74,7 @@ package: $(INSTALLED)
 sweep: $(INSTALLED)
 	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
 	$(VENV)/bin/python scripts/report.py results/small
-	$(VENV)/bin/python scripts/page.py results/small
+	$(VENV)/bin/mitsuba-bdpt page results/small
 
 # What was tried to break it, under twenty minutes on two cores: docs/reports/stress.md.
 stress: $(INSTALLED)
@@ -96,9 +96,9 @@ endurance: $(INSTALLED)
 
 # The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)
-	$(VENV)/bin/python scripts/reference.py --all --seconds 3600
-	$(VENV)/bin/python scripts/reference.py glass_caustics --spp 256 --seconds 7200
-	$(VENV)/bin/python scripts/reference.py cornell_box --spp 256 --seconds 3600
+	$(VENV)/bin/mitsuba-bdpt reference --all --seconds 3600
+	$(VENV)/bin/mitsuba-bdpt reference glass_caustics --spp 256 --seconds 7200
+	$(VENV)/bin/mitsuba-bdpt reference cornell_box --spp 256 --seconds 3600
 
 # The tables and plots of docs/reports, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)

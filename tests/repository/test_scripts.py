@@ -44,11 +44,16 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def by_user(monkeypatch, script, *arguments):
-    """The exit status of a script, run as a user does but for the process."""
-    monkeypatch.setattr(sys, "argv", [script, *arguments])
+def by_user(monkeypatch, command, *arguments):
+    """The exit status of a script, or of a verb of the command, run as a user does but for the process."""
+    if not command.endswith(".py"):
+        try:
+            return main([command, *arguments])
+        except SystemExit as ended:
+            return ended.code
+    monkeypatch.setattr(sys, "argv", [command, *arguments])
     with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(SCRIPTS / script), run_name="__main__")
+        runpy.run_path(str(SCRIPTS / command), run_name="__main__")
     return ended.value.code
 
 
@@ -57,28 +62,27 @@ def by_user(monkeypatch, script, *arguments):
     [
         ("candidates.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         (
-            "compare.py bdpt path --scenes nowhere",
+            "compare bdpt path --scenes nowhere",
             "scene='nowhere' is neither a scene file nor the name of one",
         ),
         ("compare_ptracer.py --only=no-such-case --page missing.md", "missing.md"),
         ("endurance.py --show --record .", "Is a directory"),
         (
-            "equal_time.py scenes/nowhere",
+            "equal-time scenes/nowhere",
             "neither a scene file nor the name of one in",
         ),
-        ("equal_time.py cornell_box -o a.jpg", "output='a.jpg' must end in .png"),
-        ("equal_time.py room.xml --reference words.toml", "'words.toml' is not an EXR"),
-        ("equal_time.py words.toml --reference flat.exr", "Parsing of XML"),
-        ("equal_time.py room.xml --reference flat.exr -i nope bdpt", "nope"),
-        ("equal_time.py room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
+        ("equal-time room.xml -o a.jpg", "output='a.jpg' must end in .png"),
+        ("equal-time room.xml --reference words.toml", "'words.toml' is not an EXR"),
+        ("equal-time words.toml --reference flat.exr", "Parsing of XML"),
+        ("equal-time room.xml --reference flat.exr -i nope bdpt", "nope"),
+        ("equal-time room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
         ("fireflies.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         ("floor.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         ("overhead.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         ("mutants.py nowhere", "no mutant has 'nowhere' in its name"),
-        ("page.py broken", "broken: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
-        ("page.py . -o a.pdf", "output='a.pdf' must end in .html"),
-        ("page.py . -o words.toml/a.html", "words.toml"),
-        ("point_error.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("page broken", "broken: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
+        ("page . -o a.pdf", "output='a.pdf' must end in .html"),
+        ("page . -o words.toml/a.html", "words.toml"),
         ("public_scenes.py nowhere", "folder='nowhere' is no folder; give one that holds scene files"),
         ("public_scenes.py broken", "folder='broken' holds no scenes; they are NAME.xml or NAME/scene.xml"),
         (
@@ -87,12 +91,10 @@ def by_user(monkeypatch, script, *arguments):
         ),
         ("public_scenes.py . --reference room=gone.exr", "--reference room=gone.exr: no such file, here or"),
         ("report.py nowhere", "nowhere: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
-        ("stopping.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
-        ("strategies.py nowhere", "scene='nowhere' is neither a scene file"),
-        ("strategies.py room.xml -o words.toml/a", "words.toml"),
-        ("strategies.py room.xml --max-depth 1", "max_depth=1 has no strategies"),
-        ("strategies.py room.xml --heuristic some", "bdpt: heuristic='some' is not known"),
-        ("strategy_noise.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("pyramid nowhere", "scene='nowhere' is neither a scene file"),
+        ("pyramid room.xml -o words.toml/a", "words.toml"),
+        ("pyramid room.xml --max-depth 1", "max_depth=1 has no strategies"),
+        ("pyramid room.xml --heuristic some", "bdpt: heuristic='some' is not known"),
         ("sweep.py nowhere.toml", "nowhere.toml"),
         ("sweep.py words.toml", "words.toml is not TOML"),
         (f"sweep.py {SCRIPTS.parent / 'presets' / 'small.toml'} -o words.toml", "words.toml"),
@@ -130,15 +132,15 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
         "floor.py x --rounds 0",
         "public_scenes.py x --resolution 4",
         "public_scenes.py x --seeds 1",
-        "reference.py x --seconds nan",
-        "reference.py x --spp 0",
+        "reference x --seconds nan",
+        "reference x --spp 0",
         "startup.py --rooms 0 --rounds 0",
         "startup.py --rooms 0 --spp 0",
         "startup.py --rooms -1",
-        "strategies.py x --spp 0",
-        "strategies.py x --seed -1",
-        "strategies.py x --resolution -8",
-        "strategies.py x --exposure nan",
+        "pyramid x --spp 0",
+        "pyramid x --seed -1",
+        "pyramid x --resolution -8",
+        "pyramid x --exposure nan",
         "versus.py x --spp 0",
         "versus.py x --pairs 0.5",
     ],
@@ -155,7 +157,7 @@ def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command
 @pytest.mark.parametrize("words", ["bdpt nothing", "", "skip=none"])
 def test_integrators_of_command_lines_are_checked(here, monkeypatch, capsys, words):
     """Expected: what is no type with properties is said with the form that is wanted, status 2."""
-    assert by_user(monkeypatch, "equal_time.py", "room.xml", "-i", words, "path") == 2
+    assert by_user(monkeypatch, "equal-time", "room.xml", "-i", words, "path") == 2
     assert "which must have the form" in capsys.readouterr().err
 
 
@@ -170,10 +172,10 @@ def test_options_of_rooms_want_rooms(here, monkeypatch, capsys, option):
 @pytest.mark.parametrize(
     ("command", "taken"),
     [
-        ("equal_time.py room.xml --reference flat.exr -o a.png", "a.png"),
-        ("strategies.py room.xml -o a.exr", "a.png"),
-        ("strategies.py room.xml -o a.exr", "a.exr"),
-        ("strategies.py room.xml -o a.exr", "a_weighted.png"),
+        ("equal-time room.xml --reference flat.exr -o a.png", "a.png"),
+        ("pyramid room.xml -o a.exr", "a.png"),
+        ("pyramid room.xml -o a.exr", "a.exr"),
+        ("pyramid room.xml -o a.exr", "a_weighted.png"),
     ],
 )
 def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, command, taken):
