@@ -13,7 +13,7 @@ from . import removed
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import named
 from .image import denoising, features, film_limits
-from .image.channels import Channels
+from .image.accumulator import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
 from .image.stokes import POLARIZED

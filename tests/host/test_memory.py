@@ -8,7 +8,7 @@ import mitsuba as mi
 import pytest
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.image import film_limits
-from mitsuba_bdpt.image.channels import Channels
+from mitsuba_bdpt.image.accumulator import Channels
 from patience import PATIENCE
 
 GIB = 2**30

@@ -6,7 +6,7 @@ import mitsuba as mi
 
 from ..errors import UsageError
 from ..host import memory
-from .channels import Channels
+from .accumulator import Channels
 from .layers import image_count
 
 # Of one array.

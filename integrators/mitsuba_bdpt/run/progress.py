@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from ..image.spread import Spread
+from ..image.replicates import Spread
 from ..planning.decision import read_decisions
 from ..planning.moments import Moments
 from ..planning.planner import Decided, Pilots
