@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import CommandError
+from ..files.images import attribute
 from ..files.named import named_files
 from ..files.whole import check_writable, replacing
 from ..host.versions import versions
@@ -19,6 +20,9 @@ from ..run.snapshot import Snapshot, read
 
 BEGIN_ANEW = "begin anew by --resume never"
 """What to do about a checkpoint that is of no use."""
+
+CONTENT = "bdptContent"
+"""Attribute of images beside checkpoints: `content`."""
 
 
 def path_of(output: Path) -> Path:
@@ -35,11 +39,33 @@ def digest(options: Namespace) -> str:
     return found.hexdigest()
 
 
+def content(options: Namespace) -> str:
+    """What determines the image of a command line but for its noise, as a hash."""
+    names = "variant", "integrator", "properties", "denoise", "exposure"
+    return _hash([digest(options), versions(), *(getattr(options, name) for name in names)])
+
+
 def identity(options: Namespace, spp: int) -> str:
     """What determines the image of a command line with ``spp`` samples per pixel, as a hash."""
-    names = "variant", "integrator", "properties", "seed", "time", "target_error", "denoise", "exposure"
-    values = [digest(options), spp, versions(), *(getattr(options, name) for name in names)]
+    return _hash([content(options), spp, options.seed, options.time, options.target_error])
+
+
+def _hash(values: list) -> str:
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
+
+
+def attributes(options: Namespace, output: Path) -> dict[str, str]:
+    """Attributes of an image for renders that are resumed beside it."""
+    is_needed = options.checkpoint is not None or path_of(output).exists()
+    return {CONTENT: content(options)} if is_needed else {}
+
+
+def samples_of_image(options: Namespace, output: Path) -> int:
+    """Samples per pixel of the image that a resumed render would replace; 0 if it is of other content."""
+    is_resumed = options.checkpoint is not None and options.resume != "never" and path_of(output).exists()
+    if not is_resumed or attribute(output, CONTENT) != content(options):
+        return 0
+    return int(json.loads(attribute(output, "bdptStatistics") or "{}").get("spp", 0))
 
 
 def check(options: Namespace, output: Path) -> None:

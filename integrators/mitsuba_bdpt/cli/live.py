@@ -26,12 +26,20 @@ class Often:
             self._last = time.monotonic()
 
 
-def watchers(options: Namespace, film: mi.Film, output: Path) -> list[Often]:
-    """Functions of a `PassReport` that show the image of a render into ``film`` as ``options`` ask."""
+def watchers(options: Namespace, film: mi.Film, output: Path, least: int) -> list[Often]:
+    """Functions of a `PassReport` that show the image of a render into ``film`` as ``options`` ask.
+
+    Previews replace the PNG from ``least`` samples per pixel on.
+    """
     if options.preview is None:
         return []
     path = output.with_suffix(".png")
-    return [Often(options.preview, lambda report: _rewrite(report, film, path, options.exposure))]
+
+    def preview(report: PassReport) -> None:
+        if report.spp_done >= least:
+            _rewrite(report, film, path, options.exposure)
+
+    return [Often(options.preview, preview)]
 
 
 def _rewrite(report: PassReport, film: mi.Film, path: Path, exposure: float) -> None:

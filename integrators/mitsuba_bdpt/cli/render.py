@@ -50,6 +50,8 @@ class Outcome:
     seconds: float
     spp: int
     interrupted: bool = False
+    finished: bool = True
+    """Whether it has all samples, or the error, that it was to have; with checkpoints only."""
     statistics: dict = field(default_factory=dict)
     error: Exception | None = None
     """What has ended it before its end, if something else than a signal has."""
@@ -138,13 +140,15 @@ def loaded(options: Namespace) -> Loaded:
 def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, ending: Ending) -> bool:
     """Render one image and write it; returns whether it came to its end.
 
-    Once rendered, it is written whatever signals come, and only then a checkpoint is removed.
+    Once rendered, it is written whatever signals come, and only then a checkpoint is removed. A resumed
+    render that ends early does not replace an image of more samples.
     """
     sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
     if is_done(job, spp):
         say(f"{job.output}: rendered before by the same command")
         return True
-    outcome = render(scene, integrator, job, spp)
+    least = checkpoints.samples_of_image(job, job.output)
+    outcome = render(scene, integrator, job, spp, least)
     ending.patient = True
     try:
         if outcome.interrupted and not outcome.spp:
@@ -152,9 +156,14 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
             return False
         found = report(outcome)
         attributes = {"bdptSettings": json.dumps(settings(job, spp)), "bdptStatistics": json.dumps(found)}
+        attributes |= checkpoints.attributes(job, job.output)
         if job.checkpoint is not None and not outcome.interrupted:
             attributes[IDENTITY] = checkpoints.identity(job, spp)
-        write(sensor.film(), job, attributes)
+        if outcome.finished or outcome.spp >= least:
+            write(sensor.film(), job, attributes)
+        else:
+            why = f"it has {least} samples per pixel, the checkpoint of the resumed render {outcome.spp}"
+            print(f"warning: {job.output} is kept: {why}", file=sys.stderr)
         if job.statistics is not None:
             write_json(job.statistics, {"settings": settings(job, spp)} | found)
         outcome.written()
@@ -271,10 +280,12 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
         cluster.check_settings(integrator.settings)
 
 
-def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
-    """Render into the sensor's film, and show what is done meanwhile."""
+def render(
+    scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, least: int = 0
+) -> Outcome:
+    """Render into the sensor's film, and show what is done meanwhile; ``least`` see `live.watchers`."""
     film = choose_sensor(scene, options.sensor).film()
-    watchers = live.watchers(options, film, options.output)
+    watchers = live.watchers(options, film, options.output, least)
     if options.scheduler is None:
         if options.time is not None and not hasattr(integrator, "on_pass"):
             return render_repeatedly(scene, integrator, options, spp)
@@ -288,7 +299,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
         shown.close()
     seconds, done = time.perf_counter() - started, sum(statistics["passes"])
     error = ended if isinstance(ended, Exception) else None
-    return Outcome(seconds, done, ended is not None, statistics, error)
+    return Outcome(seconds, done, ended is not None, statistics=statistics, error=error)
 
 
 def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
@@ -334,10 +345,10 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     elif interrupted:
         # Mitsuba's own integrators leave nothing behind.
         done = 0
-    outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics)
+    whole = done == spp or reached(asked_error(integrator), statistics)
+    finished = not interrupted and whole
+    outcome = Outcome(time.perf_counter() - started, done, interrupted, finished, statistics)
     if kept is not None:
-        whole = done == spp or reached(asked_error(integrator), statistics)
-        finished = not interrupted and whole
         # Of a finished render at the end only: its image may fail to be written.
         if finished:
             outcome.written = kept.remove
