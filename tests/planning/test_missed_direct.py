@@ -1,8 +1,10 @@
-"""Direct light of delta emitters on a sensor with area: said where it is not sampled."""
+"""Light of delta emitters on a sensor with area, direct or by delta events: said where it is not sampled."""
 
 import mitsuba as mi
 import pytest
 import scene_parts as parts
+from mitsuba_bdpt.planning import missed_direct
+from mitsuba_bdpt.run.rendering import Render
 
 T = parts.T
 LAMPS = {
@@ -37,7 +39,7 @@ def said(capfd, sensor, lamp, method=None, **others):
     method = mi.load_dict({"type": "bdpt", "max_depth": 4} | (method or {}))
     method.render(scene, spp=1)
     lines = capfd.readouterr().out.splitlines()
-    warnings = [line for line in lines if "directly on" in line]
+    warnings = [line for line in lines if "this light is missing" in line and "on what is seen" not in line]
     return warnings, [line for line in method.explain(scene, spp=1).splitlines() if "lost: " in line]
 
 
@@ -68,6 +70,43 @@ def test_missing_direct_light_is_said(case, lamp, capfd):
     assert "lost: delta emitter, sensor (needs (1,1))" in lost
 
 
+GLASS = {"type": "rectangle", "to_world": T().translate([0, 0, 0.3]), "bsdf": {"type": "thindielectric"}}
+BEAM = {
+    "type": "rectangle",
+    "to_world": T().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.2),
+    "emitter": {"type": "directionalarea", "id": "bulb", "radiance": 3.0},
+}
+
+
+def of_plan(sensor, lamp, method=None, **others):
+    """The warnings before a render, which is not made."""
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp} | others, optimize=False)
+    settings = mi.load_dict({"type": "bdpt", "max_depth": 4} | (method or {})).settings
+    render = Render(scene, scene.sensors()[0], settings, 0, 1)
+    found = missed_direct.warnings(render.prepared, render.plan, settings, render.findings)
+    return [text for text in found if text]
+
+
+@pytest.mark.parametrize("lamp", [LAMPS["point"], BEAM], ids=["point", "beam"])
+def test_missing_light_through_glass_is_said(lamp):
+    """Rationale: through a pane, or from a lamp that emits into one direction, only t = 0 samples it.
+
+    Expected: one warning that names lamp and remedy, none of direct light, which the pane stops; none where
+    t = 0 takes part, or where a wall stops the light.
+    """
+    (warning,) = of_plan(meter(), lamp, WITHOUT, pane=GLASS)
+    assert "'bulb' shines through glass or mirrors on" in warning and "leave light_paths at auto" in warning
+    assert of_plan(meter(), lamp, pane=GLASS) == []
+    assert of_plan(meter(), lamp, WITHOUT, pane=GLASS, blind=BLIND) == []
+
+
+def test_a_batch_of_meters_behind_glass():
+    """Expected: a warning by default too: t = 0 does not look which of the meters light hits."""
+    a, b = (mi.load_dict(meter(x)) for x in (-0.1, 0.1))
+    (warning,) = of_plan(batch(a=a, b=b), LAMPS["point"], pane=GLASS, plate_a=a, plate_b=b)
+    assert "through glass or mirrors on" in warning and "render the views one by one" in warning
+
+
 def test_a_lens_without_light_subpaths(capfd):
     """Rationale: a point light before an open lens is a disk on the film, which camera subpaths miss.
 
@@ -87,6 +126,7 @@ def test_a_lens_without_light_subpaths(capfd):
         (meter, AREA_LAMP, WITHOUT, {}),
         (meter, {"type": "constant"}, WITHOUT, {}),
         (meter, LAMPS["point"], WITHOUT, {"blind": BLIND}),
+        (meter, AREA_LAMP, WITHOUT, {"pane": GLASS}),
         (meter, LAMPS["point"] | {"position": [0, 0, -1]}, WITHOUT, {}),
         (meter, LAMPS["point"], WITHOUT | {"hide_emitters": True}, {}),
         (lambda: CAMERA, LAMPS["point"], WITHOUT, {}),

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -27,6 +28,7 @@ from ..host import renamed
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..scene.prepared import PreparedScene
+from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport import spectra
 from ..transport.inputs import Shared
@@ -41,6 +43,10 @@ if TYPE_CHECKING:
 # first four scenes with such light: enough to tell what is `WORTH_A_WORD`, not for a number to rely
 # on. A look takes 60 to 90 ms on two busy cores, 0.3 to 0.4 s where its kernels have to be compiled.
 SUBPATHS, COMPARED = 1 << 13, 1 << 11
+
+# Light subpaths that are looked at for hits of the sensor: a meter of 10 square centimetres, 3 m from a lamp,
+# gets two of them.
+HITTING = 1 << 18
 
 # Edges after which a subpath of delta events ends: through twelve panes, or reflected as often within glass.
 # (In `lamp_behind_glass` 12 find 5 % less than 24, and 48 no more; elsewhere 8 find all.)
@@ -307,19 +313,41 @@ def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi
 
     Also the emitters' indices, and the mask of subpaths whose ray is not finite, which hit nothing.
     """
-    generator = mi.PCG32(SUBPATHS, SEED, 1)
-    shared = shared_sample(prepared, generator)
-    e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
-    active = e.delta & ~spectra.is_zero(e.weight)  # what is not finite is kept, to be said
-    ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
-    weight, index = mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(e.weight)), e.index
-    ray.maxt = dr.full(mi.Float, dr.inf, SUBPATHS)  # as wide as those of the sensor, for the same kernel
-    dr.make_opaque(ray, weight, active, beam, index, generator)
+    ray, weight, active, beam, index, generator = _emitted(prepared, SUBPATHS)
     astray = active & ~(dr.all(dr.isfinite(ray.o)) & dr.all(dr.isfinite(ray.d)))
     ends = _follow(prepared, ray, weight, active, generator, max_depth, True)
     if plan.direct:
         ends.active &= (ends.edges > 1) | beam
     return ends, index, astray
+
+
+def _emitted(prepared: PreparedScene, count: int):
+    """The first rays of ``count`` light subpaths.
+
+    With what they carry; masks of those from delta emitters, and of beams; the emitters' indices; random
+    numbers for the rest of the subpaths.
+    """
+    generator = mi.PCG32(count, SEED, 1)
+    shared = shared_sample(prepared, generator)
+    e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
+    active = e.delta & ~spectra.is_zero(e.weight)  # what is not finite is kept, to be said
+    ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
+    weight, index = mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(e.weight)), e.index
+    ray.maxt = dr.full(mi.Float, dr.inf, count)  # as wide as those of the sensor, for the same kernel
+    dr.make_opaque(ray, weight, active, beam, index, generator)
+    return ray, weight, active, beam, index, generator
+
+
+def arriving(prepared: PreparedScene, sensor: Sensor, max_depth: int) -> list[int]:
+    """Indices of the delta emitters of which light subpaths hit the ``sensor`` by delta events alone.
+
+    Direct light counts of beams only.
+    """
+    with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
+        ray, weight, active, beam, index, generator = _emitted(prepared, HITTING)
+        found = _follow(prepared, ray, weight, active, generator, max_depth, True, sensor)
+        hits = found.active & ((found.edges > 1) | beam)
+        return np.unique(dr.gather(mi.UInt32, index, dr.compress(hits)).numpy()).tolist()
 
 
 def _seen(prepared: PreparedScene, plan: Plan, max_depth: int) -> _Ends:
@@ -356,10 +384,11 @@ def _follow(
     generator: PCG32,
     max_depth: int,
     adjoint: bool,
+    sensor: Sensor | None = None,
 ) -> _Ends:
     """Follow rays by delta events to the first surface that has another lobe, by intensity alone.
 
-    Where one has both, a coin decides. One kernel for both sides.
+    Where one has both, a coin decides. One kernel for both sides. With a ``sensor``: to where they hit it.
     """
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
     last, is_adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
@@ -374,9 +403,14 @@ def _follow(
         both = active & smooth & delta
         here = active & smooth & (~both | (generator.next_float32() < 0.5))
         weight = dr.select(both, weight * 2, weight)
+        if sensor is not None:
+            here = _hits(sensor, ray, si, walk.active)
         reflectance = _reflectance(si, surface, generator, here)
         arrived = replace(walk, weight=weight, distance=distance, active=here)
-        ends = dr.select(here, _end(si, surface, arrived, reflectance), ends)
+        end = _end(si, surface, arrived, reflectance)
+        if sensor is not None:
+            end.active = here
+        ends = dr.select(here, end, ends)
         active = active & ~here & delta & (walk.edges < last)
         first = active & (walk.edges == 1)
         through = dr.select(first, dr.reinterpret_array(mi.UInt32, si.shape), walk.through_shape)
@@ -397,6 +431,14 @@ def _follow(
     )
     dr.eval(ends)
     return ends
+
+
+def _hits(sensor: Sensor, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+    """Mask: the last edge of a subpath, from a delta event or a beam to ``si``, hits the ``sensor``."""
+    cos = dr.abs(dr.dot(si.n, ray.d))
+    walk = SimpleNamespace(previous=ray.o, d=ray.d, pi=si, active=active)
+    vertex = SimpleNamespace(si=si, hit=active & si.is_valid(), cos=cos)
+    return sensor.hit(walk, vertex, mi.Bool(False)).active
 
 
 def _nowhere() -> _Ends:

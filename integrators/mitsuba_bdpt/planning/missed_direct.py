@@ -1,7 +1,8 @@
-"""Light of delta emitters that falls directly on a sensor with area and that no strategy in use samples.
+"""Light of delta emitters that falls on a sensor with area and that no strategy in use samples.
 
-Camera subpaths do not hit such an emitter and next-event estimation starts at a surface: only (1,1) and t = 0
-sample it. Where a render does without both, the emitters whose light arrives are found with shadow rays.
+It arrives directly or by delta events (mirrors, glass). Camera subpaths do not hit such an emitter and
+next-event estimation starts at a surface: only (1,1), of direct light, and t = 0 sample it. Where a render
+does without them, the emitters whose light arrives are found with shadow rays, or with light subpaths.
 """
 
 from __future__ import annotations
@@ -19,47 +20,63 @@ from ..sensors import checks, kinds
 from ..sensors.records import CameraJoin, Sensor
 from ..settings import Settings
 from ..transport.plan import Plan
+from . import lost_light
 from .findings import Findings
 from .lost_light import NAMED, called, shared_sample
-from .possible import Start, unreachable_paths
+from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 # Points of the sensor to which each emitter is connected.
 POINTS = 1 << 10
 
 
-def warning(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> str:
-    """The warning about such light; empty if none is missing."""
-    lost = unreachable_paths(prepared, plan, settings)
-    if not any(Start.DIRECT_DELTA_EMITTER in paths.starts for paths in lost):
-        return ""
-    found, _ = findings.find("missed direct light", (), partial(_arriving, prepared))
+def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
+    """The warnings about such light, directly and by delta events; none if no such light is missing."""
+    lost = [paths for paths in unreachable_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
+    return [_warning(prepared, plan, settings, findings, paths) for paths in lost]
+
+
+def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str:
+    """The warning about the light of lost ``paths`` that end at the sensor; empty if none arrives."""
+    direct = Start.DIRECT_DELTA_EMITTER in paths.starts
+    look = partial(_arriving, prepared, direct, settings.max_depth)
+    found, _ = findings.find("missed direct light", (direct, settings.max_depth), look)
     if not found:
         return ""
     emitters = [prepared.scene.emitters()[i] for i in found[:NAMED]]
     lamps = " and ".join(map(called, emitters)) + (" and others" if len(found) > NAMED else "")
     shine = "shines" if len(found) == 1 else "shine"
-    why, remedy = _cause(prepared, plan, settings)
+    how = "directly" if direct or not prepared.delta else "through glass or mirrors"
+    why, remedy = _cause(prepared, plan, settings, paths.needs)
     sensor = checks.called(prepared.camera.sensor)
-    return f"bdpt: {lamps} {shine} directly on {sensor}: this light is missing, because {why}; {remedy}"
+    return f"bdpt: {lamps} {shine} {how} on {sensor}: this light is missing, because {why}; {remedy}"
 
 
-def _cause(prepared: PreparedScene, plan: Plan, settings: Settings) -> tuple[str, str]:
-    """Why (1,1) is not in use, and what to do."""
+def _cause(prepared: PreparedScene, plan: Plan, settings: Settings, strategy: str) -> tuple[str, str]:
+    """Why a ``strategy`` is not in use, and what to do."""
+    is_batch = prepared.camera.sensor.class_name() == "BatchSensor"
     if not prepared.camera.connectible:
-        one_by_one = prepared.camera.sensor.class_name() == "BatchSensor"
-        remedy = "render the views one by one" if one_by_one else "use an area light"
+        remedy = "render the views one by one" if is_batch else "use an area light"
         return f"no light can be traced to the sensor: {prepared.camera.reason}", remedy
     if settings.light_paths == 0:
         return "light_paths=0 leaves out light subpaths", "leave light_paths at auto"
     for skipped in plan.skipped:
-        if "(1,1)" in skipped["class"]:
-            return skipped["why"], "mend that, or use an area light"
+        if strategy in skipped["class"]:
+            remedy = "render the views one by one" if is_batch else "mend that, or use an area light"
+            return skipped["why"], remedy
     return "decisions leave out light subpaths", "leave decisions to the integrator"
 
 
-def _arriving(prepared: PreparedScene) -> tuple[int, ...]:
-    """Indices of the first delta emitters whose light arrives at the sensor directly, `NAMED` + 1 at most."""
+def _arriving(prepared: PreparedScene, direct: bool, max_depth: int) -> tuple[int, ...]:
+    """Indices of the first delta emitters whose light arrives at the sensor, `NAMED` + 1 at most.
+
+    Directly, or else by delta events.
+    """
     views = _with_area(prepared)
+    if not direct:
+        if prepared.space is not None:  # `lost_light` knows surfaces only
+            return ()
+        found = {i for view in views for i in lost_light.arriving(prepared, view, max_depth)}
+        return tuple(sorted(found)[: NAMED + 1])
     emitters = prepared.scene.emitters()
     arriving = (
         i
@@ -72,11 +89,9 @@ def _arriving(prepared: PreparedScene) -> tuple[int, ...]:
 def _with_area(prepared: PreparedScene) -> list[Sensor]:
     """The sensor, or the views of a batch, as far as they have area and can be connected."""
     camera = prepared.camera
-    if camera.connectible:
-        return [camera]
     views = checks.views(camera.sensor)
     found = [kinds.prepare(view, prepared.emitters.shape_errors, prepared.scene) for view in views]
-    return [view for view in found if view.connectible and not view.delta]
+    return [view for view in found or [camera] if view.connectible and not view.delta]
 
 
 def _arrives(prepared: PreparedScene, sensor: Sensor, emitter: mi.Emitter) -> bool:

@@ -92,9 +92,9 @@ def warn_of_lost_light(prepared, plan, text: str):
         warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
 
 
-def warn_of_missed_direct(prepared, text: str):
-    """Warn once of direct light on the sensor that is not sampled, unless ``text`` is empty."""
-    if text:
+def warn_of_missed_direct(prepared, texts: list[str]):
+    """Warn once of light on the sensor that is not sampled; an empty text is no warning."""
+    for text in filter(None, texts):
         warn_once(prepared.scene, prepared.camera.sensor, text)
 
 

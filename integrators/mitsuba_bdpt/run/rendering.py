@@ -142,7 +142,7 @@ class Render:
                     messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())
                     messages.warn_of_missed_direct(
                         self.prepared,
-                        missed_direct.warning(self.prepared, self.plan, self.settings, self.findings),
+                        missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings),
                     )
                 self._pass(step)
                 if not number:
