@@ -345,12 +345,12 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     elif interrupted:
         # Mitsuba's own integrators leave nothing behind.
         done = 0
-    whole = done == spp or reached(asked_error(integrator), statistics)
-    finished = not interrupted and whole
-    outcome = Outcome(time.perf_counter() - started, done, interrupted, finished, statistics)
+    outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics=statistics)
     if kept is not None:
+        whole = done == spp or reached(asked_error(integrator), statistics)
+        outcome.finished = not interrupted and whole
         # Of a finished render at the end only: its image may fail to be written.
-        if finished:
+        if outcome.finished:
             outcome.written = kept.remove
         else:
             kept.write()
