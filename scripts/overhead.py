@@ -37,7 +37,7 @@ from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.run import rendering
-from mitsuba_bdpt.run.work import Meter
+from mitsuba_bdpt.run.statistics import Meter
 from repository import benchmark_depth
 
 ROUNDS, SHORT, LONG = 7, 4, 64

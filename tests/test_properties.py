@@ -20,7 +20,8 @@ import pytest
 import scene_parts as parts
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.properties import check_variant
-from mitsuba_bdpt.run import schedule, work
+from mitsuba_bdpt.run import schedule
+from mitsuba_bdpt.run import statistics as statistics_module
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
 from patience import PATIENCE
@@ -371,7 +372,7 @@ def test_timeout_stops_after_a_pass(monkeypatch):
     normalised by what was done (0.5 exactly, without light subpaths), and timeout=0 does one pass.
     """
     clock = Clock()
-    monkeypatch.setattr(work, "time", SimpleNamespace(perf_counter=clock.perf_counter))
+    monkeypatch.setattr(statistics_module, "time", SimpleNamespace(perf_counter=clock.perf_counter))
     for timeout, count in ((2.5, 3), (0, 1), (-1, 10), (100, 10), (float("inf"), 10)):
         bdpt = integrator(max_depth=1, light_paths=0, skip="none", spp_per_pass=1, timeout=timeout)
 
@@ -1341,7 +1342,7 @@ def test_passes_are_short_under_a_timeout(monkeypatch):
     compilation = [
         {"type": dr.KernelType.JIT, "cache_hit": False, "codegen_time": 50.0, "backend_time": 150.0}
     ]
-    monkeypatch.setattr(work.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(statistics_module.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(dr, "kernel_history", lambda: [compilation.pop()] if compilation else [])
     bdpt.on_pass = lambda report: clock.__setitem__(0, float(report.spp_done))
     bdpt.render(lamp_in_a_sphere(), spp=1000)

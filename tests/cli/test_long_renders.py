@@ -14,8 +14,8 @@ from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.named import named_files
 from mitsuba_bdpt.image.accumulator import Accumulator
-from mitsuba_bdpt.run import work
 from mitsuba_bdpt.run.snapshot import read
+from mitsuba_bdpt.run.statistics import Meter
 from patience import PATIENCE
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
@@ -216,7 +216,7 @@ def test_an_interruption_inside_a_pass(monkeypatch):
     is the uninterrupted one, its estimate of the error included."""
     arguments = [*ARGUMENTS, "--spp", "63", "-P", "variance=true"]  # too few for a pilot
     assert main([*arguments, "-o", "whole.exr"]) == 0
-    original, close_pass, waits, closed = work.Meter.wait, Accumulator.close_pass, [], []
+    original, close_pass, waits, closed = Meter.wait, Accumulator.close_pass, [], []
 
     def close(self, spp):
         close_pass(self, spp)
@@ -230,7 +230,7 @@ def test_an_interruption_inside_a_pass(monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Accumulator, "close_pass", close)
-        patch.setattr(work.Meter, "wait", wait)
+        patch.setattr(Meter, "wait", wait)
         assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60"]) == 130
     assert read(Path("cut.checkpoint.npz")).passes == (1, 4, 3, 4)  # the next one ends a replicate
     assert main([*arguments, "-o", "cut.exr", "--checkpoint", "60", "--resume"]) == 0

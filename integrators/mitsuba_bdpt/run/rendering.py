@@ -39,11 +39,9 @@ from ..transport.photons.wavelength_sets import SETS
 from ..transport.plan import Plan
 from . import messages
 from .pass_points import PassPoints
-from .progress import Progress
 from .schedule import REPLICATES, Step, batches, passes_since, schedule
-from .snapshot import Snapshot, identity
-from .statistics import rays
-from .work import Meter
+from .snapshot import Progress, Snapshot, identity
+from .statistics import Meter, rays
 
 
 @dataclass(frozen=True)
