@@ -1109,7 +1109,7 @@ MUTANTS = (
     Mutant(
         "merging: normals are not compared",
         "transport/photons/merging.py",
-        "return within & flat & (dr.dot(photon.n, z.si.n) > _SAME_SIDE)",
+        "return within & flat & same_surface(photon.n, z.si.n)",
         "return within & flat",
         ("tests/images/test_merging.py::test_which_photons_are_near",),
     ),
@@ -1248,8 +1248,8 @@ MUTANTS = (
     Mutant(
         "guided s = 0: t = 0 counts it at all diffuse vertices of a light subpath",
         "transport/photons/guided_hits.py",
-        "y.hit & walk.only_delta & y.connectible() & ~joined",
-        "y.hit & y.connectible() & ~joined",
+        "possible = walk.only_delta & is_sds_vertex",
+        "possible = is_sds_vertex",
         ("tests/images/test_sds_paths.py::test_light_subpaths_with_two_diffuse_vertices",),
     ),
     Mutant(

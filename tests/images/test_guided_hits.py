@@ -21,7 +21,8 @@ from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import photon_guide
-from mitsuba_bdpt.transport.photons.photon_guide import Guide, GuidePhoton
+from mitsuba_bdpt.transport.photons.photon import Photon
+from mitsuba_bdpt.transport.photons.photon_guide import Guide
 from mitsuba_bdpt.transport.plan import GUIDED
 from snapshots import ROUNDING
 from test_merging import (
@@ -74,8 +75,8 @@ def photons(count, spread, seed=1):
     p[:2] = rng.random((2, count))
     d = np.concatenate([spread * rng.standard_normal((2, count)), np.ones((1, count))])
     d /= np.linalg.norm(d, axis=0)
-    found = GuidePhoton.zeros(count)
-    found.p, found.d, found.slope = mi.Point3f(*p), mi.Vector3f(*d), mi.Float(np.full(count, 0.5))
+    found = Photon.zeros(count)
+    found.p, found.d, found.distance = mi.Point3f(*p), mi.Vector3f(*d), mi.Float(np.full(count, 2.0))
     found.lane = dr.arange(mi.UInt32, count)
     return found
 

@@ -19,6 +19,7 @@ from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport.inputs import Kernel
 from mitsuba_bdpt.transport.photons import aim, merging, photon_pass, wavelength_sets
 from mitsuba_bdpt.transport.photons.merge_radius import Footprints
+from mitsuba_bdpt.transport.photons.photon import Photon
 from snapshots import ROUNDING, stopped
 
 import drjit as dr  # isort: skip
@@ -502,7 +503,7 @@ def test_which_photons_are_near():
     """Expected: those in the disc, in a flat cylinder about it, whose normals agree to 37 degrees."""
     p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0], 0, [0, 0, 0, 0.24, 0.26, 0, 0])
     n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51)])
-    photon = merging.Photon(p, None, n, *[None] * 5)
+    photon = Photon(p, None, n, *[None] * 6)
     z = SimpleNamespace(si=SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1)))
     found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
     assert found == [True, True, False, True, False, True, False]

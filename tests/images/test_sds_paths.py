@@ -14,6 +14,7 @@ import welch as st
 from mitsuba_bdpt.sampling import sobol
 from mitsuba_bdpt.transport.photons import merging, photon_guide, photon_pass
 from mitsuba_bdpt.transport.photons.merge_radius import Footprints
+from mitsuba_bdpt.transport.photons.photon import Photon
 from snapshots import ROUNDING
 from test_merging import ball, images, matte, point, strategy_images, transform, under_glass
 
@@ -67,7 +68,7 @@ def test_merges_beyond_stored_vertices_have_no_other_strategy():
 def random_photons(count, seed=1):
     """Photons on the floor z = 0 between -4 and 4, of random flux, as arrays."""
     rng = np.random.default_rng(seed)
-    found = merging.Photon.zeros(count)
+    found = Photon.zeros(count)
     found.p = mi.Point3f(*rng.uniform(-4, 4, (2, count)), 0)
     found.n = mi.Normal3f(dr.zeros(mi.Float, count), 0, 1)
     found.flux = mi.Spectrum(mi.Float(rng.exponential(size=count)))

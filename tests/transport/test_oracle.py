@@ -702,11 +702,11 @@ def traced_photons(world: World, k_, merges: merging.Merging, shared, monkeypatc
 
 def record_merges(world: World, monkeypatch):
     """Keep in ``world.merged`` what is merged at each x_m, a `Contribution`; inactive where nothing is."""
-    possible, merge, draw, loop = merging.possible, merging.merge, merging._draw, dr.while_loop
+    is_sds_vertex, merge, draw, loop = kernel.is_sds_vertex, merging.merge, merging._draw, dr.while_loop
     world.merged, mask = {}, {}
 
-    def recorded_possible(kernel_, z, walk):
-        mask[0] = possible(kernel_, z, walk)
+    def recorded_mask(kernel_, first, walk, z):
+        mask[0] = is_sds_vertex(kernel_, first, walk, z)
         return mask[0]
 
     def recorded_merge(kernel_, z, *more):
@@ -721,7 +721,8 @@ def record_merges(world: World, monkeypatch):
             patch.setattr(dr, "while_loop", loop)
             return draw(*arguments)
 
-    for name, function in (("possible", recorded_possible), ("merge", recorded_merge), ("_draw", drawn)):
+    monkeypatch.setattr(kernel, "is_sds_vertex", recorded_mask)
+    for name, function in (("merge", recorded_merge), ("_draw", drawn)):
         monkeypatch.setattr(merging, name, function)
 
 
@@ -789,10 +790,10 @@ def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
     ],
 )
 def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
-    """Rationale: as above, also of ``photon_pass.trace``, ``merging.possible`` and ``merging.merge``: photons
-    are traced along the paths, sorted into the grid and found again from the camera's side, in discs so small
-    that each holds the vertex of its own path alone. Radii depend on the place, so that eta is spread over
-    three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.
+    """Rationale: as above, also of ``photon_pass.trace``, ``walk.is_sds_vertex`` and ``merging.merge``:
+    photons are traced along the paths, sorted into the grid and found again from the camera's side, in discs
+    so small that each holds the vertex of its own path alone. Radii depend on the place, so that eta is
+    spread over three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.
 
     Expected: the weights of all strategies and merges are the oracle's, as above. There is a merge at each
     vertex where the oracle has one, and else only where an event is delta on a BSDF that has other lobes. A

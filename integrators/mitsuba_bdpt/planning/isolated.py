@@ -20,7 +20,7 @@ from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
-from ..transport.photons.guiding_benefit import MOMENTS, Found, Gauge, trace
+from ..transport.photons.guiding_benefit import MOMENTS, Estimator, Found, trace
 from ..transport.photons.photon_pass import photons_of, trace_guide
 from ..transport.plan import Plan
 from .moments import FINE, GROUPS, Isolated, tile_of
@@ -52,13 +52,13 @@ def measure(
         return None
     kernel.without_isolated = True
     counts = dr.opaque(mi.Float, PHOTONS), dr.opaque(mi.Float, samples / SHARE)
-    gauge = Gauge(made[0], made[1], *counts)
+    estimator = Estimator(made[0], made[1], *counts)
     region = prepared.camera.region
     pixels = int(region.size.prod())
     chosen = min(LANES, pixels)
     batch = Batch(0, chosen, 0, LANES // chosen, spread=pixels)
     sums = Sums(region)
-    trace(kernel, gauge, batch, Points("sobol", seed), sums.add)
+    trace(kernel, estimator, batch, Points("sobol", seed), sums.add)
     found, aimed = sums.evaluated()
     return Isolated(found, aimed / batch.size, batch.size)
 

@@ -32,6 +32,7 @@ from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport import spectra
 from ..transport.inputs import Shared
+from ..transport.photons.photon import same_surface
 from ..transport.plan import Plan
 from .possible import Start, unreachable_paths
 
@@ -56,11 +57,6 @@ LONGEST = 24
 # disks overlap, so that no light falls between them, and are still small beside the image. (With 0.75 noise
 # is up to 1.6 times as large; with 3, as disks reach beyond what is lit, up to 6 % less is found.)
 RADIUS = 1.5
-
-# Least cosine between the normals of two points of one surface: what arrives on the other side of an edge, or
-# of a thin wall, is light of another one. (Within a disk the normals of what is round differ by less. From 0
-# to 0.99 what is found in scenes/ changes by 4 % at most.)
-SAME_SURFACE = 0.9
 
 # Share of an image's light from which on its loss is worth a word. (A caustic beneath a glass ball, seen
 # through the ball, has a thousandth.)
@@ -497,10 +493,9 @@ def _meetings(photons: _Ends, points: _Ends, max_depth: int):
         i: mi.UInt32, total: mi.UnpolarizedSpectrum, shape: mi.UInt32
     ) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum, mi.UInt32]:
         point = dr.gather(_Ends, points, i)
-        cos = dr.dot(point.n, photons.n)
-        cos = dr.select(point.through, dr.abs(cos), cos)
+        same = same_surface(point.n, photons.n) | (point.through & same_surface(-point.n, photons.n))
         r2 = dr.square(point.distance)
-        near = (dr.squared_norm(point.p - photons.p) < r2) & (cos > SAME_SURFACE)
+        near = (dr.squared_norm(point.p - photons.p) < r2) & same
         near &= point.edges + photons.edges <= longest
         shape = dr.select(near, point.through_shape, shape)
         return i + 1, total + dr.select(near, point.weight / (dr.pi * r2), 0), shape

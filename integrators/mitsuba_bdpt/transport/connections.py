@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
+from ..sampling.reservoir import offer
 from . import mis, scattering, spectra
 from .contribution import Contribution, drop_non_finite, roulette, size_of
 from .counters import MEDIA, Counters, counted_in_media, one
@@ -180,12 +181,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         c = drop_non_finite(inner(kernel, z, y))
         of_this = _as_drawn(kernel, z, y, c).weighted()
         size = size_of(of_this)
-        before, total = total, total + size
-        # What is left of the number after the decision, u / share or (u - share) / (1 - share).
-        u_total = u * total
-        take = u_total < size
-        rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
-        u = dr.select(total > 0, rest, u)
+        total, take, u = offer(total, size, u)
         value = dr.select(take, of_this, value)
         kept = None if kept is None else dr.select(take, (c.value, *c.sides[1:], size), kept)
         # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
@@ -225,11 +221,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
         y = path.sketches.read(path.si[slot].p, slot)
         reached = z.edges + path.s[slot] <= kernel.last_inner
         size = dr.select(reached, guess(kernel, at_z, y), 0)
-        before, total = total, total + size
-        u_total = u * total
-        take = u_total < size
-        rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
-        u = dr.select(total > 0, rest, u)
+        total, take, u = offer(total, size, u)
         chosen, of_chosen = dr.select(take, slot, chosen), dr.select(take, size, of_chosen)
         of_even = dr.select(slot == even, size, of_even)
         slot += 1

@@ -108,7 +108,7 @@ from .observer import Observer
 from .photons import guided_hits, merging
 from .sharing import Sharing
 from .subpaths import CameraSample
-from .walk import random_walk
+from .walk import is_sds_vertex, random_walk
 
 
 @dataclass
@@ -319,7 +319,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
         # A branch of its own: few lanes are on an isolated path.
         return dr.if_stmt(
             (z, total, *counted),
-            merging.possible(kernel, z, walk),
+            is_sds_vertex(kernel, kernel.kappa.splat, walk, z),
             merge,
             lambda z, total, lost, merges: (total, lost, merges),
             label="merges",

@@ -449,13 +449,15 @@ def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
     return dr.select(step.delta, walk.guided, h.start(other))
 
 
-def may_merge(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
-    """Mask: at ``vertex`` the path so far is isolated, the edge to it included, and its event not delta.
+def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
+    """Mask: an SDS path may have its diffuse ``vertex`` here, if the other subpath ends likewise.
 
-    ``first`` as of `newest_coefficient`; ``walk`` as it was before it arrived.
+    No edge up to the vertex is connected by a strategy in use, its event is not delta, and the path may have
+    a further edge. ``first`` as of `newest_coefficient`; ``walk`` as it was before it arrived.
     """
     joined = mis.is_joined(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
-    return vertex.hit & walk.isolated & vertex.connectible() & ~joined
+    possible = vertex.hit & vertex.connectible() & ~joined & (vertex.edges < kernel.max_depth)
+    return possible if walk.isolated is None else possible & walk.isolated
 
 
 def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:

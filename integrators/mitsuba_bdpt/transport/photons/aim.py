@@ -1,12 +1,12 @@
-"""First directions of photons' subpaths: half of them go towards what begins an isolated path.
+"""First directions of photon subpaths: half of them are aimed at shapes with delta lobes.
 
-Most isolated paths begin with delta events, and few of the subpaths that an emitter's own density chooses
-meet a small thing of glass. So half of the first directions are uniform in the cones about spheres around the
-shapes with delta lobes (in all directions from within a sphere); the density is that of the mixture, by
-whichever half a direction was made. Light from infinity is not aimed: its disks cover details by themselves
-(`emitters.disks`). From an even sky there are no photons: s = 0 finds its light well.
+Most SDS paths begin with delta events, and an emitter's own density samples few directions towards a small
+shape of glass. So half of the first directions are uniform in cones about bounding spheres of the shapes with
+delta lobes (over the whole sphere of directions from within one). The density is that of the mixture. Light
+from infinity is not aimed: the disks from which it is emitted cover details by themselves (`emitters.disks`).
+Uniform environments emit no photons: s = 0 samples their light well.
 
-Light subpaths are not aimed: of the strategies merges alone have `Aim.density` in the place of the emitter's.
+Light subpaths are not aimed: merges are the only strategy with `Aim.density` in place of the emitter's.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from ...emitters.records import Emission
 from ...geometry.boxes import box_of
 from ...host.introspection import grouped_shapes, is_instance
 
-# Spheres; one for all where they would be more.
+# Most spheres; a scene with more shapes has one around all of them.
 MOST_SPHERES = 8
 
-# Largest radiance of a sky over its mean up to which there are no photons of it.
+# Largest ratio of maximum to mean radiance of an environment that emits no photons.
 EVEN_SKY = 16
 
-# Spheres are so much larger than boxes: rounding, and a sphere's box is that of a cube.
+# Factor of the spheres' radii, for rounding.
 _MARGIN = 1.001
 
 
 @dataclass
 class Sphere:
-    """Opaque; from within it a direction may be any."""
+    """A bounding sphere; its fields are opaque."""
 
     center: mi.Point3f
     radius: mi.Float
 
     def cone(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
-        """From ``p`` the direction to the centre, and 1 - cos of the angle about it; 2 from within."""
+        """The cone from ``p``: its axis, and 1 - cos of its half angle; 2 from within the sphere."""
         between = self.center - p
         dist2 = dr.squared_norm(between)
         sin2 = dr.square(self.radius) / dist2
@@ -52,14 +52,14 @@ class Sphere:
 
 @dataclass
 class Aim:
-    """Where photons' subpaths of a scene set out to: ``spheres``; ``no_sky``: none start from its sky."""
+    """The ``spheres`` at which photons are aimed; ``no_sky``: the environment emits none."""
 
     spheres: tuple[Sphere, ...]
     no_sky: bool
 
     @staticmethod
     def of(scene: mi.Scene, emitters: Emitters) -> Aim:
-        """That of a ``scene``."""
+        """The aim of a ``scene`` and its ``emitters``."""
         boxes = [] if not emitters.connectible_nearby else _delta_boxes(scene)
         if len(boxes) > MOST_SPHERES:
             whole = mi.ScalarBoundingBox3f()
@@ -71,7 +71,10 @@ class Aim:
         return Aim(tuple(_sphere(box) for box in boxes), no_sky)
 
     def emission(self, emitters: Emitters, u_point, u_direction, shared) -> tuple[Emission, mi.Float]:
-        """Emissions of photons, whose ``pdf_second`` is the mixture's, and the emitter's own over that."""
+        """Sample emissions of photons; returns them, and the emitter's own density over the mixture's.
+
+        ``pdf_second`` of the emissions is the mixture's.
+        """
         number = None
         if self.spheres:
             aimed, u_x = _halved(u_direction.x)
@@ -87,15 +90,15 @@ class Aim:
         return replace(e, weight=e.weight * ratio, pdf_second=mixed), ratio
 
     def density(self, e: Emission, number: mi.UInt32 | None = None) -> mi.Float:
-        """Density with which photons are emitted as ``e``, in the measure of its ``pdf_second``.
+        """Density of emitting a photon as ``e``, in the measure of its ``pdf_second``.
 
-        ``number`` of the sphere for which it was sampled, in whose cone it is, whatever rounding says.
+        ``number``: the sphere for which it was sampled, whose cone contains it in spite of rounding.
         """
         mixed = dr.select(_aimable(e), self._mixed(e.si.p, e.d, e.pdf_second, number), e.pdf_second)
         return dr.select(e.infinite & ~e.delta, 0, mixed) if self.no_sky else mixed
 
     def density_at(self, hit: mi.Bool, p, d, pdf_second: mi.Float) -> mi.Float:
-        """The same of a point that camera subpaths have ``hit``, else of the surroundings; ``d`` from it."""
+        """`density` at ``p``, a point that a camera subpath ``hit``, else the environment; ``d`` from it."""
         return dr.select(hit, self._mixed(p, d, pdf_second), mi.Float(0) if self.no_sky else pdf_second)
 
     def _mixed(self, p, d, pdf_second, number=None):
@@ -112,7 +115,7 @@ class Aim:
         return (pdf_second + aimed / len(self.spheres)) / 2
 
     def _sample(self, p, u: mi.Point2f) -> tuple[mi.UInt32, mi.Vector3f]:
-        """A direction into one of the cones from ``p``, and the number of its sphere."""
+        """Sample a direction in one of the cones from ``p``; returns the index of the sphere and it."""
         scaled = u.x * len(self.spheres)
         number = dr.minimum(mi.UInt32(scaled), len(self.spheres) - 1)
         axis, width = self.spheres[0].cone(p)
@@ -127,7 +130,7 @@ class Aim:
 
 
 def _halved(u: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Whether ``u`` is in the upper half of [0, 1), and its place there."""
+    """Whether ``u`` is in the upper half of [0, 1), and ``u`` rescaled to [0, 1) within its half."""
     upper = u >= 0.5
     return upper, dr.minimum(2 * u - dr.select(upper, 1, 0), 1 - 2**-24)
 
@@ -137,7 +140,7 @@ def _aimable(e: Emission) -> mi.Bool:
 
 
 def _towards(emitters: Emitters, e: Emission, d, active: mi.Bool) -> Emission:
-    """``e``, where ``active`` into the direction ``d`` instead of its own."""
+    """``e``, with the direction ``d`` in place of its own where ``active``."""
     to = replace(e, d=d, cos=dr.select(e.delta, 1, dr.abs(dr.dot(e.anchor.n, d))))
     pdf_second = emitters.direction_density(to, e.si.p + d, d, active)
     radiance = emitters.radiance_towards(e, d, active)
@@ -161,7 +164,7 @@ def _sphere(box) -> Sphere:
 
 
 def _delta_boxes(scene: mi.Scene) -> list:
-    """The boxes of shapes with delta lobes; of all instances if one of the shapes in groups has some."""
+    """Bounding boxes of shapes with delta lobes; of all instances if a shape in any group has some."""
     grouped = any(_is_delta(shape) for shape in grouped_shapes(scene))
     found = (box_of(s) for s in scene.shapes() if (grouped if is_instance(s) else _is_delta(s)))
     return [box for box in found if box is not None]

@@ -1,14 +1,14 @@
-"""Guided s = 0: one more way to make isolated paths, which aims at light that glass focuses.
+"""Photon-guided BSDF sampling: one more way to make SDS paths by hitting an emitter (s = 0).
 
-An isolated path (see `merging`) from an emitter with area is made by s = 0 and t = 0 alone, and by s = 0
-only if a sampled direction happens to lead to the emitter by delta events. At the last vertex z whose event
-is not delta the direction is drawn a second time, from the density p_g of a `photon_guide.Guide`, and
-followed through delta events only. All densities but those of the direction cancel::
+An SDS path from an emitter with area is made by s = 0 and t = 0 alone, and by s = 0 only if a sampled
+direction happens to lead to the emitter by delta events. At the path's diffuse vertex z, the last whose event
+is not delta, a second direction is sampled from the density p_g of a `photon_guide.Guide`, and followed
+through delta events only. All densities but those of the direction cancel::
 
     guided s = 0 over s = 0 = p_g / p_bsdf
 
-Both have a weight, which holds that ratio, and so does t = 0, which asks for p_g at the same vertex (its
-first that is not delta).
+Both have a weight, which contains that ratio, and so does t = 0, which evaluates p_g at the same vertex: the
+first of the light subpath that is not delta.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from ...sampling.points import Purpose, Stream
 from .. import bsdf, mis, spectra, techniques
 from ..counters import one
 from ..inputs import Kernel
-from ..walk import Side, Vertex, Walk, may_merge, newest_coefficient, not_finite, random_walk
+from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
 from . import photon_guide
 
-# Tells the numbers of guided subpaths from those of the camera subpath that they branch off.
+# Seed by which random numbers of guided subpaths differ from those of the camera subpath they branch off.
 _SEED = 0x5BD1E995
 
 
 @dataclass
 class Advice:
-    """What a guide says at a vertex: where s = 0 can be guided (``active``), and the place of its photons.
+    """The guide at a vertex: ``active`` where s = 0 can be guided, ``found`` the index of its photons.
 
-    ``other``: the density (solid angle, times the number of guided samples) with which it makes the walk's
-    own direction.
+    ``other``: the guide's density of the walk's own direction (solid angle, times the number of guided
+    samples).
     """
 
     active: mi.Bool
@@ -50,32 +50,27 @@ def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
     return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED), {})
 
 
-def _possible(kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
-    """Mask: s = 0 can be guided at the camera vertex ``z``; ``walk`` as it was before it arrived."""
-    return may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
-
-
 def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """What the guide says at the camera vertex ``z``; ``walk`` as it was before it arrived."""
-    return _asked(kernel, z, z.si.to_world(step.wo), _possible(kernel, z, walk))
+    """The guide at the camera vertex ``z``; ``walk`` as it was before it arrived."""
+    return _evaluated(kernel, z, z.si.to_world(step.wo), is_sds_vertex(kernel, kernel.kappa.splat, walk, z))
 
 
 def look_back(kernel: Kernel, y: Vertex, walk: Walk, step) -> Advice:
-    """What the guide says at the light vertex ``y``; ``other``: of the direction the light came from.
+    """The guide at the light vertex ``y``; ``other``: of the direction the light came from.
 
-    ``step`` is not used; `Side.guide` gets it.
+    ``step`` is not used: `Side.guide` passes it.
     """
-    joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
-    return _asked(kernel, y, -walk.d, y.hit & walk.only_delta & y.connectible() & ~joined)
+    possible = walk.only_delta & is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
+    return _evaluated(kernel, y, -walk.d, possible)
 
 
 def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """As `advise`, of a guide that makes the walk's own direction as often, wherever s = 0 can be guided."""
-    possible = _possible(kernel, z, walk)
+    """Like `advise`, of a guide whose density of the walk's own direction is that of the BSDF."""
+    possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
     return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
 
 
-def _asked(kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
+def _evaluated(kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
     def look(p, d):
         found = photon_guide.find(kernel.guide, p)
         return Advice(mi.Bool(True), found, _density(kernel, p, found, d))
@@ -91,10 +86,10 @@ def _density(kernel: Kernel, p, found, d) -> mi.Float:
 
 
 def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
-    """Follow directions of the guide at ``z``, where there is one; returns the ``state`` after that.
+    """Trace guided subpaths from ``z`` where the guide is active; returns the ``state`` after that.
 
-    ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and counts of what was not
-    finite, of `Counters.aimed` and `Counters.guided`.
+    ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and the counts of non-finite
+    values, `Counters.aimed` and `Counters.guided`.
     """
     return dr.if_stmt(
         (z, *state),
@@ -133,7 +128,7 @@ def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
     side = Side(
         "camera",
         shared,
-        spectra.brightest(walk.throughput),  # what delta events leave of it plays roulette
+        spectra.brightest(walk.throughput),  # roulette compares the throughput with it
         False,
         kernel.max_depth,
         kernel.kappa.splat,
@@ -146,7 +141,7 @@ def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
 
 
 def _begun(kernel: Kernel, z: Vertex, numbers: Stream, shared) -> Walk:
-    """A subpath that leaves ``z`` in a direction that the guide makes."""
+    """A subpath that leaves ``z`` in a direction sampled from the guide."""
     h, p, points = kernel.heuristic, z.si.p, kernel.points
     u1 = points.draw_1d("camera", numbers, Purpose.LOBE, z.event)
     u2 = points.draw_2d("camera", numbers, Purpose.BSDF, z.event)

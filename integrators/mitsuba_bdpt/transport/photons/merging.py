@@ -1,20 +1,20 @@
-"""Merging the vertices of isolated paths: photons near a camera vertex stand for paths through it.
+"""Vertex merging (photon mapping) of SDS paths: photons near a camera vertex represent paths through it.
 
-Source: Georgiev 2012, see `mis`; of its vertex merging what no connection can do. An edge is *joined* if a
-strategy in use makes paths by connecting its ends: neither is a delta event, and their class has a
-coefficient (the edge to a point of an emitter by next-event estimation, to the sensor by t = 1, others by
-inner connections). A path is *isolated* if no edge of it is joined: lamp, glass, wall, glass, camera. Only
-s = 0 and t = 0 make those, and merging: the light side and the camera side of the path are traced, each up to
-the same vertex, whose event is not delta, and a photon that is near enough counts as if it were there.
+Source: Georgiev 2012, see `mis`; here restricted to paths that no connection can make. An edge is *joined* if
+a strategy in use makes paths by connecting its ends: neither end is a delta event, and the strategy's class
+has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to the sensor, inner
+connections for the others). An *SDS path* (specular-diffuse-specular) has no joined edge: lamp, glass, wall,
+glass, camera. Only s = 0, t = 0 and merging make it: the light subpath and the camera subpath are traced up
+to the same diffuse vertex, and a photon within a radius of the camera vertex counts as if it were there.
 
-With n photons' subpaths, discs of radius r(x) about camera vertices, area measure, p-> from the light's side
-and p<- from the camera's::
+With n photon subpaths, discs of radius r(x) about camera vertices, area measure, p-> densities of the light
+subpath and p<- of the camera subpath::
 
     n p_m = eta prod_{i<=m} p->_i prod_{m<=i<k} p<-_i,    eta = n pi r(x_m)^2
 
 and kappa n p_m in the weights.
 
-The estimate is consistent, not unbiased: what lies within r is taken for what lies at the vertex.
+The estimate is consistent, not unbiased: photons within r are taken to lie at the vertex.
 """
 
 from __future__ import annotations
@@ -28,33 +28,32 @@ import mitsuba as mi
 
 from ...sampling import sobol
 from ...sampling.points import Purpose, Stream, sequential
+from ...sampling.reservoir import offer
 from .. import bsdf, mis, spectra
 from ..contribution import Contribution, size_of
 from ..inputs import Kernel
-from ..walk import Vertex, Walk, may_merge
+from ..walk import Vertex
 from .aim import Aim
-from .columns import Columns
 from .merge_radius import Radius
+from .photon import Photon, same_surface
 from .wavelength_sets import SET_BITS, WavelengthSets
 
-# Bits of a bucket's number in the hash table, and of each coordinate of a cell.
+# Bits of a bucket's index in the hash table, and of each coordinate of a cell.
 BUCKET_BITS = 18
 _CELL_BITS = 20
 
-# Cosine between geometric normals, and distance from the tangent plane over the radius, up to which a photon
-# is taken to lie on the surface of the camera vertex.
-_SAME_SIDE, _FLAT = 0.8, 0.25
+# Distance of a photon from the tangent plane of the camera vertex, over the radius, up to which it is merged.
+_FLAT = 0.25
 
 
 @dataclass
 class Merging:
-    """What a pass knows of merging.
+    """Merging in one pass.
 
-    ``radius``, ``count`` of photons' subpaths that a camera subpath can meet, `Photons` (None while they are
-    traced), and ``kappa``, with which merges enter all weights: all camera vertices in one disc meet the same
-    photons, so that many merges are worth as much as one, see `coefficient`. Numbers are opaque ``Float``.
-    ``aim`` of the photons, an `Aim`; in spectral variants ``wavelengths``, a `WavelengthSets`: subpaths meet
-    those of the same set.
+    ``radius`` of the discs; ``count``: number of photon subpaths that can be merged with a camera subpath;
+    ``kappa``: coefficient of merges in all weights, see `coefficient`; ``aim`` of the photons, an `Aim`;
+    ``photons``: `Photons`, None while they are traced; ``wavelengths``: a `WavelengthSets` in spectral
+    variants, where photons merge with camera subpaths of the same set. Numbers are opaque ``Float``.
     """
 
     radius: Radius
@@ -74,36 +73,12 @@ class Merging:
 
 
 def coefficient(samples: float, radius: float) -> float:
-    """kappa of merges in discs of this ``radius`` in pixels, if so many ``samples`` per pixel share photons.
+    """kappa of merges in discs of ``radius`` pixels, where ``samples`` samples per pixel share photons.
 
-    One over the number of camera vertices that share the photons of a disc. Without it merges under a sky,
-    where s = 0 is good, took nearly all of the weight: 183 times the variance at 256 samples per pixel.
+    One over the number of camera vertices that share the photons of a disc: their merges are correlated, and
+    weights by densities alone would count them as independent.
     """
     return min(1.0, 1 / (samples * math.pi * radius**2))
-
-
-@dataclass
-class Photon(Columns):
-    """A light vertex that may be merged.
-
-    ``p`` position, ``d`` unit direction towards the light's side, ``n`` geometric normal, ``flux`` the
-    throughput (over the number of subpaths it is the light's), ``older`` the partial sums of all alternatives
-    of fewer light vertices, in the area measure; ``aim`` the emitter's own density of the first direction
-    over that of `Aim`; ``edges`` up to it; ``lane`` of its subpath.
-    """
-
-    p: mi.Point3f
-    d: mi.Vector3f
-    n: mi.Normal3f
-    flux: mi.Spectrum
-    older: mi.Float
-    aim: mi.Float
-    edges: mi.UInt32
-    lane: mi.UInt32
-
-    @staticmethod
-    def types():
-        return mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum, mi.Float, mi.Float, mi.UInt32, mi.UInt32
 
 
 @dataclass
@@ -149,11 +124,6 @@ def bucket_of(cell: mi.UInt64) -> mi.UInt32:
     """The bucket of a cell in the hash table."""
     word = sobol.mix(mi.UInt32(cell) ^ sobol.mix(mi.UInt32(cell >> 32)))
     return word >> (32 - BUCKET_BITS)
-
-
-def possible(kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
-    """Mask: photons may be merged at the camera vertex ``z``; ``walk`` as it was before it arrived."""
-    return may_merge(kernel, kernel.kappa.splat, walk, z) & (z.edges < kernel.max_depth)
 
 
 def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
@@ -209,9 +179,9 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
         near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # others share its bucket
         near &= _is_near(photon, z, r) & (photon.edges <= most)
         size = dr.select(near, size_of(photon.flux), 0)
-        total += size
         u, after = sequential(word)
-        take = tried & (u * total < size)
+        total, take, _ = offer(total, size, u)
+        take &= tried
         word = dr.select(tried, after, word)
         chosen = dr.select(take, place, chosen)
         place += dr.select(tried, mi.UInt32(1), 0)
@@ -223,4 +193,4 @@ def _is_near(photon: Photon, z: Vertex, r: mi.Float) -> mi.Bool:
     off = photon.p - z.si.p
     within = dr.squared_norm(off) < dr.square(r)
     flat = dr.abs(dr.dot(off, z.si.n)) < _FLAT * r
-    return within & flat & (dr.dot(photon.n, z.si.n) > _SAME_SIDE)
+    return within & flat & same_surface(photon.n, z.si.n)

@@ -1,11 +1,11 @@
-"""Photons as a guide of directions: from where light that glass focuses arrives at a point.
+"""The density of directions that photons define at a point, for photon-guided BSDF sampling.
 
 Source of the idea: H. W. Jensen, "Importance Driven Path Tracing Using the Photon Map", 1995. The photons are
-the vertices of light subpaths on the first surface that is not delta. Sorted along a space-filling curve
-(Morton's, "Z-order"), those next to a point's place on it are near it, however few there are: a window of
-them, dense around that place and sparse farther off, is a mixture of lobes about the photons' directions. The
-density is a function of the point and of photons that do not depend on the samples that use it, so that
-whatever it is nothing is biased.
+the first vertices of light subpaths that are not delta, sorted along a Morton (Z-order) curve. A query takes
+a window of photons about the point's place on the curve, dense next to it and sparse farther off: some are
+near the point however few photons there are. Each photon of the window has a lobe about its direction; the
+density is the mean of the lobes. Photons are independent of the samples that use the density, so that guiding
+is unbiased for any density.
 """
 
 from __future__ import annotations
@@ -16,59 +16,36 @@ from itertools import pairwise
 import drjit as dr
 import mitsuba as mi
 
-from .columns import Columns
+from .photon import Photon
 
-# Places of the photons of a window, from that of the point on.
+# Offsets of the photons of a window from the point's place among them.
 _NEAR = 4
 _FAR = (6, 12, 25, 60)
 WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
 
-# How many places each stands for.
+# Number of places that each photon of a window represents.
 _BETWEEN = [b - a for a, b in pairwise(WINDOW)]
 STANDS_FOR = tuple((a + b) / 2 for a, b in pairwise([_BETWEEN[0], *_BETWEEN, _BETWEEN[-1]]))
 
-# Bits of each coordinate of a place on the curve, and of the number of a subpath: 64 together.
+# Bits of each coordinate of a place on the curve, and of the index of a subpath: 64 together.
 _BITS, _LANE_BITS = 15, 19
 
-# Width of a lobe (tangent of half its directions' angle) over the photon's slope times its distance from the
-# point; the least one, and the largest, beyond which a photon says nothing.
+# Width of a lobe (tangent of the half angle that contains half of its directions) over the photon's slope
+# times its distance from the point; least width; width from which on a photon has no lobe.
 _WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
 
 
 @dataclass
-class GuidePhoton(Columns):
-    """A photon: ``p`` position, ``d`` unit direction towards the light's side.
-
-    ``slope``: by how much directions change over a distance; one over the length of its last edge, until a
-    `Guide` knows better.
-    For `guiding_benefit` also ``n`` geometric normal, ``flux`` the throughput of its subpath, ``hit`` the
-    partial sum of s = 0, in the area measure, and ``edges`` of its path. ``lane`` of its subpath, which has
-    no other photon.
-    """
-
-    p: mi.Point3f
-    d: mi.Vector3f
-    slope: mi.Float
-    n: mi.Normal3f
-    flux: mi.Spectrum
-    hit: mi.Float
-    edges: mi.UInt32
-    lane: mi.UInt32
-
-    @staticmethod
-    def types():
-        return mi.Point3f, mi.Vector3f, mi.Float, mi.Normal3f, mi.Spectrum, mi.Float, mi.UInt32, mi.UInt32
-
-
-@dataclass
 class Guide:
-    """``photons`` in the order of their ``place`` on the curve, so many as ``count``; and its box.
+    """``photons`` in the order of their ``place`` on the curve, ``count`` of them; and its box.
 
+    ``slope`` of each: by how much directions change over a distance (1 / scene unit), see `_slopes`.
     ``low`` corner of the box, ``scale`` places over length; ``offsets`` see `WINDOW`, ``stands_for`` see
     `STANDS_FOR`.
     """
 
-    photons: GuidePhoton
+    photons: Photon
+    slope: mi.Float
     place: mi.UInt64
     count: mi.UInt32
     low: mi.Point3f
@@ -77,8 +54,8 @@ class Guide:
     stands_for: mi.Float
 
     @staticmethod
-    def of(photons: GuidePhoton, count: int) -> Guide:
-        """The guide of the first ``count`` of these ``photons``, one at least."""
+    def of(photons: Photon, count: int) -> Guide:
+        """The guide of the first ``count`` of the ``photons``, at least one."""
         index = dr.arange(mi.UInt32, count)
         found = photons.at(index)
         low = mi.Point3f(*(dr.min(x) for x in found.p))
@@ -89,6 +66,7 @@ class Guide:
         order = dr.argsort((place << _LANE_BITS) | mi.UInt64(found.lane))
         guide = Guide(
             found.at(order),
+            mi.Float(0),
             dr.gather(mi.UInt64, place, order),
             dr.opaque(mi.UInt32, count),
             low,
@@ -96,31 +74,31 @@ class Guide:
             mi.Int32(WINDOW),
             mi.Float(STANDS_FOR),
         )
-        guide.photons.slope = _slopes(guide)
+        guide.slope = _slopes(guide)
         dr.make_opaque(guide)
         return guide
 
 
 @dr.syntax
 def _slopes(guide: Guide) -> mi.Float:
-    """The slope of each photon: of the least to others in its window the third; where fewer, what it has.
+    """The slope of each photon: the third least to others in its window; of fewer 1 / the last edge's length.
 
-    Where light is focused from several sides the others are of several kinds, of which the nearest in
-    direction are of its own.
+    The third least, since light may be focused from several sides: the photons nearest in direction come from
+    the same one.
     """
     index = dr.arange(mi.UInt32, dr.width(guide.place))
     own = guide.photons.at(index)
     first, second, third = mi.Float(dr.inf), mi.Float(dr.inf), mi.Float(dr.inf)
     k = mi.UInt32(0)
     while dr.hint(k < len(WINDOW), label="slopes of photons", exclude=[guide, index, own]):
-        other = photon(guide, index, k, True)
+        other = photon(guide, index, k)
         distance = dr.norm(other.p - own.p)
         slope = dr.select(distance > 0, dr.norm(other.d - own.d) / distance, dr.inf)
         first, slope = dr.minimum(first, slope), dr.maximum(first, slope)
         second, slope = dr.minimum(second, slope), dr.maximum(second, slope)
         third = dr.minimum(third, slope)
         k += 1
-    return dr.select(dr.isfinite(third), third, own.slope)
+    return dr.select(dr.isfinite(third), third, dr.rcp(own.distance))
 
 
 def _place(p: mi.Point3f, low: mi.Point3f, scale: mi.Float) -> mi.UInt64:
@@ -145,58 +123,61 @@ def _spread(x: mi.UInt64) -> mi.UInt64:
     return x
 
 
-@dr.syntax
 def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
-    """The number of the first photon at or behind the place of ``p``."""
+    """The index of the first photon at or behind the place of ``p``."""
     place = _place(p, guide.low, guide.scale)
-    low, high = mi.UInt32(0), mi.UInt32(guide.count)
-    while dr.hint(low < high, label="place among photons", exclude=[guide, place]):
-        middle = (low + high) >> 1
-        before = dr.gather(mi.UInt64, guide.place, middle) < place
-        low = dr.select(before, middle + 1, low)
-        high = dr.select(before, high, middle)
-    return low
+
+    def is_before(index):
+        index = mi.UInt32(index)  # at first an int
+        exists = index < guide.count  # the bound of the search is fixed, so that all guides are one kernel
+        return exists & (dr.gather(mi.UInt64, guide.place, index, exists) < place)
+
+    return mi.UInt32(dr.binary_search(0, 1 << _LANE_BITS, is_before))
 
 
-def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> GuidePhoton:
-    """The ``k``-th photon of the window about the number ``found``."""
-    number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
-    number = dr.clip(number, 0, mi.Int32(guide.count) - 1)
-    return guide.photons.at(mi.UInt32(number), active)
+def number(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> mi.UInt32:
+    """The index of the ``k``-th photon of the window about the index ``found``."""
+    index = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
+    return mi.UInt32(dr.clip(index, 0, mi.Int32(guide.count) - 1))
+
+
+def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
+    """The ``k``-th photon of the window about the index ``found``."""
+    return guide.photons.at(number(guide, found, k, active), active)
 
 
 def exists(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.Bool:
-    """Mask: the window has a photon of this number; beyond the first and last of all it repeats them."""
+    """Mask: the window has a ``k``-th photon; beyond the first and last of all it repeats them."""
     number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k)
     return (number >= 0) & (number < mi.Int32(guide.count))
 
 
-def _width(photon: GuidePhoton, p: mi.Point3f) -> mi.Float:
-    """The width of its lobe at ``p``, 0 if it has none."""
-    width = _WIDTH * dr.norm(photon.p - p) * photon.slope
-    return dr.select(width < _MOST, dr.maximum(width, _LEAST), 0)
+def _lobe(guide: Guide, p: mi.Point3f, found: mi.UInt32, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
+    """The lobe at ``p`` of the ``k``-th photon of the window: its axis, and width^2 / 2, 0 if it has none."""
+    index = number(guide, found, k, True)
+    photon = guide.photons.at(index)
+    width = _WIDTH * dr.norm(photon.p - p) * dr.gather(mi.Float, guide.slope, index)
+    return photon.d, dr.square(dr.select(width < _MOST, dr.maximum(width, _LEAST), 0)) / 2
 
 
 def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Point2f):
-    """A unit direction of the density at ``p``, and a mask: whether there is one."""
+    """Sample a unit direction at ``p``; returns it and a mask: whether the photon drawn has a lobe."""
     k = dr.minimum(mi.UInt32(u1 * len(WINDOW)), len(WINDOW) - 1)
-    chosen = photon(guide, found, k, True)
-    a = dr.square(_width(chosen, p)) / 2
+    axis, a = _lobe(guide, p, found, k)
     m = dr.minimum(2 * u2.x * a / (a + 2 * (1 - u2.x)), 2)  # 1 - cos of the angle
     sin, cos = dr.sincos(2 * dr.pi * u2.y)
     across = dr.sqrt(dr.maximum(m * (2 - m), 0))
     local = mi.Vector3f(across * cos, across * sin, 1 - m)
-    return mi.Frame3f(chosen.d).to_world(local), a > 0
+    return mi.Frame3f(axis).to_world(local), a > 0
 
 
 @dr.syntax
 def density(guide: Guide, p: mi.Point3f, found: mi.UInt32, d: mi.Vector3f) -> mi.Float:
-    """The density (solid angle) with which `draw` makes the unit direction ``d`` at ``p``."""
+    """The density (solid angle) of sampling the unit direction ``d`` at ``p`` by `draw`."""
     k, total = mi.UInt32(0), mi.Float(0)
     while dr.hint(k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, d]):
-        near = photon(guide, found, k, True)
-        a = dr.square(_width(near, p)) / 2
-        m = dr.squared_norm(d - near.d) / 2
+        axis, a = _lobe(guide, p, found, k)
+        m = dr.squared_norm(d - axis) / 2
         total += a * (a + 2) / dr.square(dr.select(a > 0, a + m, 1))
         k += 1
     return total / (4 * dr.pi * len(WINDOW))

@@ -1,108 +1,90 @@
-"""Tracing the photons of a pass: light subpaths as far as their paths are isolated, kept in memory."""
+"""The photon pass: traces light subpaths along SDS paths and stores their vertices as photons."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ...sampling.points import Points, Purpose
-from .. import mis, spectra, subpaths
+from .. import spectra, subpaths
 from ..counters import Counters, one
 from ..inputs import Kernel
 from ..observer import Observer
-from ..walk import may_merge, newest_coefficient, random_walk
+from ..walk import is_sds_vertex, random_walk
 from .aim import Aim
-from .merging import BUCKET_BITS, Merging, Photon, Photons, bucket_of, cell_at, level_of
-from .photon_guide import Guide, GuidePhoton
+from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, level_of
+from .photon import Photon
+from .photon_guide import Guide
 
-# Photons that memory is taken for at first, over the number of subpaths: few subpaths have more.
+# Photons per subpath for which memory is allocated at first.
 _CAPACITY = 0.5
 
-# Photons' subpaths of a render's guide, and of a pass with merging: one for so many of its samples, within
-# these limits. Twice as many make merges hardly less noisy (the noise is that of the camera's subpaths), and
-# in `pool_floor` take half as much time again.
+# Camera samples per photon subpath, of a render's guide and of a pass with merging; bounds of the number of
+# photon subpaths.
 SAMPLES_PER_PHOTON, SAMPLES_PER_MERGED = 4, 8
 FEWEST_PHOTONS, MOST_PHOTONS = 1 << 12, 1 << 18
 
-# So many of a pass at most for each disc of its radius that the film has room for: merges of more are slow.
+# Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Bits of a path's edges, and of the number of its subpath, in the key by which photons are sorted.
+# Bits of the edges and of the subpath's index in the key by which photons are sorted.
 _EDGES_BITS, _LANE_BITS = 12, 32
 
 
 def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
-    """Photons' subpaths of so many ``samples``, one for ``each`` so many."""
+    """Number of photon subpaths for ``samples`` camera samples, one per ``each``."""
     return min(max(samples // each, FEWEST_PHOTONS), MOST_PHOTONS)
 
 
 def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
-    """The same of a pass with merging on so many ``pixels``, in discs of this ``radius`` (pixels)."""
+    """Number of photon subpaths of a pass with merging of ``pixels`` pixels, for a ``radius`` in pixels."""
     most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
     return min(photons_of(samples, SAMPLES_PER_MERGED), most)
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
-    """``merging`` with the photons of ``count`` light subpaths, which these ``points`` make.
+    """Trace ``count`` photon subpaths from ``points``; returns ``merging`` with their photons.
 
-    Also `Counters.summed`. Traced again if they are more than there was memory for: none is dropped.
+    Also `Counters.summed`.
     """
-    kernel = _kernel(kernel, points)
-    kernel.merging = merging
-
-    def photon(y, walk, lanes, aimed):
-        keep = may_merge(kernel, kernel.kappa.direct, walk, y) & (y.edges < kernel.max_depth)
-        older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
-        return keep, Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, y.edges, lanes)
-
-    photons, found, counters = _all(kernel, merging.aim, count, Photon, photon)
+    photons, found, counters = _all(_kernel(kernel, points, merging), merging.aim, count)
     return replace(merging, photons=_sorted(merging, photons, found)), counters
 
 
 def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
-    """The guide that ``count`` light subpaths make, which set out as ``aim`` says; `Counters.summed`.
+    """Trace ``count`` photon subpaths from ``points``; returns the guide of their photons.
 
-    None if they give no photon. Photons are those that s = 0 might find, at the first vertex that is not
-    delta.
+    None if there is no photon. Also `Counters.summed`. First directions are sampled by ``aim``.
     """
-    kernel = _kernel(kernel, points)
-    kernel.guide = None
-
-    def photon(y, walk, lanes, aimed):
-        joined = mis.is_joined(y.partial, newest_coefficient(kernel, kernel.kappa.direct, y.edges))
-        keep = y.hit & y.connectible() & ~joined & (y.edges < kernel.max_depth)
-        keep &= y.partial.d_vc > 0
-        slope = dr.rcp(dr.norm(y.si.p - y.previous))
-        return keep, GuidePhoton(y.si.p, -walk.d, slope, y.si.n, y.throughput, y.partial.d_vc, y.edges, lanes)
-
-    photons, found, counters = _all(kernel, aim, count, GuidePhoton, photon)
+    photons, found, counters = _all(_kernel(kernel, points, None), aim, count)
     return Guide.of(photons, found) if found else None, counters
 
 
-def _kernel(kernel: Kernel, points: Points) -> Kernel:
+def _kernel(kernel: Kernel, points: Points, merging: Merging | None) -> Kernel:
     kernel = kernel.bound(points, 1.0, Observer())
+    kernel.merging, kernel.guide = merging, None
     kernel.last_light = kernel.max_depth
     return kernel
 
 
-def _all(kernel: Kernel, aim: Aim, count: int, kind, photon) -> tuple[Any, int, mi.UInt64]:
-    """As `_traced`; none is left out."""
+def _all(kernel: Kernel, aim: Aim, count: int) -> tuple[Photon, int, mi.UInt64]:
+    """Trace as `_traced`, again with more memory if the photons exceed it: none is dropped."""
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        photons, found, counters = _traced(kernel, aim, count, kind.zeros(capacity), photon)
+        photons, found, counters = _traced(kernel, aim, count, Photon.zeros(capacity))
         if found <= capacity:
             return photons, found, counters
         capacity = found
 
 
-def _traced(kernel: Kernel, aim: Aim, count: int, out, photon) -> tuple[Any, int, mi.UInt64]:
-    """Photons in the order of their arrival, how many there are, maybe more than fit into ``out``; counts.
+def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, int, mi.UInt64]:
+    """Store photons in ``out``; returns it, their number, which may exceed its size, and counts.
 
-    ``photon(y, walk, lanes, aimed)`` says whether there is one at a vertex, and which.
+    With merging all diffuse vertices of SDS paths; for a guide the first vertex of a subpath that is not
+    delta, if s = 0 can make the path through it.
     """
     capacity = dr.width(out)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
@@ -121,10 +103,14 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out, photon) -> tuple[Any, int
     side = replace(side, join=None, isolated=merges, only_delta=not merges)
 
     def visit(y, counters, walk):
-        keep, found = photon(y, walk, lanes, aimed)
-        keep &= spectra.is_finite(
-            y.throughput
-        )  # else all that are drawn with it would be NaN; the walk counts it
+        older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
+        keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
+        # Otherwise estimates of all vertices near it would be NaN; the walk counts it.
+        keep &= spectra.is_finite(y.throughput)
+        if not merges:
+            keep &= older > 0
+        distance = dr.norm(y.si.p - y.previous)
+        found = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes)
         place = dr.scatter_inc(kept, mi.UInt32(0), keep)
         dr.scatter(out, found, place, keep & (place < most))
         return counters + Counters(photons=one(keep))
@@ -138,7 +124,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out, photon) -> tuple[Any, int
 
 
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
-    """The first ``count`` by bucket, subpath and edge, an order that does not depend on threads."""
+    """Sort the first ``count`` photons by bucket, subpath and edge: an order that no thread changes."""
     index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
     found = photons.at(index)
     radius = merging.radius

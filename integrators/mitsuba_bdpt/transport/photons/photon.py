@@ -1,0 +1,60 @@
+"""The record of a photon, and whether a photon lies on the surface of another vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+# Least cosine between the geometric normals of two points of one surface: light on the other side of an edge
+# or of a thin wall belongs to another one.
+SAME_SURFACE = 0.8
+
+
+@dataclass
+class Photon:
+    """A light vertex that is kept in memory, or arrays of many.
+
+    ``p`` position, ``d`` unit direction towards the light's side, ``n`` geometric normal; ``flux``:
+    throughput of its subpath, not divided by the number of subpaths; ``older``: the partial sum of all
+    alternatives with fewer light vertices (area measure); ``aim``: the emitter's own density of the first
+    direction over that of `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index
+    of its subpath.
+    """
+
+    p: mi.Point3f
+    d: mi.Vector3f
+    n: mi.Normal3f
+    flux: mi.Spectrum
+    older: mi.Float
+    aim: mi.Float
+    distance: mi.Float
+    edges: mi.UInt32
+    lane: mi.UInt32
+
+    @staticmethod
+    def types() -> tuple[Any, ...]:
+        """The types of the fields in the present variant, in their order.
+
+        Dr.Jit takes the types of a record's fields for those of the first variant that asked.
+        """
+        return (
+            *(mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum),
+            *(mi.Float, mi.Float, mi.Float, mi.UInt32, mi.UInt32),
+        )
+
+    @staticmethod
+    def zeros(count: int) -> Photon:
+        """Memory for ``count`` photons."""
+        return Photon(*(dr.zeros(kind, count) for kind in Photon.types()))
+
+    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
+        """The photons of these indices."""
+        return Photon(*(dr.gather(type(field), field, index, active) for field in vars(self).values()))
+
+
+def same_surface(a: mi.Normal3f, b: mi.Normal3f) -> mi.Bool:
+    """Mask: points with the geometric normals ``a`` and ``b`` are taken to lie on one surface."""
+    return dr.dot(a, b) > SAME_SURFACE
