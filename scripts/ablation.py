@@ -41,7 +41,7 @@ from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.run import schedule
 from mitsuba_bdpt.transport import inputs
-from mitsuba_bdpt.transport.counters import COUNTERS, Counters
+from mitsuba_bdpt.transport.contribution import COUNTERS, Counters
 
 SCENES = ("cornell_box", "open_sky", "veach_mis", "glass_caustics")
 

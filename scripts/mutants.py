@@ -365,14 +365,14 @@ MUTANTS = (
     ),
     Mutant(
         "sharing: rows are not dealt",
-        "transport/sharing.py",
+        "transport/batch.py",
         "row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))",
         "row = seat.row",
         ("tests/transport/test_sharing.py::test_every_sample_is_served_once[2]",),
     ),
     Mutant(
         "sharing: the inverse of another map",
-        "transport/sharing.py",
+        "transport/batch.py",
         "row = _turned_back(row, self._rows, sobol.mix(column ^ keys[0]))",
         "row = _turned_back(row, self._rows, sobol.mix(column ^ keys[1]))",
         ("tests/transport/test_sharing.py::test_every_sample_is_served_once[2]",),
@@ -687,7 +687,7 @@ MUTANTS = (
     ),
     Mutant(
         "media: thinned vertices stand for themselves only",
-        "transport/stored_vertices.py",
+        "transport/light_path.py",
         "y.throughput_over_cos / probability",
         "y.throughput_over_cos",
         ("tests/images/test_media.py::test_thinned_light_subpaths",),

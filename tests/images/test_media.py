@@ -31,7 +31,7 @@ import welch as st
 from mitsuba_bdpt.image.layers import strategies
 from mitsuba_bdpt.media.media import interaction
 from mitsuba_bdpt.planning import planner
-from mitsuba_bdpt.transport import inputs, stored_vertices
+from mitsuba_bdpt.transport import inputs, light_path
 from scipy import stats
 
 DEPTH = 4
@@ -249,7 +249,7 @@ def test_thinned_light_subpaths(monkeypatch):
     """
     original = planner.plan
     monkeypatch.setattr(planner, "plan", lambda *args: replace(original(*args), **PAIRS["inner"]))
-    for module in (inputs, stored_vertices):
+    for module in (inputs, light_path):
         monkeypatch.setattr(module, "KEPT", 2)
     ours = layers(parts.tile_means(load("fog"), bdpt(strategy_images=True), 64, 12000, SEEDS))
     family = [st.compare_images(weighted_sum(ours, k), path_lengths("fog")[k], f"k={k}") for k in (3, 4)]

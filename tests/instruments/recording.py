@@ -25,9 +25,8 @@ from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import connections, kernel
 from mitsuba_bdpt.transport.batch import Batch
-from mitsuba_bdpt.transport.counters import Counters
-from mitsuba_bdpt.transport.inputs import Kernel
-from mitsuba_bdpt.transport.observer import Observer
+from mitsuba_bdpt.transport.contribution import Counters
+from mitsuba_bdpt.transport.inputs import Kernel, Observer
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8

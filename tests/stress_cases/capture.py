@@ -24,9 +24,9 @@ import mitsuba as mi  # isort: skip
 
 from mitsuba_bdpt.host.jit import float64
 from mitsuba_bdpt.transport import connections
-from mitsuba_bdpt.transport.counters import Counters
-from mitsuba_bdpt.transport.observer import Observer
-from mitsuba_bdpt.transport.stored_vertices import StoredVertex
+from mitsuba_bdpt.transport.contribution import Counters
+from mitsuba_bdpt.transport.inputs import Observer
+from mitsuba_bdpt.transport.light_path import StoredVertex
 
 from instruments.endpoints import Camera, disks_of, dot, lamps_of, length2
 from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths

@@ -39,14 +39,13 @@ from mitsuba_bdpt.transport import (
     connections,
     inputs,
     kernel,
+    light_path,
     mis,
-    stored_vertices,
     subpaths,
     techniques,
 )
-from mitsuba_bdpt.transport.counters import Counters
-from mitsuba_bdpt.transport.inputs import Shared
-from mitsuba_bdpt.transport.observer import Observer
+from mitsuba_bdpt.transport.contribution import Counters
+from mitsuba_bdpt.transport.inputs import Observer, Shared
 from mitsuba_bdpt.transport.photons import merging, photon_pass
 from mitsuba_bdpt.transport.photons.merge_radius import Radius
 
@@ -653,9 +652,9 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
     ):
         monkeypatch.setattr(sys.modules[function.__module__], function.__name__, record(function, edges_of))
     monkeypatch.setattr(
-        stored_vertices,
+        light_path,
         "store_light_vertex",
-        lambda kernel_, y, path: stored.append(stored_vertices.StoredVertex.of(y)),
+        lambda kernel_, y, path: stored.append(light_path.StoredVertex.of(y)),
     )
     monkeypatch.setattr(connections, "connect_all", connect_all)
     monkeypatch.setattr(techniques, "sees_emitter", lambda kernel_, z: z.active)

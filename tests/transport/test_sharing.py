@@ -1,10 +1,10 @@
-"""Which camera samples share a light subpath, and the noise they have in common: `transport.sharing`."""
+"""Which camera samples share a light subpath, and the noise they have in common: `transport.batch`."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.transport.sharing import LEAST_RUNS, LONGEST_RUN, Sharing
+from mitsuba_bdpt.transport.batch import LEAST_RUNS, LONGEST_RUN, Sharing
 from repository import load_scene
 
 PIXELS = (*range(1, 40), 97, 256, 257, 31 * 17, 997, 64 * 64, 4097, 4 * LEAST_RUNS * LONGEST_RUN + 13)
@@ -23,7 +23,7 @@ def test_every_sample_is_served_once(served):
     """Rationale: a sample that is traced twice, or not at all, biases the image of films whose size S does
     not divide; samples of a pixel that share a light subpath depend on each other; those that share with
     several pixels, or with others in every pass, have no net of light subpaths (8 % more error, see
-    `sharing`). Expected, for films of any number of pixels (fewer than S, primes, whole runs and a rest) and
+    `batch`). Expected, for films of any number of pixels (fewer than S, primes, whole runs and a rest) and
     samples: each slot has one lane, which `lane` finds; a lane's slots are of different pixels; a pixel's
     samples share in order with those of the same pixels, whatever their number; there are no more lanes than
     the next whole number of pixels takes; the first part, thus all if S = 1, is as it was."""

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_bdpt.transport.inputs import KEPT
-from mitsuba_bdpt.transport.stored_vertices import Thinning
+from mitsuba_bdpt.transport.light_path import Thinning
 
 COUNT = 400
 

@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ..geometry import polarization
 from ..transport import connections
-from ..transport.counters import Counters, one
+from ..transport.contribution import Counters, one
 
 
 class Image:

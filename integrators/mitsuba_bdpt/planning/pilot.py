@@ -44,7 +44,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
-from ..transport.counters import COUNTERS, Counters, one
+from ..transport.contribution import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.plan import Plan

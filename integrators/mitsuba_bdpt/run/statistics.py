@@ -10,14 +10,14 @@ from typing import NotRequired, TypedDict
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.counters import COUNTERS, MEDIA, MERGING
+from ..transport.contribution import COUNTERS, MEDIA, MERGING
 
 
 @dataclass(frozen=True)
 class Work:
     """What is counted; a part of a render's progress.
 
-    ``counts``: sums of `counters.COUNTERS` by name; kernels ``compiled``, and found ``cached``; ``seconds``
+    ``counts``: sums of `COUNTERS` by name; kernels ``compiled``, and found ``cached``; ``seconds``
     in all, of which ``compile_seconds`` compile kernels and ``pilot_seconds`` are those of pilots (apart from
     their compiling)."""
 

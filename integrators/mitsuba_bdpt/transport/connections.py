@@ -11,11 +11,19 @@ from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
 from . import mis, scattering, spectra
-from .contribution import Contribution, drop_non_finite, roulette, size_of
-from .counters import MEDIA, Counters, counted_in_media, one
+from .contribution import (
+    MEDIA,
+    Contribution,
+    Counters,
+    counted_in_media,
+    drop_non_finite,
+    one,
+    roulette,
+    size_of,
+)
 from .inputs import Kernel
+from .light_path import LightPath, StoredVertex, read_light_vertex
 from .sketches import Sketch, guess
-from .stored_vertices import LightPath, StoredVertex, read_light_vertex
 from .visibility import Sight, guessed, seen
 from .walk import Vertex, is_lit, newest_coefficient, where_lit
 

@@ -1,4 +1,4 @@
-"""What a kernel is given besides its batch: scene, strategies in use, their coefficients, limits."""
+"""What a kernel is given besides its batch: scene, strategies in use, coefficients, limits, an observer."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import mitsuba as mi
 from ..sampling.points import Points
 from ..settings import MAX_STORED, Settings
 from . import mis
-from .observer import Observer
 from .plan import Plan
 
 # Sizes of the lanes' local memory. On CPUs they do not matter for speed; few of them make few kernels.
 STORE_SIZES = (64, 256, MAX_STORED)
 
-# In scenes with media, so many vertices of a light subpath are kept at most; see `stored_vertices.Thinning`.
+# In scenes with media, so many vertices of a light subpath are kept at most; see `light_path.Thinning`.
 KEPT = 64
 
 
@@ -50,6 +49,34 @@ class Shared:
     weight: mi.UnpolarizedSpectrum
     u_wavelength: mi.Float
     wavelength_set: mi.UInt32 | None = None
+
+
+class Observer:
+    """Observes the subpaths of a lane while they are recorded, for tools; this one does nothing.
+
+    `kernel.retrace` takes one. What it is given are arrays of Dr.Jit, which it must not change. In recorded
+    loops they have no values yet; who wants to read them turns `SymbolicLoops` and `SymbolicConditionals`
+    off, so that loops run step by step. Lanes whose subpath has ended keep the values of their last step,
+    with ``active`` false.
+    """
+
+    def emitted(self, emission):
+        """A light subpath starts: y_0 and the direction of its first edge, an `emitters.Emission`."""
+
+    def started(self, kernel, side, walk, stream):
+        """A subpath is on its first edge; ``side`` is its `walk.Side`, ``stream`` its random numbers."""
+
+    def vertex(self, side, walk, vertex, step):
+        """A subpath has reached a ``vertex`` (`walk.Vertex`) and sampled the next ``step``.
+
+        ``step`` is a `bsdf.Step`, None in scenes without surfaces; ``walk`` as it was before it arrived.
+        """
+
+    def drawn(self, end):
+        """One inner connection of a camera vertex was drawn.
+
+        ``end``: the light vertex, or where a visibility ray ends that is to reach it.
+        """
 
 
 class Kernel:

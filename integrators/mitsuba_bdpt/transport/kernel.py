@@ -1,7 +1,7 @@
 """One batch (a pass, a band of its rows, or a pilot) as one kernel.
 
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
-subpaths that it serves, in S different pixels (see `sharing`); all strategies of a pair are evaluated by that
+subpaths that it serves, in S different pixels (see `batch`); all strategies of a pair are evaluated by that
 lane. No vertex lies in global memory: apart from the film, the footprint does not grow with samples or image
 size. (With ``points=sampler`` the random numbers of a pass do, and in a pilot what each sample adds.)
 
@@ -24,7 +24,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             that point <- one virtual call
         t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
         t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
-        keep y, if on a surface whose BSDF is not delta, for inner          stored_vertices
+        keep y, if on a surface whose BSDF is not delta, for inner          light_path
             connections, unless no camera subpath could reach it in time
         d_vcm, d_vc (eqs. 34, 35, 53, 54), throughput <- the event at y     walk._leave
         roulette of the subpath; the next edge <- a ray
@@ -62,7 +62,7 @@ In scenes with media y and z may lie in one as well; null surfaces are passed an
     d_vcm <- over T~ of the edge, on arrival                                walk._vertex, mis.to_area
     BSDF -> phase function, cosine -> 1, in a volume                        scattering, phase
     a shadow ray -> transmittance T of the value and T~ of the weight       visibility, media.transmittance
-    keep y -> of a long subpath 64 vertices that stand for all              stored_vertices.Thinning
+    keep y -> of a long subpath 64 vertices that stand for all              light_path.Thinning
 
 Each strategy i of a path adds w_i f / (n_i p_i). n_i is its number of samples per camera sample: the light
 subpaths per camera subpath for t <= 1, else 1. The weights w_i are those of a `mis.Heuristic`; of the balance
@@ -97,16 +97,14 @@ from ..emitters.emission_tables import Cell
 from ..sampling.points import Points, Purpose
 from . import (
     contribution,
-    stored_vertices,
+    light_path,
     subpaths,
     techniques,
 )
-from .batch import Batch, Places
-from .counters import Counters, counted_by_camera, counted_by_light, counted_in_media, one
-from .inputs import Kernel, Shared
-from .observer import Observer
+from .batch import Batch, Places, Sharing
+from .contribution import Counters, counted_by_camera, counted_by_light, counted_in_media, one
+from .inputs import Kernel, Observer, Shared
 from .photons import guided_hits, merging
-from .sharing import Sharing
 from .subpaths import CameraSample
 from .walk import is_sds_vertex, random_walk
 
@@ -120,7 +118,7 @@ class Lane:
 
     place: Places
     shared: Shared
-    path: stored_vertices.LightPath
+    path: light_path.LightPath
     emission: Cell | None = None
 
 
@@ -183,7 +181,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     place_in_sequence = place.index(index)
     stream = kernel.points.stream("light", place_in_sequence, index)
     shared = subpaths.shared_by_lane(kernel, stream, place_in_sequence)
-    path = stored_vertices.allocate_light_path(kernel, dr.width(index))
+    path = light_path.allocate_light_path(kernel, dr.width(index))
     counters, emitted = Counters(), None
     if kernel.plan.joined > 1:
         path, counters = _light_subpaths(kernel, sink, place_in_sequence, index, shared, path)
@@ -239,13 +237,13 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         if plan.splat:
             counters += splat(techniques.splat(kernel, vertex, stream))
         if plan.connections != "none":
-            stored_vertices.store_light_vertex(kernel, vertex, path)
+            light_path.store_light_vertex(kernel, vertex, path)
         return path, counters
 
     if kernel.space is not None:
         # No purpose is left to name this number (`points`); that of vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
-        path = replace(path, thinning=stored_vertices.Thinning.begin(u))
+        path = replace(path, thinning=light_path.Thinning.begin(u))
     walk = subpaths.light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 makes SDS paths
     guide = None if walk.only_delta is None else partial(guided_hits.look_back, kernel)
     active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, guide)
@@ -261,7 +259,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 
 @dr.syntax
 def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
-    """``serve`` each camera sample of the lane at this `sharing.Seat`; what they count."""
+    """``serve`` each camera sample of the lane at this `batch.Seat`; what they count."""
     walked = Counters.zeros("camera", *counted_in_media(kernel.space))
     counters = walked + _camera_counters(kernel)
     served = mi.UInt32(0)

@@ -20,8 +20,7 @@ from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraJoin, SensorHit
 from . import bsdf, mis, spectra
-from .contribution import Contribution, roulette
-from .counters import Counters, one
+from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
 from .visibility import Sight, seen
 from .walk import Vertex, Walk, is_lit, newest_coefficient, where_lit

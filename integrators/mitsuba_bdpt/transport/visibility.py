@@ -10,8 +10,7 @@ import mitsuba as mi
 from ..geometry import polarization, rays
 from ..media import transmittance
 from ..sampling.points import Purpose, Stream
-from .contribution import Contribution
-from .counters import Counters
+from .contribution import Contribution, Counters
 from .inputs import Kernel
 
 # Optical depth up to which a join's transmittance is guessed before its ray is traced, from the medium that

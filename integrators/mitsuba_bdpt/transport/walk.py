@@ -20,7 +20,7 @@ from ..media import flight
 from ..sampling.points import Purpose
 from ..sensors.records import CameraJoin
 from . import bsdf, mis, scattering, spectra
-from .counters import Counters
+from .contribution import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
 

@@ -22,7 +22,7 @@ from ...geometry import rays
 from ...sampling import sobol
 from ...sampling.points import Purpose, Stream
 from .. import bsdf, mis, spectra, techniques
-from ..counters import one
+from ..contribution import one
 from ..inputs import Kernel
 from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
 from . import photon_guide

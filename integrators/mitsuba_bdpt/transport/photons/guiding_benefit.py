@@ -23,8 +23,7 @@ from ...sampling.reservoir import offer
 from .. import bsdf, subpaths
 from ..batch import Batch, Places
 from ..contribution import size_of
-from ..inputs import Kernel
-from ..observer import Observer
+from ..inputs import Kernel, Observer
 from ..plan import GUIDED
 from ..walk import Vertex, Walk, is_sds_vertex, random_walk
 from . import photon_guide

@@ -10,9 +10,8 @@ import mitsuba as mi
 
 from ...sampling.points import Points, Purpose
 from .. import spectra, subpaths
-from ..counters import Counters, one
-from ..inputs import Kernel
-from ..observer import Observer
+from ..contribution import Counters, one
+from ..inputs import Kernel, Observer
 from ..walk import is_sds_vertex, random_walk
 from .aim import Aim
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, level_of
