@@ -364,6 +364,13 @@ MUTANTS = (
         ),
     ),
     Mutant(
+        "reservoir: what is left of the random number is not uniform",
+        "sampling/reservoir.py",
+        "rest = dr.select(take, u_total, u_total - size)",
+        "rest = u_total",
+        ("tests/sampling/test_reservoir.py::test_candidates_are_drawn_in_proportion_to_their_size",),
+    ),
+    Mutant(
         "sharing: rows are not dealt",
         "transport/batch.py",
         "row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))",

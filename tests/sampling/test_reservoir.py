@@ -1,0 +1,34 @@
+"""Weighted reservoir sampling."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from mitsuba_bdpt.sampling.reservoir import offer
+
+SIZES = (0.0, 1.0, 0.0, 2.0, 5.0, 0.0)
+
+
+def test_candidates_are_drawn_in_proportion_to_their_size():
+    """Expected: each candidate is drawn by a share of 2^16 evenly spaced numbers that is its size over the
+    total, and what is left of these numbers is evenly spaced: as many in each of 16 bins. To 1e-3, for the
+    granularity of 2^16 numbers, most of which pass four decisions in single precision.
+    """
+    count = 1 << 16
+    u = (dr.arange(mi.Float, count) + 0.5) / count
+    total, chosen = mi.Float(0), dr.full(mi.UInt32, len(SIZES), count)
+    for i, size in enumerate(SIZES):
+        total, take, u = offer(total, mi.Float(size), u)
+        chosen = dr.select(take, mi.UInt32(i), chosen)
+    chosen, u = np.array(chosen), np.array(u)
+    for i, size in enumerate(SIZES):
+        drawn = u[chosen == i]
+        assert abs(len(drawn) / count - size / sum(SIZES)) < 1e-3
+        if size:
+            shares = np.histogram(drawn, 16, (0, 1))[0] / len(drawn)
+            np.testing.assert_allclose(shares, 1 / 16, atol=1e-3)
+
+
+def test_nothing_is_drawn_of_nothing():
+    """Expected: candidates of size 0 alone are not taken, and the random number is kept."""
+    total, take, u = offer(mi.Float(0), mi.Float(0), mi.Float(0.25))
+    assert total[0] == 0 and not take[0] and u[0] == 0.25
