@@ -2,7 +2,7 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""The part of a pilot that asks whether guiding s = 0 pays, see `transport.photons.guiding_benefit`."""
+"""The pilot's estimate of what photon-guided BSDF sampling gains, see `transport.photons.guiding_benefit`."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ from ..transport.photons.photon_pass import photons_of, trace_guide
 from ..transport.plan import Plan
 from .moments import FINE, GROUPS, Isolated, tile_of
 
-# Camera samples that look for vertices where s = 0 can be guided: most of their subpaths end at once. Light
-# subpaths that give the photons to measure with, and at most so many that give those of the guide.
+# Camera samples, most of whose subpaths end at once. Photon subpaths that estimate; also the most photon
+# subpaths of the guide.
 LANES, PHOTONS = 1 << 14, 1 << 16
 
-# Estimates of s = 0 count up to as many times what arrives as a render has samples, over this: light that a
-# render is not likely to meet is missing from its image, not noise. (One sample in so many is on a path
-# where s = 0 can be guided.)
+# Estimates of s = 0 beyond the light that arrives times the render's samples over this number are left out:
+# a render rarely samples such light, so that it is missing from the image and adds no noise.
 SHARE = 16
 
 
 def measure(
     prepared: PreparedScene, plan: Plan, settings: Settings, seed: mi.UInt32, samples: float
 ) -> Isolated | None:
-    """Second moments of s = 0 where it can be guided by ``plan``, in a render of so many ``samples``.
+    """Second moments of s = 0 where ``plan`` can guide it, in a render of ``samples`` camera samples.
 
-    None if no photon is found.
+    None if there is no photon.
     """
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
     aim = Aim.of(prepared.scene, prepared.emitters)
@@ -66,18 +65,18 @@ def measure(
 def group(lane: mi.UInt32) -> mi.UInt32:
     """Return the independent part of the pilot to which a ``lane`` belongs.
 
-    Neighbouring lanes belong to different parts, in random order: else the parts would be columns of films
-    of some widths, and each would measure its own region of the image.
+    Neighbouring lanes belong to different parts, in random order: otherwise the parts would be columns of
+    films of some widths, and each would measure a region of its own.
     """
     return (lane + sobol.mix(lane // GROUPS)) % GROUPS
 
 
-# Numbers of a row: an even one, so that Dr.Jit adds it as a packet.
+# Width of a row: even, so that Dr.Jit adds it as a packet.
 _WIDTH = MOMENTS + MOMENTS % 2
 
 
 class Sums:
-    """What the lanes have `Found`, by group and fine tile."""
+    """Sums of the lanes' `Found`, by group and fine tile."""
 
     def __init__(self, region: Region):
         self._region = region
@@ -86,7 +85,7 @@ class Sums:
         dr.make_opaque(self._sums, self._aimed)
 
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
-        """Add what a ``lane`` found, whose camera sample has this ``position`` on the film."""
+        """Accumulate the `Found` of a ``lane`` whose camera sample has this ``position`` on the film."""
         row = group(lane) * FINE**2 + tile_of(self._region, position)
         values = mi.ArrayXd(found.moments + [mi.Float64(0)] * (_WIDTH - MOMENTS))
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)

@@ -22,7 +22,7 @@ from .walk import Side, Walk, not_finite
 
 @dataclass
 class CameraSample:
-    """A camera sample: its `CameraStart`, random numbers, point of the lens, and whether there is one."""
+    """A camera sample: its start, random numbers and sample of the lens; ``covered``: mask, it exists."""
 
     start: CameraStart
     stream: Stream
@@ -68,7 +68,7 @@ def emission(kernel: Kernel, stream, shared):
 
 
 def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
-    """A light subpath on its first edge; ``merges``: whether it asks for those of its vertices."""
+    """A light subpath on its first edge; ``merges``: whether its weights contain merges at its vertices."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
@@ -167,7 +167,7 @@ def _first_partial(kernel: Kernel, start):
 
 
 def _no_merges(kernel: Kernel, asked: bool):
-    """``d_vm`` of a subpath that begins; the number 0 where it is not ``asked`` for."""
+    """``d_vm`` of a subpath that begins; the number 0 where it is not used, or not ``asked`` for."""
     used = kernel.merging is not None or kernel.guide is not None
     return kernel.heuristic.zero() if asked and used else 0
 
