@@ -250,7 +250,7 @@ def _rays_per_sample(rows) -> str:
 
 
 def choices_table(results: Results) -> str:
-    """What the pilots chose, what they left out and why, and what they cost; rays per sample."""
+    """What the pilots chose and left out, what they cost, and rays per sample."""
     head = ["scene", "chosen (number of renders)", "left out in the first render"]
     head += ["share of the pilot in the first render"]
     head += ["closest hits and shadow rays per sample", f"the same, {NONE}"]
@@ -267,7 +267,7 @@ def choices_table(results: Results) -> str:
             [
                 f"`{scene}`",
                 "; ".join(f"{text or 'no pilot'} ({count})" for text, count in chosen),
-                "; ".join(f"{s['class']}: {s['why']}" for s in left_out) or "–",
+                ", ".join(s["class"] for s in left_out) or "–",
                 said(lambda rows=rows: f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} %", str),
                 _rays_per_sample(rows),
                 _rays_per_sample(results.of(scene, NONE, results.deciding)),
@@ -497,8 +497,8 @@ def checked_goals(file: Path, data: dict) -> list[dict]:
     for goal in goals:
         for key in ("what", "at_least"):
             text_of(file, f"{key} of a [[goal]]", goal.get(key))
-        for key in {"aim", "tried"} & set(goal):
-            text_of(file, f"{key} of {goal['what']!r}", goal[key])
+        if "aim" in goal:
+            text_of(file, f"aim of {goal['what']!r}", goal["aim"])
         measure, scene = goal.get("measure"), goal.get("scene")
         if measure is not None and measure not in tuple(GOALS):
             raise CommandError(
@@ -524,17 +524,16 @@ def goals_table(results: Results, goals) -> str:
     return table(["what", "at least", "aim", "measured"], lines)
 
 
-def tried_text(goals) -> str:
-    """What was tried for goals that are not reached, or far from their aim."""
-    return "".join(f"* {goal['what']}: {goal['tried']}\n" for goal in goals if "tried" in goal)
-
-
 # -- files ------------------------------------------------------------------------------------
 
 
 def notes_text(notes: dict) -> str:
-    """Explanations by scene."""
-    return "".join(f"* `{scene}`: {text}\n" for scene, text in notes.items())
+    """Explanations, each with its scenes."""
+    lines = []
+    for text in dict.fromkeys(notes.values()):
+        scenes = ", ".join(f"`{scene}`" for scene in notes if notes[scene] == text)
+        lines.append(f"* {scenes}: {text}\n")
+    return "".join(lines)
 
 
 def replace_part(text: str, name: str, part: str) -> str:
@@ -595,7 +594,7 @@ def page(results: Results, made: dict, goals: list, notes: dict) -> str:
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
     parts = [_introduction(results)]
     if goals:
-        parts.append(f"## Goals\n\n{goals_table(results, goals)}\n{tried_text(goals)}")
+        parts.append(f"## Goals\n\n{goals_table(results, goals)}")
     parts.append(
         f"""## Efficiency
 
