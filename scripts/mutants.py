@@ -184,8 +184,8 @@ MUTANTS = (
     Mutant(
         "numbers of the light subpath for the camera's",
         "transport/subpaths.py",
-        'points.stream("camera", place.index(slot), slot)',
-        'points.stream("light", place.index(slot), slot)',
+        'points.stream("camera", place.index(slot))',
+        'points.stream("light", place.index(slot))',
         ("tests/images/test_plausible_bugs.py::test_subpaths_draw_from_their_own_streams",),
     ),
     Mutant(
@@ -339,20 +339,6 @@ MUTANTS = (
         "later = 1 if purpose is Purpose.EMITTER else 0",
         "later = 0",
         ("tests/sampling/test_points.py::test_draws_of_one_contribution_are_joint[camera-first4-second4]",),
-    ),
-    Mutant(
-        "points: all numbers from one sequence of the sampler",
-        "sampling/points.py",
-        "at = slot + row * self._samples",
-        "at = slot",
-        ("tests/sampling/test_samplers.py::test_samplers_points_equal_path[stratified-none-16]",),
-    ),
-    Mutant(
-        "points: the sampler's numbers at every vertex",
-        "sampling/points.py",
-        "return dr.select(vertex == at, inside, outside)",
-        "return inside",
-        ("tests/sampling/test_samplers.py::test_samplers_points_equal_path[independent-auto-4]",),
     ),
     Mutant(
         "points: pairs share their seed with single numbers",
@@ -1414,8 +1400,8 @@ MUTANTS = (
     Mutant(
         "joined light subpaths: all have the same random numbers",
         "transport/kernel.py",
-        'kernel.points.stream("light", place * count + mi.UInt64(number), index)',
-        'kernel.points.stream("light", place, index)',
+        'kernel.points.stream("light", place * count + mi.UInt64(number))',
+        'kernel.points.stream("light", place)',
         ("tests/images/test_joined_light_paths.py::test_a_cornell_box_is_joined_and_less_noisy",),
     ),
     Mutant(

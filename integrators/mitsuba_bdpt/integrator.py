@@ -154,7 +154,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         spp = samples_per_pixel(sensor, spp, self.settings)
         render = Render(scene, sensor, self.settings, seed, spp)
         if start is not None:
-            check_resumable(start, self.settings)
+            check_resumable(start)
             render.resume(start)
         messages.warn_of_parameters(scene, sensor)
         messages.warn_of_media(render.prepared, sensor)

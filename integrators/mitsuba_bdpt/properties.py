@@ -212,11 +212,6 @@ def _check_together(settings: Settings):
         raise UsageError(
             f"target_error={settings.target_error} follows from the variance; set variance to true"
         )
-    if settings.target_error and settings.points == "sampler":
-        raise UsageError(
-            f"target_error={settings.target_error} with points=sampler is not possible: a sampler's "
-            "samples are numbered before it is known how many there will be; use points=sobol"
-        )
 
 
 def check_variant(variant: str | None = None):

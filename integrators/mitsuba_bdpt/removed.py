@@ -12,6 +12,8 @@ REMOVED = {
     "merging_radius": "leave it out: the radius is about a pixel and shrinks from pass to pass; for a "
     "smaller one render more samples, or a larger film",
     "stored_vertices": "leave it out; for path tracing alone set light_paths=0",
+    "points=sampler": "use sobol, which is as good as Mitsuba's best sampler; the scene's sampler gives the "
+    "number of samples alone",
     "until_error": "use target_error",
     "--until-error": "use --target-error",
     "--keep-checkpoint": "a finished render cannot be continued; for more samples render with another --seed "

@@ -26,7 +26,7 @@ LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
 GUIDING = ("auto", "always", "never")
 EMISSION_GUIDING = ("auto", "never")
 CONNECTIONS = ("auto", "all", "one", "none")
-POINTS = ("sobol", "sampler", "independent")
+POINTS = ("sobol", "independent")
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,7 @@ class Settings:
     points: str = _parameter(
         "sobol",
         "a kind of sample points",
-        """``sobol``: Owen-scrambled Sobol' points for all draws that gain by them, at every vertex.
-        ``sampler``: the scene's sampler for a path's first draws. ``independent``: random numbers.""",
+        """Sample points: ``sobol``, Owen-scrambled Sobol' points, or ``independent`` random numbers.""",
         choices=POINTS,
     )
     merging: bool = _parameter(

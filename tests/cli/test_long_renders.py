@@ -334,7 +334,6 @@ def test_until_an_error(capsys):
         (["--scheduler", "x:1", "--target-error", "1"], "scheduler together with target_error"),
         (["--scheduler", "x:1", "-P", "timeout=3"], "scheduler with timeout=3.0 is not possible"),
         (["--scheduler", "x:1", "-P", "aovs=a:duv_dx"], "duv_dx depends on the samples per pixel of a part"),
-        (["--checkpoint", "1", "-P", "points=sampler"], "checkpoint with points=sampler"),
         (["--integrator", "path", "--checkpoint", "1"], "checkpoint is for the integrator bdpt"),
         (["--integrator", "path", "--scheduler", "x:1"], "scheduler is for the integrator bdpt"),
         (["--time", "2", "-P", "timeout=3"], "-P timeout=3 together with --time 2 is not possible"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.image.features import FeatureLayers
 from mitsuba_bdpt.measure.agreement import sidak
+from mitsuba_bdpt.sampling.points import Points, Purpose
 from welch import LEVEL, Comparisons, assert_agree, compare_images
 
 T = mi.ScalarTransform4f
@@ -37,6 +38,18 @@ class Fixed(mi.Sampler):
 
     def next_2d(self, active=True):
         return mi.Point2f(self.next_1d(), 0.8)
+
+
+def fixed(draw):
+    """`Points._draw`, of which camera rays get the numbers of `Fixed`."""
+    of_rays = Purpose.FILM, Purpose.APERTURE, Purpose.TIME, Purpose.WAVELENGTH
+
+    def drawn(points, side, stream, purpose, vertex, dims):
+        if purpose not in of_rays:
+            return draw(points, side, stream, purpose, vertex, dims)
+        return mi.Float(0.3) if dims == 1 else mi.Point2f(0.3, 0.8)
+
+    return drawn
 
 
 def bitmap():
@@ -154,7 +167,7 @@ def bdpt(**parameters):
     ],
     ids=["plain", "hidden emitters", "thin lens, border", "crop, passes", "all layers", "depth 0"],
 )
-def test_features_are_those_of_aov(film_keys, sensor_keys, parameters):
+def test_features_are_those_of_aov(film_keys, sensor_keys, parameters, monkeypatch):
     """Rationale: features are Mitsuba's own, at our camera samples. With a sampler that always gives the
     same number both integrators see the same points, so that there is no noise. Expected: all kinds of
     layers equal `aov`'s in every pixel for any film, sensor and parameter, except where its uv derivatives
@@ -162,8 +175,9 @@ def test_features_are_those_of_aov(film_keys, sensor_keys, parameters):
     layer's largest value (rays are set up in another order; sums in single precision).
     """
     mi.register_sampler("fixed", Fixed)
+    monkeypatch.setattr(Points, "_draw", fixed(Points._draw))
     target = scene(sensor(film(**film_keys), sampler={"type": "fixed"}, **sensor_keys))
-    integrator = bdpt(points="sampler", **parameters)
+    integrator = bdpt(**parameters)
     spp = 16 if "variance" in parameters else 4
     names, result = integrator.aov_names(), layers(integrator, target, spp)
     assert names[: len(ALL_NAMES)] == ALL_NAMES

@@ -85,7 +85,6 @@ def test_the_estimated_error_is_that_of_skewed_images(shape, most):
         ("box", {}),
         ("gaussian", {"skip": "none"}),
         pytest.param("box", {"points": "independent", "light_paths": 0}, marks=pytest.mark.slow),
-        pytest.param("box", {"points": "sampler"}, marks=pytest.mark.slow),
     ],
 )
 def test_variance_is_the_spread_over_seeds(rfilter, parameters):
@@ -95,7 +94,7 @@ def test_variance_is_the_spread_over_seeds(rfilter, parameters):
     Tolerance: 10 %: 32 seeds give each pixel's variance to 25 %, 144 pixels of three partly correlated
     channels give the mean to 3 %. Statistic: ratio of means.
     """
-    target = scene(rfilter, sampler="multijitter" if "points" in parameters else "independent")
+    target = scene(rfilter)
     integrator = bdpt(**parameters)
     assert integrator.aov_names() == ["variance.R", "variance.G", "variance.B"]
     result = renders(integrator, target, range(32), 16)

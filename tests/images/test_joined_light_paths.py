@@ -259,23 +259,21 @@ def test_short_renders_are_not_joined():
         ({"samples": (1 << 16) - 1}, 1),
         ({"pixels": (1 << 10) - 1}, 1),
         ({"transmits": True}, 1),
-        ({"points": "sampler"}, 1),
         ({"why": "in scenes with media"}, 1),
     ],
     ids=str,
 )
 def test_what_is_joined(change, joined):
     """Expected: four light subpaths where the fewest are chosen with one connection, in a long render of many
-    pixels, and where guesses know the BSDFs and the points are not a scene's sampler's.
+    pixels, and where guesses know the BSDFs.
     """
     given = {"light_paths": 1 / 16, "connections": "one", "samples": 1 << 16, "pixels": 1 << 10}
-    given |= {"transmits": False, "points": "sobol", "why": ""} | change
+    given |= {"transmits": False, "why": ""} | change
     way = Configuration(given["light_paths"], given["connections"], 1.0, 1.0)
     asked = SimpleNamespace(
         _prepared=SimpleNamespace(traits=SimpleNamespace(transmits=given["transmits"])),
-        _settings=SimpleNamespace(points=given["points"]),
         _pixels=given["pixels"],
-        _why_not_joined=lambda joined: given["why"],
+        _why_not_joined=lambda: given["why"],
     )
     row = planner.Planner._joined(asked, choice.Prediction(way, 1.0, 1.0), given["samples"])
     assert row.candidate.joined == joined

@@ -132,7 +132,7 @@ def test_no_number_decides_two_things(kind):
     points, drawn = Points(kind, mi.UInt32(3)), []
     purposes = Purpose.__members__.values()  # with aliases
     for side in ("camera", "light"):
-        stream = points.stream(side, mi.UInt64(lanes) << 32, lanes)  # each of a sequence of its own
+        stream = points.stream(side, mi.UInt64(lanes) << 32)  # each of a sequence of its own
         for vertex in (0, 1, 2):
             drawn += [np.array(points.draw_1d(side, stream, p, vertex)) for p in purposes]
     found = np.corrcoef(np.array(drawn))

@@ -165,8 +165,6 @@ def test_what_does_not_belong_together_is_refused():
         bdpt().render(scene("gaussian"), seed=0, spp=16, start=start)
     with pytest.raises(TypeError, match="start=dict must be a snapshot"):
         bdpt().render(target, start={})
-    with pytest.raises(ValueError, match="points=sampler"):
-        bdpt(points="sampler").render(target, spp=16, start=start)
     with pytest.raises(ValueError, match="seed=0 is in both"):
         start.joined(start)
     with pytest.raises(ValueError, match="not a snapshot"):
@@ -240,7 +238,6 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
         ({"target_error": 0.1}, ValueError, "set variance to true"),
         ({"target_error": -1.0, "variance": True}, ValueError, "the relMSE to stop at, or 0 for none"),
         ({"target_error": "low", "variance": True}, TypeError, "must be a number"),
-        ({"target_error": 0.1, "variance": True, "points": "sampler"}, ValueError, "points=sobol"),
     ],
 )
 def test_bad_parameters(parameters, error, message):

@@ -18,7 +18,7 @@ def drawn(side, draws, samples: int, seeds: int) -> np.ndarray:
     seed = dr.repeat(dr.arange(mi.UInt32, seeds), samples)
     index = dr.tile(dr.arange(mi.UInt32, samples), seeds)
     points = Points("sobol", seed)
-    stream = points.stream(side, mi.UInt64(index), index)
+    stream = points.stream(side, mi.UInt64(index))
     found = []
     for purpose, vertex in draws:
         u = points.draw_2d(side, stream, purpose, mi.UInt32(vertex))
@@ -79,7 +79,7 @@ def test_samples_beyond_the_range_of_32_bits():
 
     def points_at(index):
         points = Points("sobol", mi.UInt32(3))
-        u = points.draw_2d("camera", points.stream("camera", index, slot), Purpose.FILM)
+        u = points.draw_2d("camera", points.stream("camera", index), Purpose.FILM)
         return np.stack([c.numpy() for c in u], axis=-1)
 
     here = points_at(index)

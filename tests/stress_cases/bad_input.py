@@ -47,7 +47,7 @@ SENSIBLE = {
     "heuristic": ("balance", "power"),
     "skip": ("auto", "impossible", "none"),
     "connections": ("auto", "all", "one", "none"),
-    "points": ("sobol", "sampler", "independent"),
+    "points": ("sobol", "independent"),
     "photon_guiding": ("auto", "always", "never"),
     "emission_guiding": ("auto", "never"),
     "aovs": ("", "albedo:albedo", "dd:depth,nn:sh_normal"),

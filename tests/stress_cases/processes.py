@@ -114,7 +114,7 @@ PLAIN = (({}, SIZE, 1),)
 IN_TURN = (
     ({}, 48, 64),
     ({"variance": True}, SIZE, 16),
-    *(({"aovs": "albedo:albedo,nn:sh_normal"}, SIZE, 1), ({"points": "sampler"}, SIZE, 1)) * 6,
+    *(({"aovs": "albedo:albedo,nn:sh_normal"}, SIZE, 1), ({"points": "independent"}, SIZE, 1)) * 6,
     *(({"skip": "none"}, SIZE, 1), *PLAIN) * 3,
 )
 
@@ -479,7 +479,7 @@ CASES = (
     _case(
         "renders-1000",
         "1,000 renders: of twenty each one of 48 x 48 that asks a pilot, others with `variance`, `aovs`, "
-        "`points=sampler`, `skip=none` or plain",
+        "`points=independent`, `skip=none` or plain",
         f"{STAYS}; 50 pilots",
         partial(_in_a_row, 1000, IN_TURN),
         timed=True,

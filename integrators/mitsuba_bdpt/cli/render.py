@@ -271,11 +271,6 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
                 f"{name} is for the integrator bdpt, not for {integrator.class_name()}; use "
                 "--integrator bdpt."
             )
-    if options.checkpoint is not None and integrator.settings.points == "sampler":
-        raise CommandError(
-            "checkpoint with points=sampler is not possible: a scene's sampler cannot start in the middle of "
-            "its samples; use points=sobol."
-        )
     if options.scheduler is not None:
         cluster.check_settings(integrator.settings)
 

@@ -322,7 +322,7 @@ def measure(
         cells = kernel.emitters.table_count * kernel.emitters.side**2
         listener = emission.Listener(region, cells)
     pixels = int(region.size.prod())
-    stratified = settings.points != "independent"
+    stratified = settings.points == "sobol"
     nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
     lanes -= nets * NETS * NET
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
@@ -330,7 +330,7 @@ def measure(
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
     pilot = Pilot(region, batch, rarest(stands_for, asked), prepared.space is not None, listener)
     # What is not in nets are independent numbers: the squared mean follows from products of samples.
-    points = Points("sobol" if stratified else "independent", seed)
+    points = Points(settings.points, seed)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))

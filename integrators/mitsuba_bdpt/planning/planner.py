@@ -44,8 +44,8 @@ AIMED_GAIN = 1.15
 # light subpaths. (Efficiency with four over that with one, 16 samples per pixel of 128^2: `ajar_door` 1.32,
 # `uplight_room` 1.36, `cornell_box` 1.46, `window_room` 1.47, `furnace_point` 1.68, `pool_floor` 0.98. Where
 # more light subpaths are chosen it is 0.73 to 1.30.) Not where BSDFs scatter to the other side, which guesses
-# do not know well, not with a scene's sampler, whose numbers the light subpaths of a lane would share, and on
-# CPUs alone: on others it was not measured, and lanes need four times the local memory.
+# do not know well, and on CPUs alone: on others it was not measured, and lanes need four times the local
+# memory.
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
 # Tables that a later pilot has taught replace earlier ones if they leave this part of what those leave.
@@ -146,8 +146,7 @@ class Planner:
         while repeat <= done:
             repeat *= 4
         self.decided = replace(self.decided, pilots=pilots._replace(repeat=repeat))
-        # A scene's sampler cannot start again in the middle of its samples.
-        return done <= LATEST_REPEAT * self._spp and self._settings.points != "sampler"
+        return done <= LATEST_REPEAT * self._spp
 
     def ask(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Ask a pilot and adopt what it says; returns its predictions, the best first."""
@@ -155,8 +154,7 @@ class Planner:
         if self.decided.pilots.asked:
             answer = self._answer(samples)
         else:  # that of each render of the scene
-            stratified = self._has_stratified_points()
-            key = self._settings, self.pilot_seed, samples, self._pixels, JOINED, stratified
+            key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
             answer, is_known = self._findings.find("answers", key, lambda: self._answer(samples))
             if is_known:
                 pilots = self.decided.pilots._replace(asked=answer.asked, remembered=answer.asked)
@@ -221,7 +219,6 @@ class Planner:
             or samples < JOINED_SAMPLES
             or self._pixels < JOINED_PIXELS
             or self._prepared.traits.transmits
-            or self._settings.points == "sampler"
             or dr.backend_v(mi.Float) != dr.JitBackend.LLVM
             or self._why_not_joined()
         ):
@@ -345,15 +342,10 @@ class Planner:
     def _alternatives(self, samples: int) -> choice.Alternatives:
         """What may be done with so many ``samples`` that are still to come."""
         possible = candidates(self._prepared, self.full, self._settings)
-        return choice.Alternatives(possible, self._has_stratified_points(), samples, self.full.guidable)
+        return choice.Alternatives(possible, self._settings.points == "sobol", samples, self.full.guidable)
 
     def _expected(self, passes: tuple[int, ...]) -> int:
         """Samples still to come, as far as that is known."""
         done = sum(passes)
         left = (self._spp - done) * self._pixels
         return budget.expected_samples(self._settings, left, done * self._pixels)
-
-    def _has_stratified_points(self) -> bool:
-        if self._settings.points == "sampler":
-            return self._prepared.camera.sensor.sampler().class_name() != "IndependentSampler"
-        return self._settings.points == "sobol"

@@ -21,17 +21,12 @@ def check_made_for(integrator, scene):
             )
 
 
-def check_resumable(start, settings):
+def check_resumable(start):
     """Raise `UsageError` or `UsageTypeError` if a render cannot go on from ``start``."""
     if not isinstance(start, Snapshot):
         raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
     if not start.progress.whole:
         raise UsageError("start=... was joined or reduced for joining; only assemble() can use it")
-    if settings.points == "sampler":
-        raise UsageError(
-            "start with points=sampler is not possible: a scene's sampler cannot start in the middle "
-            "of its samples; use points=sobol"
-        )
 
 
 def resolve_sensor(scene, sensor):
@@ -64,22 +59,4 @@ def samples_per_pixel(sensor, spp, settings) -> int:
             f"variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
             "samples per pixel, one for each independent part of the render"
         )
-    if settings.points == "sampler":
-        return _whole_sets(sensor.sampler().clone(), spp, REPLICATES if settings.variance else 1)
     return spp
-
-
-def _whole_sets(sampler, spp: int, parts: int) -> int:
-    """``spp``, rounded up to what the sampler makes: stratified samplers do not make any number.
-
-    Each of ``parts`` (see `schedule.schedule`) is such a number.
-    """
-
-    def made(count):
-        sampler.set_sample_count(count)
-        return int(sampler.sample_count())
-
-    most = -(-spp // parts)
-    if all(made(count) == count for count in {spp // parts, most}):
-        return spp
-    return parts * made(most)

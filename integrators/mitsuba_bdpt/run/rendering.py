@@ -87,7 +87,7 @@ class Render:
             seed = integer(seed, "seed", 0)
         seed = mi.UInt32(seed)
         dr.make_opaque(seed)
-        self.points = PassPoints(settings, sensor, seed)
+        self.points = PassPoints(settings, seed)
         self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         aims = self.plan.merging or self.plan.guidable
         self.aim = Aim.of(scene, self.prepared.emitters) if aims else None
@@ -228,7 +228,7 @@ class Render:
 
     def _affordable(self, size: int) -> int:
         """Samples per pixel of a pass of ``size`` under ``timeout``."""
-        if not 0 <= self.settings.timeout < math.inf or self.settings.points == "sampler":
+        if not 0 <= self.settings.timeout < math.inf:
             return size
         rate = self.meter.rate(sum(self.passes))
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
@@ -243,7 +243,7 @@ class Render:
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()
-            drawn = self.points.of(step, batch, self.planner.changes)
+            drawn = self.points.of(step, self.planner.changes)
             with gc_paused(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 with evaluated_mode(self.prepared.emitters.evaluated):
                     counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)

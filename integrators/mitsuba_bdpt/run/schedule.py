@@ -24,9 +24,6 @@ LAUNCH_SAMPLES_CUDA = 1 << 24
 # every pass and does not average out (constant radiance, 2^12: 4e-6; 2^16: 5e-5; 2^20: 1e-3).
 MOST_SPP = 1 << 12
 
-# With points=sampler the scene sampler's numbers are kept per sample: 80 bytes each.
-LAUNCH_SAMPLES_SAMPLER = 1 << 20
-
 # Independent images whose spread gives the variance: as few as the contract allows, since each has a
 # point sequence of its own and short sequences are worse.
 REPLICATES = 8
@@ -35,25 +32,20 @@ REPLICATES = 8
 FIRST_REPLICATE = 4
 
 
-def _most_samples(settings: Settings) -> int:
+def _most_samples() -> int:
     """Samples in one launch."""
-    if settings.points == "sampler":
-        return LAUNCH_SAMPLES_SAMPLER
     return LAUNCH_SAMPLES_CUDA if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else LAUNCH_SAMPLES
 
 
 def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
     """Samples per pixel of each pass, in order, ``spp`` in all; the first is 1 if ``small_first``."""
-    limit = _most_samples(settings)
+    limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels fits into four launches' worth, see `batches`.
     most = min(MOST_SPP, max(4 * limit // width, 1))
     size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
     sizes = []
-    if settings.points == "sampler":
-        # Stratified samplers number the samples of a pixel; passes must cut them evenly.
-        size = next(n for n in range(min(size, spp), 0, -1) if spp % n == 0)
-    elif small_first and spp > 1:
+    if small_first and spp > 1:
         sizes, spp = [1], spp - 1
     return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
 
@@ -111,7 +103,7 @@ def passes_since(passes: tuple[int, ...], done: int) -> int:
 
 def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):
     """Cut a pass into bands of rows that one kernel launch can take."""
-    limit = _most_samples(settings)
+    limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     rows = (
         height

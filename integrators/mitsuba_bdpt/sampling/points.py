@@ -7,10 +7,6 @@ Every draw names its purpose and the vertex it serves, so that the point set can
   in it, so each pixel holds a net, and so does each power-of-two group of pixels). Draws of a subpath on
   which one contribution depends together, up to the second vertex, are joint points of several
   dimensions (`sobol.related`); further ones are joined vertex by vertex.
-* ``sampler``: the scene's own sampler for the first dimensions, see `SAMPLER_TABLE`; more would take
-  memory and gain little. A path takes each number from another pixel's sequence of the sampler:
-  those of one sequence are correlated (0.92 for ``stratified`` at 4 samples, 0.25 for ``ldsampler``
-  at any number), which would bias the image. Figures: docs/user/samplers.md.
 * ``independent``: hashed numbers throughout.
 
 All else is hashed: a number is a function of seed, sample, vertex and purpose, so that no
@@ -82,79 +78,40 @@ STRATIFIED = {
     },
 }
 
-# What the scene's sampler provides, in this order: (side, purpose, vertex, dimensions). Row k of pixel p
-# comes from the sampler's sequence p + k.
-SAMPLER_TABLE = (
-    ("camera", Purpose.FILM, 0, 2),
-    ("camera", Purpose.APERTURE, 0, 2),
-    ("camera", Purpose.EMITTER, 1, 2),
-    ("camera", Purpose.BSDF, 1, 2),
-    ("camera", Purpose.LOBE, 1, 1),
-    ("light", Purpose.TIME, 0, 1),
-    ("light", Purpose.WAVELENGTH, 0, 1),
-    ("light", Purpose.EMISSION_POINT, 0, 2),
-    ("light", Purpose.EMISSION_DIRECTION, 0, 2),
-    ("light", Purpose.BSDF, 1, 2),
-    ("light", Purpose.LOBE, 1, 1),
-)
-
 
 @dataclass
 class Stream:
     """The random numbers of one subpath; ``UInt32``, unchanged along the subpath.
 
     ``digits`` is its place in the Sobol' sequence (reversed index), ``seed`` the sequence's, ``key`` that of
-    the hashed numbers, ``first`` the scene sampler's numbers by (purpose, vertex).
+    the hashed numbers.
     """
 
     digits: mi.UInt32
     seed: mi.UInt32
     key: mi.UInt32
-    first: dict
 
 
 class Points:
     """Hands out `Stream` objects and draws from them.
 
-    ``kind`` one of `POINTS`; ``seed`` the render's seed (``mi.UInt32``); only for ``kind="sampler"``:
-    ``sampler`` the scene's sampler, seeded for the `sequences` of the pass with ``samples`` of each.
+    ``kind`` one of `settings.POINTS`; ``seed`` the render's seed (``mi.UInt32``).
     """
 
-    def __init__(self, kind: str, seed, sampler=None, samples: int = 1):
+    def __init__(self, kind: str, seed):
         self.kind = kind
         self.seed = seed
-        self._table = None
-        if sampler is not None:
-            self._table = [
-                sampler.next_1d() if dims == 1 else sampler.next_2d() for _, _, _, dims in SAMPLER_TABLE
-            ]
-            dr.eval(self._table)
-            self._samples = dr.opaque(mi.UInt32, samples)
-            self._slots = dr.opaque(mi.UInt32, dr.width(self._table[0]))
 
-    @staticmethod
-    def sequences(pixels: int) -> int:
-        """How many sequences of the scene's sampler a pass over so many pixels takes."""
-        return pixels + len(SAMPLER_TABLE) - 1
-
-    def stream(self, side: str, index, slot) -> Stream:
+    def stream(self, side: str, index) -> Stream:
         """Numbers of one subpath.
 
         ``side`` is ``camera`` or ``light``; ``index`` (``UInt64``) the subpath's place in the image's
-        sequence, unique over all passes; ``slot`` its place in this pass.
+        sequence, unique over all passes.
         """
         side_seed = sobol.hash_u32(self.seed, mi.UInt32(1 if side == "light" else 2))
         low, seed = sobol.split_index(index, side_seed)
-        first = {}
-        if self._table is not None:
-            for row, (owner, purpose, vertex, dims) in enumerate(SAMPLER_TABLE):
-                if owner == side:
-                    kind = mi.Float if dims == 1 else mi.Point2f
-                    at = slot + row * self._samples
-                    # The last lane may have slots behind the pass's last.
-                    first[purpose, vertex] = dr.gather(kind, self._table[row], at, at < self._slots)
         # A bijection of the index: no two of 2^32 samples of a sequence share their numbers.
-        return Stream(dr.brev(low), sobol.mix(seed), sobol.mix(low ^ _KEY), first)
+        return Stream(dr.brev(low), sobol.mix(seed), sobol.mix(low ^ _KEY))
 
     def draw_1d(self, side: str, stream: Stream, purpose: Purpose, vertex=0):
         """One number in [0, 1) for ``purpose`` at ``vertex`` (a Python or Dr.Jit integer)."""
@@ -178,11 +135,7 @@ class Points:
             if dims == 1:
                 return sobol.single_of(digits, seed)
             return mi.Point2f(*sobol.pair_of(digits, seed))
-        value = _hashed(sobol.mix(stream.key ^ seed), dims)
-        for name, drawn in stream.first.items():
-            if name[0] is purpose:
-                value = _replace(vertex, name[1], drawn, value)
-        return value
+        return _hashed(sobol.mix(stream.key ^ seed), dims)
 
 
 def _seed(stream, purpose, vertex):
@@ -214,10 +167,3 @@ def sequential(word: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
 
 def _to_unit(word):
     return mi.Float(mi.Int32(word >> 8)) * (2.0**-24)
-
-
-def _replace(vertex, at, inside, outside):
-    """``inside`` at the vertex ``at``, elsewhere ``outside``."""
-    if isinstance(vertex, int):
-        return inside if vertex == at else outside
-    return dr.select(vertex == at, inside, outside)

@@ -3,7 +3,7 @@
 A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
 subpaths that it serves, in S different pixels (see `batch`); all strategies of a pair are evaluated by that
 lane. No vertex lies in global memory: apart from the film, the footprint does not grow with samples or image
-size. (With ``points=sampler`` the random numbers of a pass do, and in a pilot what each sample adds.)
+size. (In a pilot what each sample adds does.)
 
 What a lane does. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
 k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
@@ -179,7 +179,7 @@ def _count_light(kernel: Kernel, batch: Batch, sharing: Sharing) -> float:
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     """The lanes of these numbers with their light subpaths, which are traced."""
     place_in_sequence = place.index(index)
-    stream = kernel.points.stream("light", place_in_sequence, index)
+    stream = kernel.points.stream("light", place_in_sequence)
     shared = subpaths.shared_by_lane(kernel, stream, place_in_sequence)
     path = light_path.allocate_light_path(kernel, dr.width(index))
     counters, emitted = Counters(), None
@@ -200,7 +200,7 @@ def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path)
         label=f"{count} light subpaths",
         exclude=[kernel, sink, place, index, shared, count],
     ):
-        stream = kernel.points.stream("light", place * count + mi.UInt64(number), index)
+        stream = kernel.points.stream("light", place * count + mi.UInt64(number))
         path, counted, _ = _light_subpath(kernel, sink, stream, shared, path)
         counters = counters + counted
         number += 1

@@ -108,7 +108,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk, guide=None) -> Side:
 def camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> CameraSample:
     """z_0 and the first direction."""
     points = kernel.points
-    stream = points.stream("camera", place.index(slot), slot)
+    stream = points.stream("camera", place.index(slot))
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
     u_lens = mi.Point2f(0.5)
     if kernel.camera.needs_aperture_sample:

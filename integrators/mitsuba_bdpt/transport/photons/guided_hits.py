@@ -47,7 +47,7 @@ class Advice:
 def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
     """The random numbers of the guided subpath of this ``number`` at the vertex of this ``event``."""
     seed = sobol.mix(stream.seed ^ sobol.mix(_SEED + event) ^ number)
-    return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED), {})
+    return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED))
 
 
 def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:

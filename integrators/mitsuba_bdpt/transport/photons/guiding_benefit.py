@@ -73,7 +73,7 @@ def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, ad
     index = dr.arange(mi.UInt32, batch.size)
     place = Places(kernel, batch, batch.samples)
     in_sequence = place.index(index)
-    shared = subpaths.shared_by_lane(kernel, points.stream("light", in_sequence, index), in_sequence)
+    shared = subpaths.shared_by_lane(kernel, points.stream("light", in_sequence), in_sequence)
     sample = subpaths.camera_sample(kernel, place, shared, index, mi.Bool(True))
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
     side = replace(subpaths.camera_side(kernel, sample, shared, walk), join=None, isolated=True)

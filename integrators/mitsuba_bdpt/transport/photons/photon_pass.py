@@ -88,7 +88,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, 
     capacity = dr.width(out)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
-    stream = kernel.points.stream("light", mi.UInt64(lanes), lanes)
+    stream = kernel.points.stream("light", mi.UInt64(lanes))
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
     e, aimed = aim.emission(
         kernel.emitters,
