@@ -83,8 +83,8 @@ class Settings:
         -1,
         UNLIMITED,
         "the longest path in edges, -1 for unlimited",
-        """Longest path in edges, as in ``path``: 1 is directly visible emitters, -1 unlimited. (In scenes
-        with participating media as in ``volpath``, where null surfaces do not count.)""",
+        """Longest path in edges, as in ``path`` (with media as in ``volpath``): 1 is directly visible
+        emitters, -1 unlimited.""",
         low=-1,
         high=UNLIMITED,
     )
@@ -98,7 +98,7 @@ class Settings:
     hide_emitters: bool = _parameter(
         False,
         "true or false",
-        "Hide directly visible emitters, as in ``path``.",
+        "Hides directly visible emitters, as in ``path``.",
     )
     heuristic: str = _parameter(
         "balance",
@@ -109,120 +109,103 @@ class Settings:
     skip: str = _parameter(
         "auto",
         "what may be left out",
-        """``none``: do everything. ``impossible``: leave out what the scene cannot use, draw one connection
-        per camera vertex, drop small contributions by unbiased Russian roulette. ``auto``: as ``impossible``,
-        and in renders of 2^14 samples or more (in scenes of ten BSDFs or more: about 2^16 for each kind of
-        BSDF) a pilot, or the scene alone where that tells, chooses what pays. What a pilot finds is
-        remembered for later renders of the scene, until its parameters are edited.""",
+        """Leaves out nothing (``none``), what the scene cannot use (``impossible``), or also what a short
+        pilot render predicts not to pay (``auto``).""",
         choices=SKIP,
     )
     light_paths: float | str = _parameter(
         "auto",
         "a number or 'auto'",
-        """Light subpaths per camera subpath: 0, 1, 1/2, 1/4, 1/8 or 1/16; one light subpath serves camera
-        subpaths of different pixels. ``auto``: the pilot's choice; without one 1/4, but 1 on films of fewer
-        than 64 pixels and 0 under an even sky; with ``skip=none`` 1. Given by hand, there is no pilot.""",
+        """Light subpaths per camera subpath: 0 (path tracing), 1/16, 1/8, 1/4, 1/2 or 1; with ``auto`` the
+        pilot chooses, a number switches the pilot off.""",
     )
     connections: str = _parameter(
         "auto",
         "a kind of inner connections",
-        """Inner connections per camera vertex: ``all``, ``one`` (drawn by its unshadowed contribution) or
-        ``none``. ``auto``: the pilot's choice; without one ``one``, but ``none`` under an even sky; with
-        ``skip=none`` ``all``. Given by hand, there is no pilot.""",
+        """Connections per camera vertex to vertices of light subpaths: ``all``, ``one`` or ``none``; with
+        ``auto`` the pilot chooses, the others switch the pilot off.""",
         choices=CONNECTIONS,
     )
     points: str = _parameter(
         "sobol",
         "a kind of sample points",
-        """Sample points: ``sobol``, Owen-scrambled Sobol' points, or ``independent`` random numbers.""",
+        "Random numbers: ``sobol`` (Owen-scrambled Sobol' points) or ``independent``.",
         choices=POINTS,
     )
     merging: bool = _parameter(
         False,
         "true or false",
-        """Merge vertices of paths on which no two neighbours can be joined (lamp, glass, wall, glass, camera)
-        with photons near them. Such light, which is fireflies or missing otherwise, comes out smooth. The
-        render is then consistent, not unbiased: it blurs these paths by about a pixel, less from pass to
-        pass.""",
+        """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
+        as the floor of a pool) by vertex merging with photons: consistent, not unbiased.""",
     )
     photon_guiding: str = _parameter(
         "auto",
         "when s = 0 is guided",
-        """Guide s = 0 by photons on paths on which no two neighbours can be joined (lamp, glass, wall, glass,
-        camera), which are fireflies otherwise; unbiased. ``auto``: where the pilot finds that it pays.
-        ``always``: wherever it is possible. ``never``.""",
+        """Photon-guided BSDF sampling of SDS paths from emitters with area, unbiased: ``auto`` (where the
+        pilot predicts a gain), ``always`` (where it is possible) or ``never``.""",
         choices=GUIDING,
     )
     emission_guiding: str = _parameter(
         "auto",
         "when emission is guided",
-        """Guide the emission of light subpaths to where they matter, by tables that the pilot learns from its
-        own samples; unbiased. ``auto``: where it finds that it pays, in renders that ask one. ``never``: not
-        unless ``decisions`` hold tables.""",
+        """Guides light subpaths towards where they matter, as the pilot has learned, unbiased: ``auto``
+        (where the pilot predicts a gain) or ``never``.""",
         choices=EMISSION_GUIDING,
     )
     decisions: tuple[Any, ...] | None = _converted(
         "",
         None,
         "a string of JSON",
-        """JSON of ``statistics["decisions"]`` of an earlier render, done again instead of asking a pilot.""",
+        """Decisions of an earlier render to use instead of a pilot: its ``statistics["decisions"]`` as
+        JSON.""",
     )
     strategy_images: bool = _parameter(
         False,
         "true or false",
-        """Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` of all *k* + 2 strategies of each
-        length *k*, with ``merging`` also ``weighted.merged`` and ``unweighted.merged``; needs a finite
+        """Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` of each strategy; needs a finite
         ``max_depth``.""",
     )
     variance: bool = _parameter(
         False,
         "true or false",
-        """Adds the layers ``variance.R``, ``.G``, ``.B`` (on a ``specfilm``: of its bands): the variance of
-        each pixel, splats included, estimated from 8 independent parts of the render;
-        ``statistics["error"]`` is the relMSE that follows. Needs at least 8 samples per pixel. Under
-        ``timeout`` at least two of the parts have to end (four for the error), so ask for no more samples
-        than it allows.""",
+        """Adds the layers ``variance.R``, ``.G``, ``.B``: the variance of each pixel, estimated from 8
+        independent parts of the render.""",
     )
     denoise: bool = _parameter(
         False,
         "true or false",
-        """Adds the layers ``denoised.R``, ``.G``, ``.B``: the image without its noise, by Intel's Open Image
-        Denoise (package mitsuba-oidn, extra ``[denoise]``), which is told albedo and normals of what is seen
-        first. The image itself stays as it is. For previews: a denoised image is biased.""",
+        """Adds the layers ``denoised.R``, ``.G``, ``.B``: the image denoised by Intel's Open Image Denoise,
+        which is biased (extra ``[denoise]``).""",
     )
     stokes: bool = _parameter(
         False,
         "true or false",
-        """Adds the layers ``S0.R`` to ``S3.B``: the Stokes vector of each pixel in the sensor's frame, as
-        Mitsuba's integrator ``stokes`` writes them. In polarized variants only.""",
+        """Adds the layers ``S0.R`` to ``S3.B``: the Stokes vector of each pixel, as Mitsuba's ``stokes``;
+        polarized variants only.""",
     )
     target_error: float = _parameter(
         0.0,
         "the relMSE to stop at, or 0 for none",
-        """Stop when the estimate of the relMSE is this or less; needs ``variance``. It is looked at after 32
-        samples per pixel, 64, 128, …; ``spp`` is the most that is spent. An estimate that is too small by
-        chance ends a render too early: see docs/user/long_renders.md for by how much.""",
+        "Stops the render when its estimated relMSE is at most this, 0 for never; needs ``variance``.",
         low=0,
     )
     aovs: str = _parameter(
         "",
         "a string, for example 'albedo:albedo,nn:sh_normal'",
-        """Adds feature layers, named by pairs ``name:kind`` as in Mitsuba's ``aov`` and equal to its layers:
-        ``albedo``, ``depth``, ``position``, ``uv``, ``geo_normal``, ``sh_normal``, ``dp_du``, ``dp_dv``,
-        ``duv_dx``, ``duv_dy``, ``prim_index``, ``shape_index``. Emitters show in them under
-        ``hide_emitters`` too.""",
+        """Adds feature layers by pairs ``name:kind`` as Mitsuba's ``aov``, for example
+        ``albedo:albedo,nn:sh_normal``.""",
     )
     spp_per_pass: int = _parameter(
         0,
         "samples per pixel in one pass, 0 to choose",
-        "Samples per pixel in one pass; 0: chosen from a budget.",
+        "Samples per pixel of a pass, after which progress is shown and checkpoints are written; 0 chooses.",
         low=0,
         high=UNLIMITED,
     )
     timeout: float = _parameter(
         -1.0,
         "a number of seconds, or -1 for none",
-        """Seconds after which no further pass is started (passes take about a tenth of it); -1: never.""",
+        "Seconds after which no further pass is started, -1 for no limit.",
     )
 
     internals: Internals = Internals()
