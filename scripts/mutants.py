@@ -1241,8 +1241,8 @@ MUTANTS = (
     Mutant(
         "guided s = 0: t = 0 counts it at all diffuse vertices of a light subpath",
         "transport/photons/guided_hits.py",
-        "possible = walk.only_delta & is_sds_vertex",
-        "possible = is_sds_vertex",
+        "walk, y) & walk.only_delta",
+        "walk, y)",
         ("tests/images/test_sds_paths.py::test_light_subpaths_with_two_diffuse_vertices",),
     ),
     Mutant(

@@ -60,7 +60,7 @@ def look_back(kernel: Kernel, y: Vertex, walk: Walk, step) -> Advice:
 
     ``step`` is not used: `Side.guide` passes it.
     """
-    possible = walk.only_delta & is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
+    possible = is_sds_vertex(kernel, kernel.kappa.direct, walk, y) & walk.only_delta
     return _evaluated(kernel, y, -walk.d, possible)
 
 

@@ -55,6 +55,6 @@ class Photon:
         return Photon(*(dr.gather(type(field), field, index, active) for field in vars(self).values()))
 
 
-def same_surface(a: mi.Normal3f, b: mi.Normal3f) -> mi.Bool:
+def same_surface(a: mi.Normal3f, b: mi.Normal3f):
     """Mask: points with the geometric normals ``a`` and ``b`` are taken to lie on one surface."""
     return dr.dot(a, b) > SAME_SURFACE
