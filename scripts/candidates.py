@@ -11,11 +11,11 @@ pilots choose, and what that is worth: scripts/choices.py.)
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import sys
 
+import command_line
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 from mitsuba_bdpt.measure.tables import table
 
@@ -113,7 +113,7 @@ def lines(name: str, depth: int) -> list:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("scene", nargs="+")
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")

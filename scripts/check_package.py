@@ -8,7 +8,6 @@ page, the version is that of the changes and the citation, and the entry points 
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
 import tarfile
@@ -16,6 +15,8 @@ import zipfile
 from email import message_from_bytes
 from email.message import Message
 from pathlib import Path
+
+import command_line
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -64,7 +65,7 @@ def mistakes(path: Path) -> list[str]:
 
 def main(arguments=None) -> int:
     """Print what is wrong, and return the exit status."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("folder", type=Path)
     paths = sorted(parser.parse_args(arguments).folder.glob("mitsuba_bdpt-*"))
     found = [f"{path.name}: {text}" for path in paths for text in mistakes(path)]

@@ -22,7 +22,6 @@ light that only `merging` finds, which no choice has.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -30,6 +29,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import repository
@@ -230,9 +230,7 @@ def shown(row: dict) -> list[str]:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser(__doc__)
     parser.add_argument("scenes", nargs="*", help="names in scenes/, also small_casters/NAME")
     parser.add_argument("--all", action="store_true", help="the benchmark's scenes and all of small_casters")
     parser.add_argument("--again", action="store_true", help="render the default of scenes in OUTPUT anew")

@@ -11,12 +11,12 @@ is not.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from mitsuba_bdpt.cli.mistakes import answered
@@ -535,7 +535,7 @@ def page(rows) -> str:
 
 def main(arguments=None) -> int:
     """Command line; returns the exit status."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.splitlines()[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("--page", type=Path, help="Markdown file whose part is replaced")
     parser.add_argument("--only", default="", help="cases whose name contains this")
     options = parser.parse_args(arguments)

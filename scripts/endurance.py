@@ -17,7 +17,6 @@ that failed, of whatever version; 2 for a mistake, 0 if all is well.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import signal
@@ -26,6 +25,7 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 import repository
@@ -293,9 +293,7 @@ def is_clean(record: dict) -> bool:
 
 def main(arguments=None) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser(__doc__)
     known = repository.PROJECT.scene_names()
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="of scenes/; default: all")
     text_ = "default: until there are --samples"

@@ -5,10 +5,10 @@ python scripts/fireflies.py glass_caustics thin_lens --seeds 5
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
+import command_line
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import number, within
@@ -22,9 +22,7 @@ from instruments import fireflies
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser(__doc__)
     add, one = parser.add_argument, number(int, 1)
     add("scenes", nargs="+", help="scene files, or names in PROJECT/scenes")
     add("--project", type=Path, default=repository.ROOT, metavar="DIR", help="default: this repository")

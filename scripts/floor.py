@@ -5,10 +5,10 @@ python scripts/floor.py cornell_box uplight_room veach_mis
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 
+import command_line
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.measure import probes
@@ -41,7 +41,7 @@ def probe(project: Project, rounds: int) -> dict:
 
 def main(arguments=None) -> int:
     """Print the ratio per scene."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("scene", nargs="+")
     parser.add_argument("--rounds", type=number(int, 1), default=5)
     parser.add_argument("--path", action="store_true", help="of Mitsuba's path, over the same floor")

@@ -20,6 +20,7 @@ import multiprocessing
 import time
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
@@ -176,8 +177,7 @@ def over(other: dict, ours: dict, which: str) -> float:
 
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
-    layout = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__, formatter_class=layout)
+    parser = command_line.parser(__doc__)
     parser.add_argument("scenes", nargs="*", help="names; by default those of the benchmark")
     parser.add_argument("--variant", default="cuda_ad_rgb")
     parser.add_argument("--device", default="", help="name of the GPU, for the file")

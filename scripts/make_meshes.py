@@ -4,9 +4,9 @@ Every mesh is computed from the few numbers below and written as a small binary 
 rounded to 1e-5, so that the files come out the same, byte for byte, on every machine.
 """
 
-import argparse
 from pathlib import Path
 
+import command_line
 import numpy as np
 
 FOLDER = Path(__file__).resolve().parents[1] / "scenes" / "meshes"
@@ -288,7 +288,7 @@ def make_all(folder=FOLDER):
 
 def main(arguments=None):
     """Makes them in the folder that the command line names."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split(":")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
     make_all(parser.parse_args(arguments).folder)
 

@@ -4,9 +4,9 @@ Environment maps as Mitsuba reads them: rows from the zenith (+y) to the nadir, 
 way of +x, +z and -x back to -z. Slides from the top. Half floats in EXR.
 """
 
-import argparse
 from pathlib import Path
 
+import command_line
 import numpy as np
 import OpenEXR
 
@@ -89,7 +89,7 @@ def make_all(folder=FOLDER):
 
 def main(arguments=None):
     """Makes them in the folder that the command line names."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split(":")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
     make_all(parser.parse_args(arguments).folder)
 

@@ -3,10 +3,10 @@
 Grids as Mitsuba's `gridvolume` reads them: 32-bit floats, x fastest, then y, then z, in a box of [0, 1]^3.
 """
 
-import argparse
 import struct
 from pathlib import Path
 
+import command_line
 import numpy as np
 
 FOLDER = Path(__file__).resolve().parents[1] / "scenes" / "volumes"
@@ -50,7 +50,7 @@ def make_all(folder=FOLDER):
 
 def main(arguments=None):
     """Makes them in the folder that the command line names."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split(":")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
     make_all(parser.parse_args(arguments).folder)
 

@@ -13,7 +13,6 @@ changed: plant the bug anew).
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import shutil
@@ -23,6 +22,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import command_line
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.errors import CommandError
 
@@ -1609,9 +1609,7 @@ def run(mutants: list[Mutant], bug: bool) -> int:
 
 def main(arguments=None) -> int:
     """Run the tests of the mutants, or print these."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser(__doc__)
     parser.add_argument("words", nargs="*", help="only mutants with one of these words in their name")
     parser.add_argument("--list", action="store_true", help="print names and what is replaced, run nothing")
     parser.add_argument("--unchanged", action="store_true", help="run the same tests without the bugs")

@@ -21,13 +21,13 @@ record (`dr.eval` of a kernel that it knows), and waiting for the kernel.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
 import time
 from collections import defaultdict
 from contextlib import contextmanager
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
@@ -175,7 +175,7 @@ def measure_small(name: str) -> list[list[str]]:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("scenes", nargs="+", help="names in scenes/")
     parser.add_argument("--short", action="store_true", help="renders of 4 and 16 samples per pixel")
     parser.add_argument("--small", action="store_true", help="renders of 64^2 at 8 samples per pixel")

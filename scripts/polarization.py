@@ -5,10 +5,10 @@ python scripts/polarization.py docs/images
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
@@ -78,7 +78,7 @@ def pictures(folder: Path, spp: int) -> None:
 
 def main(arguments=None) -> int:
     """Write the picture."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
+    parser = command_line.parser(__doc__)
     parser.add_argument("folder", nargs="?", type=Path, default=repository.ROOT / "docs" / "images")
     parser.add_argument("--spp", type=number(int, 1), default=512)
     options = parser.parse_args(arguments)

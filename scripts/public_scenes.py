@@ -24,6 +24,7 @@ from argparse import Namespace
 from dataclasses import dataclass
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 from mitsuba_bdpt.cli.mistakes import answered
@@ -277,9 +278,7 @@ def measured(options: Namespace, folder: Path) -> tuple[Findings, bool]:
 
 def parser() -> argparse.ArgumentParser:
     """That of the command line."""
-    made = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    made = command_line.parser(__doc__)
     add = made.add_argument
     add("folder", type=Path, metavar="FOLDER", help="folder with scenes")
     add("-o", "--output", type=Path, help="folder; default: results/public_FOLDER of the repository")

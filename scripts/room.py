@@ -6,9 +6,9 @@ python scripts/room.py ceiling 12     # in one with things of so many materials
 
 from __future__ import annotations
 
-import argparse
 import time
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 from mitsuba_bdpt.measure.metrics import TRIM, spread
@@ -275,7 +275,7 @@ def efficiency(scene: dict, seeds: int = 3, spp: int = 64) -> tuple[float, float
 
 def main() -> None:
     """Print efficiencies."""
-    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
+    parser = command_line.parser(__doc__)
     parser.add_argument("light", nargs="?", choices=LIGHTS)
     parser.add_argument("materials", nargs="?", type=int, default=18)
     options = parser.parse_args()

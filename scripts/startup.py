@@ -12,13 +12,13 @@ beyond those of the same render again, which other processes disturb less, and o
 
 from __future__ import annotations
 
-import argparse
 import os
 import statistics
 import sys
 import tempfile
 from pathlib import Path
 
+import command_line
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.measure.probes import numbers
@@ -82,7 +82,7 @@ print(taken[0][0], taken[0][1] - taken[1][1])
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(allow_abbrev=False, description=__doc__.split("\n\n")[0])
+    parser = command_line.parser(__doc__)
     materials = number(int, 0, MOST)
     parser.add_argument("--rooms", type=materials, nargs="+", help="numbers of materials; 0: the Cornell box")
     count = number(int, 1)

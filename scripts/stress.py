@@ -26,6 +26,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import command_line
 import repository
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_text
@@ -192,9 +193,7 @@ def changes(record: list[dict], before: list[dict]) -> list[str]:
 
 def main(arguments=None) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser(__doc__)
     known = {case.name: case for case in cases()}
     parser.add_argument(
         "names", nargs="*", metavar="NAME", help="cases; default: all, and the page is written"

@@ -15,7 +15,6 @@ or a decision does.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -24,6 +23,7 @@ import tempfile
 from contextlib import ExitStack, closing
 from pathlib import Path
 
+import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import repository
@@ -144,9 +144,7 @@ def _named(decisions: list) -> str:
 
 def main(arguments=None) -> int:
     """Print the table."""
-    parser = argparse.ArgumentParser(
-        allow_abbrev=False, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line.parser(__doc__)
     parser.add_argument("checkout", type=Path, help="the folder of the other one")
     parser.add_argument("--scenes", nargs="+", help="names in scenes/ that have references")
     parser.add_argument("--parameters", nargs="+", default=[], metavar="KEY=VALUE")

@@ -16,7 +16,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.measure import making, reference, showing, sweep
+from mitsuba_bdpt.measure import making, reference, report, showing, sweep
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import SceneFile
 
@@ -328,7 +328,11 @@ def test_the_parser_needs_nothing_of_the_extra():
 def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
     """Expected: no traceback, and the exit status of an interrupted process."""
     parsed = build_parser().parse_args(["report", "x"])
-    monkeypatch.setattr(parsed, "measuring", lambda options: (_ for _ in ()).throw(KeyboardInterrupt))
+
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "run", interrupted)
     assert measuring.run(parsed) == measuring.mistakes.INTERRUPTED
     assert capsys.readouterr().err == "interrupted; what was finished is kept\n"
 

@@ -6,6 +6,7 @@ The room `measure` is imported when one of them runs, since it needs packages th
 from __future__ import annotations
 
 import argparse
+import importlib
 import importlib.util
 import sys
 from argparse import Namespace
@@ -21,18 +22,19 @@ NEEDED = ("colour", "flip_evaluator", "matplotlib", "pyarrow", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
 
 
-def run(asked: Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Run a subcommand and return its exit status."""
     try:
-        return mistakes.answered(lambda: _run(asked))
+        return mistakes.answered(lambda: _run(arguments))
     except KeyboardInterrupt:
         print("interrupted; what was finished is kept", file=sys.stderr)
         return mistakes.INTERRUPTED
 
 
-def _run(asked: Namespace) -> int:
-    check_installed(asked.command)
-    return asked.measuring(asked)
+def _run(arguments: Namespace) -> int:
+    check_installed(arguments.command)
+    *_, module = COMMANDS[arguments.command]
+    return importlib.import_module(f"..measure.{module}", __package__).run(arguments)
 
 
 def check_installed(command: str) -> None:
@@ -46,12 +48,11 @@ def check_installed(command: str) -> None:
 
 def add_commands(add_command: Callable[[str, str], argparse.ArgumentParser]) -> None:
     """Declare all subcommands; ``add_command`` makes the parser of one, of its name and help."""
-    for name, (help_text, declare, measuring) in COMMANDS.items():
+    for name, (help_text, declare, _) in COMMANDS.items():
         parser = add_command(name, help_text)
         text = "folder with scenes/, references/, presets/, results/; default: the current one"
         parser.add_argument("--project", type=Path, default=Path(), metavar="DIR", help=text)
         declare(parser)
-        parser.set_defaults(measuring=measuring)
 
 
 def integrator(text: str) -> tuple[str, dict]:
@@ -128,67 +129,25 @@ def _declare_pyramid(parser) -> None:
     declare(parser, options.Pyramid)
 
 
-def _sweep(asked: Namespace) -> int:
-    from ..measure import sweep
-
-    return sweep.run(asked)
-
-
-def _report(asked: Namespace) -> int:
-    from ..measure import report
-
-    return report.run(asked)
-
-
-def _page(asked: Namespace) -> int:
-    from ..measure import page
-
-    return page.run(asked)
-
-
-def _reference(asked: Namespace) -> int:
-    from ..measure import making
-
-    return making.run(asked)
-
-
-def _compare(asked: Namespace) -> int:
-    from ..measure import compare
-
-    return compare.run(asked)
-
-
-def _equal_time(asked: Namespace) -> int:
-    from ..measure import equal_time
-
-    return equal_time.run(asked)
-
-
-def _pyramid(asked: Namespace) -> int:
-    from ..measure import pyramid
-
-    return pyramid.run(asked)
-
-
-COMMANDS: dict[str, tuple[str, Callable, Callable[[Namespace], int]]] = {
+COMMANDS: dict[str, tuple[str, Callable, str]] = {
     "sweep": (
         "render scenes by several integrators, budgets and seeds: a row of times and errors for each render",
         _declare_sweep,
-        _sweep,
+        "sweep",
     ),
-    "report": ("tables and plots of a sweep, as Markdown", _declare_report, _report),
-    "page": ("a sweep as one HTML file, with images to compare", _declare_page, _page),
+    "report": ("tables and plots of a sweep, as Markdown", _declare_report, "report"),
+    "page": ("a sweep as one HTML file, with images to compare", _declare_page, "page"),
     "reference": (
         "make references with an error estimate of their own",
         _declare_reference,
-        _reference,
+        "making",
     ),
     "compare": (
         "two ways to render, alternating: time, error and efficiency of the first over the second",
         _declare_compare,
-        _compare,
+        "compare",
     ),
-    "equal-time": ("a picture of integrators side by side at equal time", _declare_equal_time, _equal_time),
-    "pyramid": ("an image of each strategy (s, t), as EXR and PNG", _declare_pyramid, _pyramid),
+    "equal-time": ("a picture of integrators side by side at equal time", _declare_equal_time, "equal_time"),
+    "pyramid": ("an image of each strategy (s, t), as EXR and PNG", _declare_pyramid, "pyramid"),
 }
-"""Help, declaration of the arguments and run of each subcommand."""
+"""Help, declaration of the arguments, and module of `measure` whose ``run`` does it, of each subcommand."""

@@ -7,6 +7,8 @@ finite has an invalid box too, though rays meet its other triangles.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mitsuba as mi
 import numpy as np
 
@@ -24,7 +26,7 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
         box = mi.ScalarBoundingBox3f()
         for corner in (vertices.min(axis=0), vertices.max(axis=0)) if len(vertices) else ():
             box.expand(mi.ScalarPoint3f(corner.tolist()))
-    return box if _is_finite(box) else None
+    return box if is_finite(box) else None
 
 
 def boxes(scene: mi.Scene) -> list[mi.ScalarBoundingBox3f]:
@@ -37,11 +39,27 @@ def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
     """The bounding box of a scene, those of shapes included that Mitsuba leaves out of its own."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
     for shape in scene.shapes():
-        partial = shape.class_name() == "Mesh" or not _is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
+        partial = shape.class_name() == "Mesh" or not is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
         if partial and (box := box_of(shape)) is not None:
             whole.expand(box)
     return whole
 
 
-def _is_finite(box: mi.ScalarBoundingBox3f) -> bool:
+def corners(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The lower and upper corners (n, 3) of the boxes with the indices ``which``, in double precision."""
+    low, high = (
+        np.array([np.array(corner, dtype=np.float64).ravel() for corner in of_all])
+        for of_all in ([box.min for box in boxes], [box.max for box in boxes])
+    )
+    return low[which], high[which]
+
+
+def points_in(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray, u: np.ndarray) -> mi.Point3f:
+    """Points of the boxes with the indices ``which``, at the places ``u`` (n, 3) of the unit cube."""
+    low, high = corners(boxes, which)
+    return mi.Point3f((low + u * (high - low)).T)
+
+
+def is_finite(box: mi.ScalarBoundingBox3f) -> bool:
+    """Whether there is something in a box, and its corners are finite."""
     return box.valid() and bool(np.isfinite([box.min, box.max]).all())

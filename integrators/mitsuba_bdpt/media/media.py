@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UnsupportedError, UsageError
+from ..geometry.boxes import points_in
 from ..geometry.rounding import ShapeErrors
 from ..host.introspection import all_shapes, children, is_instance, named
 from .equal import representatives
@@ -312,11 +313,7 @@ def _points_within(boxes: list[mi.BoundingBox3f], rng) -> mi.Point3f:
     """Points spread over boxes, in each as many; the origin without any."""
     if not boxes:
         return dr.zeros(mi.Point3f, _PROBES)
-    low = np.array([box.min for box in boxes], dtype=float).reshape(len(boxes), 3)
-    high = np.array([box.max for box in boxes], dtype=float).reshape(len(boxes), 3)
-    which = np.arange(_PROBES) % len(boxes)
-    u = rng.random((_PROBES, 3))
-    return mi.Point3f((low[which] + u * (high - low)[which]).T)
+    return points_in(boxes, np.arange(_PROBES) % len(boxes), rng.random((_PROBES, 3)))
 
 
 def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str:

@@ -272,7 +272,7 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
     if gain <= 1:
         return ""
     if chosen.candidate.guided and not row.candidate.guided:
-        return "without guided s=0 it has the outliers of isolated (SDS) paths, which are in no figure here"
+        return "without guided s=0 it has the outliers of SDS paths, which are in no figure here"
     if not chosen.candidate.light_paths and row.candidate.light_paths:
         return f"light subpaths have to gain {LIGHT_GAIN:g}x, and gain {gain:.2f}x"
     if not (chosen.candidate.light_paths and row.candidate.light_paths):

@@ -59,7 +59,7 @@ def explain(
             ("(1,1) (emitter point seen by the sensor)", p.endpoints),
             ("t=0 (light subpath hits the sensor)", p.arrival),
             (
-                f"guided s=0 ({p.guided} per vertex of paths on which no two neighbours can be joined)",
+                f"guided s=0 ({p.guided} per vertex of SDS paths)",
                 p.guided,
             ),
             (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
@@ -76,8 +76,7 @@ def explain(
     lines += [f"used: {name}" for name in used]
     if p.merging:
         lines.append(
-            "used: merging of vertices on isolated paths, of which no strategy in use joins two neighbours "
-            "(the render is consistent, not unbiased)"
+            "used: vertex merging (photon mapping) of SDS paths (the render is consistent, not unbiased)"
         )
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     longest = prepared.stored_vertices(settings)
@@ -134,7 +133,7 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
         )
     if table[0].candidate.guided:
         lines.append(
-            f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of isolated paths, which none of "
+            f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of SDS paths, which none of "
             "these figures has"
         )
     if table[0].without_tables:

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..emitters.emitters import Emitters
-from ..geometry.boxes import box_of, scene_box
+from ..geometry.boxes import box_of, corners, points_in, scene_box
 from ..host.introspection import is_instance, named
 from ..media import boundaries
 from ..media.media import Space, random_directions
@@ -203,7 +203,8 @@ class _Leaving:
         each = min(max(_LEAVING // len(bounds), _OF_SHAPE), _LEAVING_ONE)
         count = each * len(bounds)
         rng = np.random.default_rng(4)
-        through = _points_in([box for _, box in bounds], each, rng)
+        which = np.repeat(np.arange(len(bounds)), each)
+        through = points_in([box for _, box in bounds], which, rng.random((count, 3)))
         local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.random((2, count))))
         local.z = dr.select(dr.arange(mi.UInt32, count) % 2 == 0, local.z, -local.z)
         sides = boundaries.leaving(space, _through_scene(space, through, rng), through, local)
@@ -400,7 +401,8 @@ def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int
     """
     count = each * len(boxes)
     rng = np.random.default_rng(1)
-    through = _points_in(boxes, each, rng)
+    which = np.repeat(np.arange(len(boxes)), each)
+    through = points_in(boxes, which, rng.random((count, 3)))
     straight, (ray, _) = _through_scene(space, through, rng), _camera_rays(sensor, count, 2)
     own = mi.Ray3f(mi.Point3f(ray.o), mi.Vector3f(ray.d))
     lane = dr.arange(mi.UInt32, count)
@@ -408,24 +410,10 @@ def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int
         own.d = dr.select(lane % 4 == 1, dr.normalize(through - own.o), own.d)
     reflected = lane % 2 == 1
     medium = dr.select(reflected, dr.opaque(mi.UInt32, space.media.sensor), dr.opaque(mi.UInt32, outside))
-    low, high = _corners(boxes, each)
+    low, high = corners(boxes, which)
     slack = _SLACK * (high - low).max(1, keepdims=True) + _SLACK**2 * np.abs([low, high]).max((0, 2))[:, None]
-    corners = (mi.Point3f(x.T) for x in (low - slack, high + slack))
-    return boundaries.Lines(dr.select(reflected, own, straight), medium, reflected, through, *corners)
-
-
-def _corners(boxes: list, each: int) -> tuple[np.ndarray, ...]:
-    """The corners of every box, (n, 3), ``each`` times in a row."""
-    return tuple(
-        np.repeat(np.array([np.array(x, dtype=np.float64).ravel() for x in corner]), each, axis=0)
-        for corner in ([box.min for box in boxes], [box.max for box in boxes])
-    )
-
-
-def _points_in(boxes: list, each: int, rng) -> mi.Point3f:
-    """``each`` random points in every box, box by box."""
-    low, high = _corners(boxes, each)
-    return mi.Point3f((low + rng.random(low.shape) * (high - low)).T)
+    box = (mi.Point3f(x.T) for x in (low - slack, high + slack))
+    return boundaries.Lines(dr.select(reflected, own, straight), medium, reflected, through, *box)
 
 
 def _through_scene(space: Space, through: mi.Point3f, rng) -> mi.Ray3f:

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
-from ..geometry.boxes import scene_box
+from ..geometry.boxes import is_finite, points_in, scene_box
 from ..geometry.mitsubas_choices import spread_points
 from ..host.edits import State
 from ..host.introspection import children, named
@@ -145,11 +145,10 @@ def _wavelengths():
 def _places(scene: mi.Scene) -> mi.Point3f:
     """Points all over the scene's box, or the unit cube if it has none."""
     box = scene_box(scene)
-    low, high = np.array(box.min, dtype=float).ravel(), np.array(box.max, dtype=float).ravel()
-    if not (np.isfinite([low, high]).all() and (low <= high).all()):
-        low, high = np.zeros(3), np.ones(3)
+    if not is_finite(box):
+        box = mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
     u = np.random.default_rng(1).random((3, _COUNT))
-    return mi.Point3f(low[:, None] + u * (high - low)[:, None])
+    return points_in([box], np.zeros(_COUNT, dtype=int), u.T)
 
 
 # -- textures ---------------------------------------------------------------------------------
