@@ -96,7 +96,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     ended: BaseException | None = None
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
-        asked = integrator.statistics  # before the parts, whose own take their place
+        of_pilot = integrator.statistics  # before the parts, whose own take their place
         count = options.parts or PARTS_PER_WORKER * worker_count(workers.client)
         parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
         try:
@@ -116,21 +116,21 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
             raise ended
         return {"passes": []}, ended
     integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
-    return _with_pilot(integrator.statistics, asked), ended
+    return _with_pilot(integrator.statistics, of_pilot), ended
 
 
-def _with_pilot(parts: dict, asked: dict) -> dict:
-    """Statistics of the ``parts``, with what the pilot left when it was ``asked``.
+def _with_pilot(parts: dict, of_pilot: dict) -> dict:
+    """Statistics of the ``parts`` together with those ``of_pilot``.
 
     The parts know the pilot's decisions alone. Nothing is added where decisions were given by hand.
     """
-    if not asked:
+    if not of_pilot:
         return parts
     sums = {
-        name: {key: number + asked[name][key] for key, number in parts[name].items()}
+        name: {key: number + of_pilot[name][key] for key, number in parts[name].items()}
         for name in ("seconds", "kernels")
     }
-    return parts | {name: asked[name] for name in ("no_pilot", "non_finite_in_pilot", "skipped")} | sums
+    return parts | {name: of_pilot[name] for name in ("no_pilot", "non_finite_in_pilot", "skipped")} | sums
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:

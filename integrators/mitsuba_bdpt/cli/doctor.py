@@ -123,12 +123,12 @@ def render_in_child(
         child = start(command, capture_output=True, text=True, timeout=TIME_LIMIT)
     except subprocess.TimeoutExpired:
         return [Finding("FAIL", "test image", f"not finished after {TIME_LIMIT} seconds")]
-    said: dict = {}
+    report: dict = {}
     for line in child.stdout.splitlines():
         if line.startswith("{"):
-            said.update(json.loads(line))
-    findings = [variants(said["variants"], said.get("backends", []))] if "variants" in said else []
-    return [*findings, judge(child, said, variant)]
+            report.update(json.loads(line))
+    findings = [variants(report["variants"], report.get("backends", []))] if "variants" in report else []
+    return [*findings, judge(child, report, variant)]
 
 
 def variants(installed: list[str], backends: list[str]) -> Finding:
@@ -156,8 +156,8 @@ def why_not(variant: str, backends: list[str]) -> str:
     return "" if "LLVM" in backends else "no LLVM library was found"
 
 
-def judge(child: subprocess.CompletedProcess, said: dict, variant: str) -> Finding:
-    """Put the end of the `child`, which printed `said`, into words."""
+def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Finding:
+    """Put the end of the `child`, which printed `report`, into words."""
     last = (child.stderr.strip().splitlines() or ["it printed no error"])[-1]
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
@@ -167,11 +167,11 @@ def judge(child: subprocess.CompletedProcess, said: dict, variant: str) -> Findi
         return Finding("FAIL", "test image", text)
     if child.returncode > 0:
         return Finding("FAIL", "test image", last)
-    mean = said.get("mean", float("nan"))
+    mean = report.get("mean", float("nan"))
     # The box reflects less than its lamp emits, and no part of it is black.
     if not 0.01 < mean < 10:
         return Finding("FAIL", "test image", f"rendered with {variant}, but its mean is {mean:g}")
-    with_llvm = f", LLVM {said['llvm']}" if said.get("llvm") else ""
+    with_llvm = f", LLVM {report['llvm']}" if report.get("llvm") else ""
     return Finding("ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}")
 
 

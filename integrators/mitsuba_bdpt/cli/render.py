@@ -167,12 +167,12 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
         if job.statistics is not None:
             write_json(job.statistics, {"settings": settings(job, spp)} | found)
         outcome.written()
-        say(summary(job.output, outcome, sensor.film().crop_size(), asked_error(integrator)))
+        say(summary(job.output, outcome, sensor.film().crop_size(), target_error_of(integrator)))
     finally:
         ending.patient = False
     if outcome.error is not None:
         raise outcome.error
-    return not outcome.interrupted and not ending.asked
+    return not outcome.interrupted and not ending.signalled
 
 
 def samples_per_pixel(scene: mi.Scene, job: Namespace) -> int:
@@ -342,7 +342,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
         done = 0
     outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics=statistics)
     if kept is not None:
-        whole = done == spp or reached(asked_error(integrator), statistics)
+        whole = done == spp or reached(target_error_of(integrator), statistics)
         outcome.finished = not interrupted and whole
         # Of a finished render at the end only: its image may fail to be written.
         if outcome.finished:
@@ -357,14 +357,14 @@ def is_ours(integrator: mi.Integrator) -> bool:
     return hasattr(integrator, "assemble")
 
 
-def asked_error(integrator) -> float:
+def target_error_of(integrator) -> float:
     """The parameter ``target_error``, from wherever it comes; 0 for other integrators than `bdpt`."""
     return getattr(getattr(integrator, "settings", None), "target_error", 0)
 
 
-def reached(asked: float, statistics: Mapping) -> bool:
-    """Whether the error that was ``asked`` for, if not 0, is reached."""
-    return 0 < asked and statistics["error"] <= asked
+def reached(target_error: float, statistics: Mapping) -> bool:
+    """Whether the ``target_error``, if not 0, is reached."""
+    return 0 < target_error and statistics["error"] <= target_error
 
 
 @dataclass(frozen=True)

@@ -18,18 +18,18 @@ class Ending:
     """What has ended a command before its time.
 
     ``status``, with which it exits then; ``patient``: whether the next signal is only noted, since what is
-    done is being written; ``asked``: whether one has come.
+    done is being written; ``signalled``: whether one has come.
     """
 
     status: int = INTERRUPTED
     patient: bool = False
-    asked: bool = False
+    signalled: bool = False
 
     def __call__(self, number: int, frame: object) -> None:
         """Answer a signal: the first one raises ``KeyboardInterrupt``; later ones change nothing."""
-        if self.asked:
+        if self.signalled:
             return
-        self.asked, self.status = True, STATUS[signal.Signals(number)]
+        self.signalled, self.status = True, STATUS[signal.Signals(number)]
         if not self.patient:
             raise KeyboardInterrupt
 

@@ -48,7 +48,7 @@ class NearSide:
     escaped: mi.Bool
 
 
-# Reflections at opaque surfaces after which a ray is given up.
+# Reflections at opaque surfaces after which a ray is given up: among walls without a boundary it never ends.
 _REFLECTIONS = 16
 
 
@@ -142,7 +142,7 @@ class Lines:
     high: mi.Point3f
 
 
-# Reflections of such a line.
+# Reflections of such a line, which among walls would never end either.
 _AIMED = 4
 
 

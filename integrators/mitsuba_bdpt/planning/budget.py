@@ -24,7 +24,8 @@ LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 # (docs/development/experiments.md, "Choice of strategies").
 SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
 
-# Multiple of that length from which on the pilot also predicts the gain of guided s = 0 (two more kernels).
+# Multiple of that length from which on the pilot also predicts the gain of guided s = 0, which takes three
+# kernels in place of one (docs/development/experiments.md, "Choice of strategies").
 GUIDING_TIMES = 4
 
 # What a render is taken for whose number of samples is only a bound, see `expected_samples`.

@@ -19,8 +19,9 @@ from .decision import Decision
 # `furnace_white`.
 SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_GAIN = 1 / 2, 2, 1 << 20, 1.1
 
-# Multiple of the least length of a render with a pilot at which a gain of `UNIFORM_GAIN` pays for the pilot.
-UNIFORM_TIMES = 10
+# Multiple of the least length of a render with a pilot at which a gain of `UNIFORM_GAIN` pays for the pilot:
+# the least length is what its kernel costs.
+UNIFORM_TIMES = round(1 / (UNIFORM_GAIN - 1))
 
 
 def decision(

@@ -310,7 +310,7 @@ def measure(
         kappa_direct=1.0,
         roulette=False,
     )
-    asked, kernel = lanes, Kernel(prepared, everything, settings, mis.ByClass())
+    all_lanes, kernel = lanes, Kernel(prepared, everything, settings, mis.ByClass())
     found = None
     guiding = guiding and everything.guidable
     if guiding:
@@ -328,7 +328,7 @@ def measure(
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
-    pilot = Pilot(region, batch, rarest(stands_for, asked), prepared.space is not None, listener)
+    pilot = Pilot(region, batch, rarest(stands_for, all_lanes), prepared.space is not None, listener)
     # What is not in nets are independent numbers: the squared mean follows from products of samples.
     points = Points(settings.points, seed)
     counts = trace(kernel, pilot, batch, points, samples)

@@ -27,7 +27,8 @@ _COUNT = 4096  # answers of a plugin
 # What Mitsuba raises of a method that a Python class does not have.
 _NOT_IMPLEMENTED = re.compile("pure virtual|not implemented", re.IGNORECASE)
 
-# Share of the answers that may differ, by rounding or at edges, and by how much each may.
+# Share of the answers that may differ, by rounding or at edges, and by how much each may (relative). Wrong
+# statements show in most answers, far beyond the noise of single precision.
 _OFF, _RELATIVE = 0.05, 0.01
 
 
