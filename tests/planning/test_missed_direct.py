@@ -100,6 +100,12 @@ def test_missing_light_through_glass_is_said(lamp):
     assert of_plan(meter(), lamp, WITHOUT, pane=GLASS, blind=BLIND) == []
 
 
+def test_a_lamp_that_starts_no_light_subpath_is_not_looked_for():
+    """Rationale: a user's own lamp without area has none to follow. Expected: no warning, no error."""
+    parts.register_plugins()
+    assert of_plan(meter(), parts.EMITTERS["own lamp"](), WITHOUT, pane=GLASS) == []
+
+
 def test_a_batch_of_meters_behind_glass():
     """Expected: a warning by default too: t = 0 does not look which of the meters light hits."""
     a, b = (mi.load_dict(meter(x)) for x in (-0.1, 0.1))

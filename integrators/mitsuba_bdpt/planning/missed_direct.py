@@ -73,7 +73,8 @@ def _arriving(prepared: PreparedScene, direct: bool, max_depth: int) -> tuple[in
     """
     views = _with_area(prepared)
     if not direct:
-        if prepared.space is not None:  # `lost_light` knows surfaces only
+        # `lost_light` knows surfaces only, and emitters that light subpaths start from.
+        if prepared.space is not None or not prepared.emitters.traced:
             return ()
         found = {i for view in views for i in lost_light.arriving(prepared, view, max_depth)}
         return tuple(sorted(found)[: NAMED + 1])
