@@ -1,7 +1,7 @@
 """Where Mitsuba's own light tracer, `ptracer`, is wrong: a number for each case beside the right one.
 
     python scripts/compare_ptracer.py                    # prints the table
-    python scripts/compare_ptracer.py --page docs/user/coverage.md
+    python scripts/compare_ptracer.py --page docs/reports/ptracer.md
 
 The right number is Mitsuba's `path` where that can see the light, else a closed form; both light tracers
 render the same scene with the same depth. ``--page`` fills the part of a Markdown file between

@@ -1102,9 +1102,23 @@ MUTANTS = (
     Mutant(
         "merging: normals are not compared",
         "transport/photons/merging.py",
-        "return within & flat & same_surface(photon.n, z.si.n)",
-        "return within & flat",
+        "(beyond_rounding < _FLAT * r) & same_surface(photon.n, z.si.n)",
+        "(beyond_rounding < _FLAT * r)",
         ("tests/images/test_merging.py::test_which_photons_are_near",),
+    ),
+    Mutant(
+        "merging: rounding errors of hits are heights",
+        "transport/photons/merging.py",
+        "dr.maximum(height - 2 * z.anchor.offset, 0)",
+        "height",
+        ("tests/images/test_merging.py::test_which_photons_are_near",),
+    ),
+    Mutant(
+        "merging: discs are smaller than the rounding error of positions",
+        "transport/photons/merge_radius.py",
+        "return dr.maximum(of_pixels, offset_at(dr.max(dr.abs(p))))",
+        "return of_pixels",
+        ("tests/images/test_merging.py::test_far_from_the_origin",),
     ),
     Mutant(
         "merging: discs of another pass",
@@ -1217,14 +1231,14 @@ MUTANTS = (
     Mutant(
         "merging: photons of the coarsest grid of a disc alone",
         "transport/photons/merging.py",
-        "lowest = level_of(radius, r * (1 - 1.01 * radius.angle))",
-        "lowest = level_of(radius, r * (1 + 1.01 * radius.angle))",
+        "lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))",
+        "lowest = level_of(radius, r * (1 + 1.01 * radius.steepest))",
         ("tests/images/test_sds_paths.py::test_all_photons_of_a_disc_are_found",),
     ),
     Mutant(
         "merging: photons of the finest grid of a disc alone",
         "transport/photons/merging.py",
-        "corners = (level_of(radius, r * (1 + 1.01 * radius.angle)) - lowest + 1) * 8",
+        "corners = (level_of(radius, r * (1 + 1.01 * radius.steepest)) - lowest + 1) * 8",
         "corners = mi.UInt32(8)",
         ("tests/images/test_sds_paths.py::test_all_photons_of_a_disc_are_found",),
     ),

@@ -567,7 +567,7 @@ def test_the_page_says_who_takes_part():
     where the table of `scene_parts`, which the tests above rely on, says that it has no part.
     """
     rows = re.findall(r"^\| `([\w ]+)` \| (.+) \|.*\|$", PAGE.read_text(), re.MULTILINE)
-    found = {name: [cell.startswith("[–]") for cell in cells.split(" | ")] for name, cells in rows}
+    found = {name: [cell.startswith("–") for cell in cells.split(" | ")] for name, cells in rows}
     kinds = {name: part for name, part in parts.EMITTER_PARTS.items() if not name.startswith("own")}
     assert kinds.keys() <= found.keys()
     for name, part in kinds.items():

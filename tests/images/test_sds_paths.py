@@ -93,6 +93,7 @@ def test_all_photons_of_a_disc_are_found():
     z = SimpleNamespace(
         si=SimpleNamespace(p=mi.Point3f(*p, 0), n=mi.Normal3f(dr.zeros(mi.Float, n), 0, 1)),
         edges=mi.UInt32(edges.astype(np.uint32)),
+        anchor=SimpleNamespace(offset=mi.Float(0)),
     )
     kernel = SimpleNamespace(merging=of_pass, max_depth=dr.opaque(mi.UInt32, most))
     _, total = merging._draw(kernel, z, sobol.mix(dr.arange(mi.UInt32, n)), None)

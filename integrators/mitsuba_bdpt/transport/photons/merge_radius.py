@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...geometry.boxes import scene_box
+from ...geometry.rounding import OFFSET_ULPS, offset_at
 from ...host.introspection import world_matrix
 
 # Camera rays by which a scene is asked for the size of its pixels: so many columns and rows of them.
@@ -28,13 +29,17 @@ SHRINKING = 2 / 3
 # Most change of the radius per distance: the widths of cells allow for it (`merging.cell_at`).
 _STEEPEST = 0.5
 
+# Most change of the rounding error of a position, the least radius, per distance.
+_STEEPEST_ROUNDING = OFFSET_ULPS * 2.0**-24
+
 
 @dataclass
 class Radius:
     """``base`` + ``angle`` times the distance from ``centre``, between ``low`` and ``high`` (scene units).
 
-    All opaque, so that passes of any radius are one kernel. Photons and camera vertices find the same at the
-    same place, or weights would not sum to 1.
+    At least the rounding error of the position: smaller discs contain too few photons, or too many. All
+    opaque, so that passes of any radius are one kernel. Photons and camera vertices find the same at the same
+    place, or weights would not sum to 1.
     """
 
     centre: mi.Point3f
@@ -45,7 +50,13 @@ class Radius:
 
     def at(self, p: mi.Point3f) -> mi.Float:
         """The radius at ``p`` (scene units)."""
-        return dr.clip(self.base + self.angle * dr.norm(p - self.centre), self.low, self.high)
+        of_pixels = dr.clip(self.base + self.angle * dr.norm(p - self.centre), self.low, self.high)
+        return dr.maximum(of_pixels, offset_at(dr.max(dr.abs(p))))
+
+    @property
+    def steepest(self) -> mi.Float:
+        """Upper bound of the change of the radius per distance."""
+        return dr.maximum(self.angle, _STEEPEST_ROUNDING)
 
 
 @dataclass(frozen=True)

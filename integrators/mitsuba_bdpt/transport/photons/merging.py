@@ -106,7 +106,7 @@ def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None
     meets. Coordinates are taken modulo 2^20: cells of the same number lie far apart, and so do those of the
     same number that are of different sets.
     """
-    width = radius.low * (1 + 2 * radius.angle) * mi.Float(mi.UInt32(4) << level)
+    width = radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(4) << level)
     if corner is not None:
         p = p - radius.at(p)
     cell, number = mi.Point3i(dr.floor(p / width)), mi.UInt64(level)
@@ -156,8 +156,8 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
     """Draw one of the photons in the disc at ``z`` in proportion to its flux: its place, and their total."""
     radius, photons = kernel.merging.radius, kernel.merging.photons
     r = radius.at(z.si.p)
-    lowest = level_of(radius, r * (1 - 1.01 * radius.angle))
-    corners = (level_of(radius, r * (1 + 1.01 * radius.angle)) - lowest + 1) * 8
+    lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
+    corners = (level_of(radius, r * (1 + 1.01 * radius.steepest)) - lowest + 1) * 8
     corner, place, end = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
     cell, chosen, total = mi.UInt64(0), mi.UInt32(0), mi.Float(0)
     most = kernel.max_depth - z.edges
@@ -191,6 +191,8 @@ def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
 def _is_near(photon: Photon, z: Vertex, r: mi.Float) -> mi.Bool:
     """Mask: the ``photon`` counts as if it were at ``z``."""
     off = photon.p - z.si.p
-    within = dr.squared_norm(off) < dr.square(r)
-    flat = dr.abs(dr.dot(off, z.si.n)) < _FLAT * r
-    return within & flat & same_surface(photon.n, z.si.n)
+    height = dr.abs(dr.dot(off, z.si.n))
+    # Each of the two positions may lie off its surface by the rounding error of its hit.
+    beyond_rounding = dr.maximum(height - 2 * z.anchor.offset, 0)
+    within = dr.squared_norm(off) - dr.square(height) + dr.square(beyond_rounding) < dr.square(r)
+    return within & (beyond_rounding < _FLAT * r) & same_surface(photon.n, z.si.n)
