@@ -25,9 +25,8 @@ from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.measure import metrics
 from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.planning import moments, pilot
-from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Weighting
-from mitsuba_bdpt.planning.costs import cost
-from mitsuba_bdpt.planning.decision import Decision
+from mitsuba_bdpt.planning.choice import cost
+from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Decision, Weighting
 from mitsuba_bdpt.run import rendering
 from repository import RESOLUTION, benchmark_depth, load_reference, load_scene
 

@@ -39,8 +39,7 @@ from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.planning import pilot
 from mitsuba_bdpt.planning.candidates import candidates
-from mitsuba_bdpt.planning.configuration import Configuration
-from mitsuba_bdpt.planning.decision import Decision
+from mitsuba_bdpt.planning.configuration import Configuration, Decision
 from mitsuba_bdpt.run import rendering
 
 import mitsuba as mi  # isort: skip

@@ -17,7 +17,7 @@ from .image.accumulator import Channels
 from .image.colour import Bands, film_colours
 from .image.layers import layer_names
 from .image.stokes import POLARIZED
-from .planning.decision import read_decisions
+from .planning.configuration import read_decisions
 from .settings import LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
 # What numbers that are arguments of a render mean, for messages; of parameters see `settings.PARAMETERS`.

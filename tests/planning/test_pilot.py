@@ -17,11 +17,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.planning import budget, choice, costs, even_sky, moments, pilot
+from mitsuba_bdpt.planning import budget, choice, even_sky, moments, pilot
 from mitsuba_bdpt.planning.candidates import candidates
 from mitsuba_bdpt.planning.choice import Alternatives
-from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Weighting
-from mitsuba_bdpt.planning.decision import Decision
+from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Decision, Weighting
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
@@ -416,8 +415,8 @@ def test_light_subpaths_from_infinity_cost_more():
         assert of(target).prepared.emitters.far_share == share
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     way = Configuration.weighted(Weighting(1, 1, 1 / 16, 0), 4, "none")
-    more = costs.cost(way, rays) - costs.cost(way, rays | {"far": 0.0})
-    assert more == pytest.approx(costs.COSTS["far"] / 4 / 2)
+    more = choice.cost(way, rays) - choice.cost(way, rays | {"far": 0.0})
+    assert more == pytest.approx(choice.COSTS["far"] / 4 / 2)
 
 
 @pytest.mark.parametrize("make, least, most", [(sky, 0.05, 0.5), (cornell, 0.4, 0.9)])
@@ -545,7 +544,7 @@ def test_path_tracing_alone_before_what_is_hardly_better():
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     alone, light = (WEIGHTINGS.index(w) for w in (ALONE, Weighting(1, 1, 1 / 16, 0)))
     possible = [candidate(n, s, "none") for n, s in ((alone, 1), (light, 16))]
-    cost = costs.cost(possible[1], rays)
+    cost = choice.cost(possible[1], rays)
     for gain, chosen in ((1.1, False), (1.2, True)):
         base = np.full(shape, 1.0)
         base[:, light] = 1 / (gain * cost)
@@ -572,7 +571,8 @@ def test_what_looks_better_says_why_it_is_not_chosen():
         if served * w.light <= 1
     ]
     even = [
-        1 / costs.cost(candidate(n, 16, "one" if w.inner else "none"), rays) for n, w in enumerate(WEIGHTINGS)
+        1 / choice.cost(candidate(n, 16, "one" if w.inner else "none"), rays)
+        for n, w in enumerate(WEIGHTINGS)
     ]
     for number in range(200):
         base = even * np.exp(random.normal(0, random.uniform(0, 0.2), len(WEIGHTINGS)))
@@ -894,7 +894,7 @@ def test_the_same_kernel_where_it_hardly_matters():
     possible = [candidate(n, 4, kind) for n, kind in zip(numbers, ("none", "one"), strict=True)]
     kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "kinds", "far")
     rays = dict.fromkeys(kinds, 1.0)
-    ratio = costs.cost(possible[1], rays) / costs.cost(possible[0], rays)
+    ratio = choice.cost(possible[1], rays) / choice.cost(possible[0], rays)
     for faster, chosen in ((1.03, "none"), (1.1, "one")):
         base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
         base[:, numbers[1]] = 1 / (faster * ratio)
@@ -929,11 +929,11 @@ def test_recording_counts_in_short_renders():
     for samples, lit in ((1 << 20, True), (1 << 16, False)):
         table = choice.choose(made_of(base, rays), Alternatives(possible, True, samples))
         assert bool(table[0].candidate.light_paths) == lit
-    fixed = costs.FIXED
-    extra = (costs.COSTS["light_path"] + 12 * costs.COSTS["light"]) / 16
+    fixed = choice.FIXED
+    extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16
     expected = 1 + (extra + fixed["light"] / 2**16) / (4 + fixed["start"] / 2**16)
-    assert costs.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
-    assert costs.cost(possible[0], rays, 1 << 16) == 1 == costs.cost(possible[0], rays)
+    assert choice.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
+    assert choice.cost(possible[0], rays, 1 << 16) == 1 == choice.cost(possible[0], rays)
 
 
 def test_twice_the_light_subpaths_have_to_gain():
@@ -943,7 +943,7 @@ def test_twice_the_light_subpaths_have_to_gain():
     number = WEIGHTINGS.index(Weighting(1, 1, 1 / 16, 0))
     possible = [candidate(number, served, "none") for served in (2, 4)]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    each = [costs.cost(way, rays) for way in possible]
+    each = [choice.cost(way, rays) for way in possible]
     for gain, chosen in ((1.01, 4), (1.03, 2)):
         # base + S light: (base + 4 light) cost_4 = gain (base + 2 light) cost_2, with base = 1.
         light = (gain * each[0] - each[1]) / (4 * each[1] - 2 * gain * each[0])

@@ -1,15 +1,20 @@
 """The configurations of a render: how many light subpaths, which connections, with which coefficients.
 
 A pilot tells the variance of each of `WEIGHTINGS`; a `Configuration` adds the numbers of subpaths and
-connections, and is what the kernel is told.
+connections, and is what the kernel is told. A `Decision` is one that a render adopts, with what was predicted
+of it; it has a form in JSON.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import json
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeGuard
 
 from ..emitters.emission_tables import EmissionTables
-from ..transport.plan import Plan
+from ..errors import UsageError
+from ..settings import CONNECTIONS, LIGHT_PATHS
+from ..transport.plan import GUIDED, JOINED, Plan
 
 
 @dataclass(frozen=True)
@@ -96,3 +101,154 @@ class Configuration:
         joined = self.joined if adopted.connections == "one" else 1
         emission = self.emission if adopted.light else None
         return replace(adopted, camera_paths_per_light_path=served, joined=joined, emission=emission)
+
+
+# Contributions below a share of the image's mean play roulette before their ray is traced: below this one,
+# and below this multiple of a sample's relative variance. It adds at most the share to the variance, in most
+# scenes a tenth of that, but all of it in a furnace, where hardly anything else is noisy.
+MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
+
+# Of a recorded number: what single precision still holds when it is multiplied.
+LARGEST = 1e30
+
+# Entries of a record, see `Decision.record`.
+ENTRIES = (
+    *("pass", "light_paths", "connections", "guided", "emission", "joined", "coefficients"),
+    *("cost", "variance", "mean"),
+)
+
+
+@dataclass(frozen=True)
+class Decision(Configuration):
+    """The configuration of a render from the pass number ``first_pass`` on, and what was predicted of it.
+
+    ``cost`` of a sample (path tracing alone: 1), its ``variance`` as in `choice.Prediction`, and the
+    image's ``mean``, the scale of roulette."""
+
+    first_pass: int
+    cost: float
+    variance: float
+    mean: float
+
+    @classmethod
+    def of(
+        cls, chosen: Configuration, first_pass: int, *, cost: float, variance: float, mean: float
+    ) -> Decision:
+        """The decision for a configuration of which ``cost``, ``variance`` and ``mean`` are predicted.
+
+        They have six digits: further ones depend on the order in which a pilot's lanes were added up.
+        """
+        cost, variance, mean = (float(f"{number:.6g}") for number in (cost, variance, mean))
+        what = {f.name: getattr(chosen, f.name) for f in fields(Configuration)}
+        return cls(**what, first_pass=first_pass, cost=cost, variance=variance, mean=mean)
+
+    @property
+    def threshold(self) -> float:
+        """The size below which contributions play roulette."""
+        return self.mean * min(MOST_ROULETTE, ROULETTE_PER_VARIANCE * self.variance)
+
+    def record(self) -> dict[str, Any]:
+        """As in ``statistics["decisions"]``."""
+        return {
+            "pass": self.first_pass,
+            "light_paths": self.light_paths,
+            "connections": self.connections,
+            "guided": self.guided,
+            "emission": None if self.emission is None else self.emission.record(),
+            "joined": self.joined,
+            "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
+            "cost": self.cost,
+            "variance": self.variance,
+            "mean": self.mean,
+        }
+
+
+def read_decisions(text: str) -> tuple[Decision, ...]:
+    """The parameter ``decisions``: JSON as in ``statistics``.
+
+    An empty list means a render without a pilot. Raises `UsageError` saying what is wrong, and in which
+    entry.
+    """
+    where = ""
+    made: list[Decision] = []
+    try:
+        entries = json.loads(text)
+        if not _is_list(entries):
+            raise TypeError("a list of decisions is needed")
+        for number, entry in enumerate(entries):
+            where = f"entry {number}"
+            made.append(_read_decision(entry))
+        where = ""
+        passes = [decision.first_pass for decision in made]
+        if passes != sorted(set(passes)):
+            raise ValueError(f"passes {passes} must rise")
+        return tuple(made)
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        says = f"{where}: {error}" if where else error
+        what = f"{where} lacks {error}" if isinstance(error, KeyError) else says
+        raise UsageError(
+            f"decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: {what}"
+        ) from error
+
+
+def _is_list(value: Any) -> TypeGuard[list[Any]]:
+    return isinstance(value, list)
+
+
+def _is_object(value: Any) -> TypeGuard[dict[str, Any]]:
+    """Whether a value of JSON is an object."""
+    return isinstance(value, dict)
+
+
+def _read_decision(entry: Any) -> Decision:
+    if not _is_object(entry) or not _is_object(entry.get("coefficients", {})):
+        raise TypeError(f"{entry!r} is no decision")
+    light_paths, connections = _number(entry, "light_paths"), entry["connections"]
+    if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
+        raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
+    if not light_paths and connections != "none":
+        raise ValueError(f"connections={connections!r} without light paths")
+    if unknown := set(entry) - set(ENTRIES):
+        raise ValueError(f"{min(unknown)} is no part of a decision")
+    first_pass = entry["pass"]
+    if isinstance(first_pass, bool) or not isinstance(first_pass, int):
+        raise TypeError(f"pass={first_pass!r}")
+    numbers = {
+        "kappa_light": _number(entry["coefficients"], "t<=1"),
+        "kappa_direct": _number(entry["coefficients"], "s=1"),
+        **{name: _number(entry, name) for name in ("cost", "variance", "mean")},
+    }
+    for name, value in {"first_pass": first_pass, **numbers}.items():
+        least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
+        if not least <= value <= LARGEST:
+            raise ValueError(f"{name}={value!r}")
+    guided = entry.get("guided", 0)  # which records of older versions lack
+    if isinstance(guided, bool) or guided not in (0, *GUIDED):
+        raise ValueError(f"guided={guided!r}")
+    joined = entry.get("joined", 1)
+    if isinstance(joined, bool) or joined not in JOINED or (joined > 1 and connections != "one"):
+        raise ValueError(f"joined={joined!r}, connections={connections!r}")
+    emission = entry.get("emission")
+    return Decision(
+        light_paths=light_paths,
+        connections=connections,
+        first_pass=first_pass,
+        guided=guided,
+        joined=joined,
+        emission=None if emission is None else EmissionTables.read(emission),
+        **numbers,
+    )
+
+
+def _number(entry: dict[str, Any], name: str) -> float:
+    """A number of JSON: neither a boolean, which Python takes for one, nor text that holds one."""
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}={value!r} must be a number")
+    return float(value)
+
+
+def replayed(decision: Decision) -> list[dict[str, str]]:
+    """What a replayed decision leaves out, as in ``statistics["skipped"]``."""
+    names = ["t<=1"] * (not decision.light_paths) + ["inner"] * (decision.connections == "none")
+    return [{"class": name, "level": "by hand", "why": "decisions"} for name in names]

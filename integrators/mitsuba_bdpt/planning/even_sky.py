@@ -7,8 +7,7 @@ from ..settings import Settings
 from ..transport.plan import Plan
 from .budget import CHEAP_SAMPLES, EVEN
 from .candidates import candidates
-from .configuration import Configuration
-from .decision import Decision
+from .configuration import Configuration, Decision
 
 # kappa of s = 1 under a sky of a ratio up to `UNIFORM`, where s = 0 has hardly any noise of its own; 1 under
 # other even ones. Efficiency over path with multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in

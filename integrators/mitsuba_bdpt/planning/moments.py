@@ -5,11 +5,12 @@
 """Statistics of a pilot: variances of every way to render, and what points take off them.
 
 Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. The equations are those of
-`pilot`.
+`pilot`. `SAMPLE` and `SPLAT` are the rows that a pilot keeps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,14 +18,76 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..transport import mis
 from ..transport.batch import NET, NETS
 from ..transport.plan import GUIDED
-from .rows import SAMPLE, SPLAT
+from .configuration import WEIGHTINGS
 
 if TYPE_CHECKING:
     from ..sensors.records import Region
 
     Lanes = TypeVar("Lanes", np.ndarray, mi.UInt32)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The parts of a row, by name: how many numbers each has, in their order."""
+
+    parts: dict[str, int]
+
+    @property
+    def width(self) -> int:
+        """Numbers of a row: an even one, so that Dr.Jit adds it as a packet."""
+        used = sum(self.parts.values())
+        return used + used % 2
+
+    def place(self, name: str) -> slice:
+        """Where the numbers of a part are."""
+        names = list(self.parts)
+        first = sum(self.parts[other] for other in names[: names.index(name)])
+        return slice(first, first + self.parts[name])
+
+    def of(self, rows: np.ndarray, name: str) -> np.ndarray:
+        """A part of all rows; their numbers lie along the last axis."""
+        return rows[..., self.place(name)]
+
+    def row(self, values: Mapping[str, list[Any]]) -> list[Any]:
+        """The numbers of one row, from lists by the names of its parts."""
+        return [x for name in self.parts for x in values[name]]
+
+
+# How many weightings use a class of strategies: the last ones.
+_USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
+
+# Of a camera sample, for each weighting: its estimate, and the second moments of its contributions without
+# t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
+# with inner connections what drawing one adds. Then the number of its vertices that were joined; its tile; in
+# scenes with media the number of pairs that were evaluated, else 0.
+SAMPLE = Layout(
+    {
+        "estimate": len(WEIGHTINGS),
+        "moment": len(WEIGHTINGS),
+        "light": _USERS["light"],
+        "draw": _USERS["inner"],
+        "joined": 1,
+        "tile": 1,
+        "evaluated": 1,
+    }
+)
+
+# Parts of `SAMPLE` that are sums over the contributions.
+SUMS = ("estimate", "moment", "light", "draw")
+
+# The size of splats, their second moments without t <= 1, those of them that are rare (see `pilot.SELDOM`),
+# and their second moments by t <= 1.
+SPLAT = Layout(
+    {
+        "size": 1,
+        "moment": len(WEIGHTINGS),
+        "rare": len(WEIGHTINGS),
+        "light": _USERS["light"],
+    }
+)
 
 # Tiles of the image in each direction: of those whose brightness is known by itself, and of the larger ones
 # that stand in for them as far as it is noise. (A caustic and its shadow are smaller than the larger ones: in

@@ -50,8 +50,7 @@ from ..transport.kernel import trace
 from ..transport.plan import Plan
 from . import emission, isolated, moments
 from .configuration import WEIGHTINGS, Weighting
-from .moments import FINE, GROUPS, PER_PIXEL, Isolated, Moments, tile_of
-from .rows import SAMPLE, SPLAT, SUMS, Layout
+from .moments import FINE, GROUPS, PER_PIXEL, SAMPLE, SPLAT, SUMS, Isolated, Layout, Moments, tile_of
 
 if TYPE_CHECKING:
     from ..sampling.points import Stream

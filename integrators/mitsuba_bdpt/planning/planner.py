@@ -23,7 +23,7 @@ from ..settings import LIGHT_PATHS, Settings
 from ..transport.plan import JOINED, Plan
 from . import budget, choice, emission, even_sky, pilot
 from .candidates import candidates
-from .decision import Decision, replayed
+from .configuration import Decision, replayed
 from .explain import words
 from .findings import Findings
 from .moments import Moments

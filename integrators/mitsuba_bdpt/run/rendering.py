@@ -20,7 +20,7 @@ from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
 from ..planning import lost_light, missed_direct
 from ..planning.choice import Prediction
-from ..planning.decision import MOST_ROULETTE
+from ..planning.configuration import MOST_ROULETTE
 from ..planning.findings import Findings
 from ..planning.lost_light import LostLight
 from ..planning.planner import Planner

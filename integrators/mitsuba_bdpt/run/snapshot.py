@@ -15,7 +15,7 @@ from .._version import __version__
 from ..errors import CommandError, UsageError
 from ..image.accumulator import Accumulator
 from ..image.replicates import Spread
-from ..planning.decision import read_decisions
+from ..planning.configuration import read_decisions
 from ..planning.moments import Moments
 from ..planning.planner import Decided, Pilots
 from ..settings import Settings

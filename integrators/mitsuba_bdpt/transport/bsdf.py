@@ -101,7 +101,7 @@ class Traits:
 # over the interaction once, which saves 6 % of the time in a Cornell box; but each place that makes one has
 # functions of its own, one per BSDF, where the same few questions, asked anywhere, are compiled once. (Rooms
 # of 10 and of 27 materials take the same time either way. What diverging lanes cost in a decision is another
-# matter, see `costs.MANY_KINDS`.)
+# matter, see `planning.choice.MANY_KINDS`.)
 MANY = 10
 
 # Points at which surfaces are asked what they let pass.
