@@ -103,6 +103,7 @@ references: $(INSTALLED)
 # The tables and plots of docs/reports, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
 	-$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
+	$(VENV)/bin/python scripts/floor.py --record results/benchmark/probes.json
 	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/reports/benchmark
 	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
 

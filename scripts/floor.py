@@ -1,27 +1,30 @@
 """Kernel time over that of its rays alone, see `instruments.floor`.
 
 python scripts/floor.py cornell_box uplight_room veach_mis
+python scripts/floor.py --record results/benchmark/probes.json    # beside the probes of a sweep
 """
 
 from __future__ import annotations
 
 import statistics
 import sys
+from pathlib import Path
 
 import command_line
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.files.texts import read_json, write_json
 from mitsuba_bdpt.measure import probes
-from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.cells import machine, software
 from repository import PROJECT, ROOT
 
 import mitsuba as mi  # isort: skip
 
 from instruments import floor
 
-# One or two camera subpaths per light subpath: with 16 the replay is cut into so many small kernels that it
-# is no floor.
-PROBED = ("veach_mis", "many_lights", "glass_caustics")
+# Scenes of the record. One or two camera subpaths per light subpath: with 16 the replay is cut into so many
+# small kernels that it is no floor.
+RECORDED = ("veach_mis", "many_lights", "glass_caustics")
 
 CODE = """
 import sys, mitsuba_bdpt, mitsuba as mi
@@ -33,19 +36,33 @@ print(*floor.measure(PROJECT.scene(sys.argv[2]), int(sys.argv[3])))
 """
 
 
-def probe(project: Project, rounds: int) -> dict:
-    """Kernel time over that of its rays alone, by scene, a value per round: a probe of sweeps."""
+def record(file: Path, rounds: int) -> None:
+    """Add the floor to the probes of a sweep, unless the same software was measured before.
+
+    A process for each scene.
+    """
+    kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
+    key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
+    if {name: kept.get("floor", {}).get(name) for name in key} == key:
+        return
     scripts = str(ROOT / "scripts")
-    return {name: probes.numbers(CODE, scripts, name, str(rounds)) for name in PROBED}
+    values = {name: probes.numbers(CODE, scripts, name, str(rounds)) for name in RECORDED}
+    write_json(file, kept | {"floor": key | {"values": values}})
 
 
 def main(arguments=None) -> int:
     """Print the ratio per scene."""
     parser = command_line.parser(__doc__)
-    parser.add_argument("scene", nargs="+")
+    parser.add_argument("scene", nargs="*")
     parser.add_argument("--rounds", type=number(int, 1), default=5)
     parser.add_argument("--path", action="store_true", help="of Mitsuba's path, over the same floor")
+    parser.add_argument("--record", type=Path, metavar="FILE", help="write the floor of some scenes there")
     options = parser.parse_args(arguments)
+    if bool(options.scene) == bool(options.record):
+        parser.error("give scenes, or --record FILE")
+    if options.record:
+        record(options.record, options.rounds)
+        return 0
     mi.set_variant("llvm_ad_rgb")
     for name in options.scene:
         ratios = floor.measure(PROJECT.scene(name), options.rounds, of_path=options.path)

@@ -1,7 +1,7 @@
 """What a render costs besides its samples: the first image from an empty kernel cache, and memory.
 
 Each probe takes the project and the number of repetitions, and returns plain numbers; a repetition is a
-process of its own. Scripts add probes of their own to `PROBES`.
+process of its own.
 """
 
 from __future__ import annotations
