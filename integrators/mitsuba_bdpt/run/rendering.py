@@ -38,8 +38,7 @@ from ..transport.photons.photon_guide import Guide
 from ..transport.photons.wavelength_sets import SETS
 from ..transport.plan import Plan
 from . import messages
-from .pass_points import PassPoints
-from .schedule import REPLICATES, Step, batches, passes_since, schedule
+from .schedule import REPLICATES, PassPoints, Step, batches, passes_since, schedule
 from .snapshot import Progress, Snapshot, identity
 from .statistics import Meter, rays
 
