@@ -7,17 +7,31 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test lint gallery pictures notebook docs package references benchmark slow sweep stress same endurance mutants
+.PHONY: render test costly slow costs lint gallery pictures notebook docs package references benchmark sweep stress same \
+	endurance mutants
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
 
 # Two processes, since much of a test is compiling kernels, on one core.
-test: $(INSTALLED)
-	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
+PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
+# The cheap tests, and all that see planted bugs (tests/support/costs.py).
+test: $(INSTALLED)
+	$(PYTEST)
+
+# The tests that take seconds.
+costly: $(INSTALLED)
+	$(PYTEST) -m costly
+
+# All tests that make test leaves out.
 slow: $(INSTALLED)
-	$(VENV)/bin/python -m pytest -m slow
+	$(PYTEST) -m "slow or costly"
+
+# What tests cost, in tests/support/costs.json, by which make test leaves them out.
+costs: $(INSTALLED)
+	echo '{}' > tests/support/costs.json
+	$(PYTEST) -m "not slow" --costs
 
 # The images of the README and of docs/reports/figures.md.
 gallery: $(INSTALLED)

@@ -5,6 +5,14 @@ import mitsuba as mi
 import leftovers
 import pytest
 import variants
+from costs import (  # noqa: F401  (hooks of pytest)
+    pytest_addoption,
+    pytest_collection_modifyitems,
+    pytest_runtest_logreport,
+    pytest_runtest_makereport,
+    pytest_runtest_setup,
+    pytest_sessionfinish,
+)
 from mitsuba_bdpt.host.jit import registered_emitters
 from patience import PATIENCE
 

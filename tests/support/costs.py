@@ -1,0 +1,82 @@
+"""Which tests run in `make test`: those that are cheap, and those that see a planted bug.
+
+`costs.json` has the processor time in seconds of each test that takes longer than `QUICK`, by its name without the
+folder. Tests above `QUICK` are marked ``costly``, those above `COSTLY` ``slow``. Hooks of pytest, which conftest.py
+imports; `make costs` records the file.
+"""
+
+import json
+import resource
+import time
+from pathlib import Path
+
+import mutants
+import pytest
+
+COSTS = Path(__file__).with_name("costs.json")
+# Seconds of processor time. Below the first lie four tests in five, which take a fifteenth of the time of all; above
+# the second one in twelve, which takes half.
+QUICK, COSTLY = 0.5, 4.0
+
+
+def name(nodeid):
+    """Return the name of a test without its folders, which moves change."""
+    file, _, rest = nodeid.partition("::")
+    return f"{file.rsplit('/', 1)[-1]}::{rest}"
+
+
+def needed():
+    """Return the names of the tests that see planted bugs."""
+    return {name(test) for mutant in mutants.MUTANTS for test in mutant.tests}
+
+
+def pytest_addoption(parser):
+    """Add the option that records what tests cost."""
+    parser.addoption("--costs", action="store_true", help=f"write the processor time of tests to {COSTS}")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark tests by their cost, before pytest deselects by markers."""
+    costs, planted = json.loads(COSTS.read_text()), needed()
+    for item in items:
+        seconds = costs.get(name(item.nodeid), 0)
+        if seconds > QUICK and name(item.nodeid) not in planted:
+            item.add_marker(pytest.mark.costly if seconds <= COSTLY else pytest.mark.slow)
+
+
+def _seconds():
+    """Return the processor time of this process and of the children that it waited for."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Note when a test begins."""
+    item.began = _seconds()
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item, call):
+    """Give the last report of a test its processor time, which comes to the main process with it."""
+    outcome = yield
+    if call.when == "teardown" and hasattr(item, "began"):
+        outcome.get_result().user_properties.append(("seconds", _seconds() - item.began))
+
+
+_measured = {}
+
+
+def pytest_runtest_logreport(report):
+    """Collect what tests took, in the main process."""
+    if report.when == "teardown":
+        _measured.update({name(report.nodeid): value for key, value in report.user_properties if key == "seconds"})
+
+
+def pytest_sessionfinish(session):
+    """Write what tests took, in the main process, in place of what stood there of tests that ran."""
+    if session.config.getoption("costs") and not hasattr(session.config, "workerinput"):
+        costs = {key: value for key, value in json.loads(COSTS.read_text()).items() if key not in _measured}
+        costs |= {key: round(value, 1) for key, value in _measured.items() if value > QUICK}
+        COSTS.write_text(json.dumps(dict(sorted(costs.items())), indent=0) + "\n")
