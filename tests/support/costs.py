@@ -35,14 +35,21 @@ def pytest_addoption(parser):
     parser.addoption("--costs", action="store_true", help=f"write the processor time of tests to {COSTS}")
 
 
+def marker(test, costs, planted):
+    """Return the marker of a test, or None for one that runs in `make test`."""
+    seconds = costs.get(test, 0)
+    if seconds <= QUICK or test in planted:
+        return None
+    return "costly" if seconds <= COSTLY else "slow"
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Mark tests by their cost, before pytest deselects by markers."""
     costs, planted = json.loads(COSTS.read_text()), needed()
     for item in items:
-        seconds = costs.get(name(item.nodeid), 0)
-        if seconds > QUICK and name(item.nodeid) not in planted:
-            item.add_marker(pytest.mark.costly if seconds <= COSTLY else pytest.mark.slow)
+        if found := marker(name(item.nodeid), costs, planted):
+            item.add_marker(found)
 
 
 def _seconds():
