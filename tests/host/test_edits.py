@@ -189,14 +189,14 @@ def test_nothing_large_is_kept():
 
 
 def test_scenes_that_are_gone_are_forgotten():
-    """Rationale: what is remembered of them holds variables of Dr.Jit. Expected: with six scenes that were
+    """Rationale: what is remembered of them holds variables of Dr.Jit. Expected: with three scenes that were
     rendered and are gone as many are known as before; one that lives is not forgotten meanwhile."""
     scene, integrator = cornell(), bdpt()
     integrator.render(scene, spp=SPP)
-    before, others = len(notices._scenes), [cornell() for _ in range(6)]
+    before, others = len(notices._scenes), [cornell() for _ in range(3)]
     for other in others:
         integrator.render(other, spp=SPP)
-    assert len(notices._scenes) >= before + 6
+    assert len(notices._scenes) >= before + 3
     del other, others
     integrator.render(scene, spp=SPP)
     assert len(notices._scenes) <= before

@@ -226,7 +226,7 @@ def test_a_cornell_box_is_joined_and_less_noisy():
     """Expected: the pilot's 1/16 with one connection becomes four at a time, as `explain` says; the error
     falls to 0.8 or less (measured: 0.6), over eight seeds.
     """
-    scene = cornell()
+    scene = cornell(32)
     reference = np.mean([rendered(scene, 1024, 50 + i)[0] for i in range(4)], axis=0)
     _, method = rendered(scene)
     (decision,) = method.statistics["decisions"]

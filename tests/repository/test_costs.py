@@ -7,12 +7,14 @@ import pytest
 
 
 @pytest.mark.parametrize(
-    ("seconds", "expected"), [(0, None), (0.5, None), (0.6, "costly"), (4.0, "costly"), (4.1, "slow")]
+    ("seconds", "expected"), [(0, None), (0.3, None), (0.4, "costly"), (3.0, "costly"), (3.1, "slow")]
 )
 def test_markers_follow_from_costs(seconds, expected):
     """Expected: a test is marked by its processor time, one that sees a planted bug never is."""
-    assert costs.marker("test_a.py::test_b[c]", {"test_a.py::test_b[c]": seconds}, set()) == expected
-    assert costs.marker("test_a.py::test_b[c]", {"test_a.py::test_b[c]": seconds}, {"test_a.py::test_b[c]"}) is None
+    test = "test_a.py::test_b[c]"
+    assert costs.marker(test, {test: seconds}, set()) == expected
+    for planted in (test, "test_a.py::test_b"):
+        assert costs.marker(test, {test: seconds}, {planted}) is None
 
 
 def test_names_do_not_have_folders():

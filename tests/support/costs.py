@@ -1,8 +1,8 @@
 """Which tests run in `make test`: those that are cheap, and those that see a planted bug.
 
-`costs.json` has the processor time in seconds of each test that takes longer than `QUICK`, by its name without the
-folder. Tests above `QUICK` are marked ``costly``, those above `COSTLY` ``slow``. Hooks of pytest, which conftest.py
-imports; `make costs` records the file.
+`costs.json` has the processor time in seconds of each test that takes longer than `QUICK`, by its name without
+the folder. Tests above `QUICK` are marked ``costly``, those above `COSTLY` ``slow``. Hooks of pytest, which
+conftest.py imports; `make costs` records the file.
 """
 
 import json
@@ -14,9 +14,9 @@ import mutants
 import pytest
 
 COSTS = Path(__file__).with_name("costs.json")
-# Seconds of processor time. Below the first lie four tests in five, which take a fifteenth of the time of all; above
-# the second one in twelve, which takes half.
-QUICK, COSTLY = 0.5, 4.0
+# Seconds of processor time. Below the first lie two tests in three, which take a fortieth of the time of all;
+# above the second one in ten, which takes over half.
+QUICK, COSTLY = 0.3, 3.0
 
 
 def name(nodeid):
@@ -38,7 +38,7 @@ def pytest_addoption(parser):
 def marker(test, costs, planted):
     """Return the marker of a test, or None for one that runs in `make test`."""
     seconds = costs.get(test, 0)
-    if seconds <= QUICK or test in planted:
+    if seconds <= QUICK or test in planted or test.split("[")[0] in planted:
         return None
     return "costly" if seconds <= COSTLY else "slow"
 
@@ -78,7 +78,9 @@ _measured = {}
 def pytest_runtest_logreport(report):
     """Collect what tests took, in the main process."""
     if report.when == "teardown":
-        _measured.update({name(report.nodeid): value for key, value in report.user_properties if key == "seconds"})
+        _measured.update(
+            {name(report.nodeid): value for key, value in report.user_properties if key == "seconds"}
+        )
 
 
 def pytest_sessionfinish(session):
