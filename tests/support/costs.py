@@ -1,6 +1,6 @@
 """Which tests run in `make test`: those that are cheap, and those that see a planted bug.
 
-`costs.json` has the processor time in seconds of each test that takes longer than `QUICK`, by its name without
+`costs.json` has the processor time in seconds of each test that takes more than `QUICK`, by its name without
 the folder. Tests above `QUICK` are marked ``costly``, those above `COSTLY` ``slow``. Hooks of pytest, which
 conftest.py imports; `make costs` records the file.
 """
