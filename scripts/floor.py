@@ -15,7 +15,7 @@ from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import read_json, write_json
 from mitsuba_bdpt.measure import probes
-from mitsuba_bdpt.measure.cells import machine, software
+from mitsuba_bdpt.measure.preset import machine, software
 from repository import PROJECT, ROOT
 
 import mitsuba as mi  # isort: skip

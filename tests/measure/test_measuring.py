@@ -473,7 +473,7 @@ def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
     """Rationale: cells are named after the plugin's source, which somebody may edit meanwhile. Expected: the
     rows of what was rendered are written; a damaged cell is named."""
     digests = iter("abcdefgh" * 99)
-    monkeypatch.setattr("mitsuba_bdpt.measure.cells.source_digest", lambda: next(digests))
+    monkeypatch.setattr("mitsuba_bdpt.measure.preset.source_digest", lambda: next(digests))
     words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
     assert main(words) == 0
     assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 30

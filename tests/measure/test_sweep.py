@@ -18,11 +18,11 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files import whole
 from mitsuba_bdpt.files.images import read_layers, write_layers
 from mitsuba_bdpt.files.texts import write_json
-from mitsuba_bdpt.measure import agreement, analysis, cells, making, metrics, probes, reference, scenes, sweep
+from mitsuba_bdpt.measure import agreement, analysis, making, metrics, probes, reference, scenes, sweep
 from mitsuba_bdpt.measure import bench as bench_module
 from mitsuba_bdpt.measure import halves as halves_module
 from mitsuba_bdpt.measure.making import Job
-from mitsuba_bdpt.measure.preset import read_preset
+from mitsuba_bdpt.measure.preset import Cells, read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
 from mitsuba_bdpt.measure.rows import errors
 from mitsuba_bdpt.measure.scenes import path_tracers
@@ -375,7 +375,7 @@ def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, job, swept):
 def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, job, swept):
     """Expected: renders of another version are not mixed in; the message says what the worker has."""
     making.make(job(3))
-    monkeypatch.setattr(cells, "software", lambda: {"mitsuba-bdpt": "other"})
+    monkeypatch.setattr("mitsuba_bdpt.measure.preset.software", lambda: {"mitsuba-bdpt": "other"})
     there = ["-o", folder / "out", "--scheduler", workers.scheduler_address]
     with pytest.raises(RuntimeError, match="failed on the cluster: a worker has other software"):
         swept(preset_file(folder), *there)
@@ -753,7 +753,7 @@ def test_rivals_are_those_that_see_the_media(name):
     assert scene.has_media == (name in ("fog_lamp", "skin_ball", "cloud_sky"))
     preset = read_preset(REPOSITORY.preset("benchmark"), REPOSITORY)
     subject = next(subject for subject in preset.subjects if subject.name == name)
-    rendered = {m.name for m in cells.Cells(REPOSITORY, preset, subject).methods}
+    rendered = {m.name for m in Cells(REPOSITORY, preset, subject).methods}
     tracers = {"path", "path multijitter", "ptracer"}, {"volpath", "volpathmis"}
     assert tracers[scene.has_media] <= rendered and not tracers[not scene.has_media] & rendered
     assert set(path_tracers(scene.has_media)) <= tracers[scene.has_media]
@@ -762,7 +762,7 @@ def test_rivals_are_those_that_see_the_media(name):
 
 def keys(folder, text=PRESET):
     preset = read_preset(preset_file(folder, text), REPOSITORY)
-    return {cell.key for cell in cells.Cells(REPOSITORY, preset, preset.subjects[0]).planned()}
+    return {cell.key for cell in Cells(REPOSITORY, preset, preset.subjects[0]).planned()}
 
 
 def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):
@@ -773,5 +773,5 @@ def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):
     assert len(names | keys(tmp_path, PRESET.replace("seeds = 2", "seeds = [2, 3]"))) == 10
     fewer = keys(tmp_path, PRESET.replace('match = "seconds"', 'match = "seconds"\nseeds = 1'))
     assert len(fewer) == 6 and fewer < names
-    monkeypatch.setattr(cells, "source_digest", lambda: "edited")
+    monkeypatch.setattr("mitsuba_bdpt.measure.preset.source_digest", lambda: "edited")
     assert not names & keys(tmp_path)

@@ -21,7 +21,7 @@ Needs the extra ``[measure]``. Within the package nothing but the commands impor
 * What is measured: `metrics` (errors, colour differences), `agreement` (bias), `efficiency`, `timing`.
 * What of: `project` (the user's folder), `scenes` (any scene file, at any size).
 * Against what: `reference` (stored ones), `making` and `halves` (how they come about).
-* Sweeps: `preset` (what is rendered), `cells`, `bench` (renders), `rows` (what is kept), `sweep`, `probes`.
+* Sweeps: `preset` (what is rendered: cells), `bench` (renders), `rows` (what is kept), `sweep`, `probes`.
 * What they show: `analysis` (figures with their reasons), `tables`, `figures`, `report`, `page`.
 * Two or a few ways to render: `compare`, `equal_time`.
 * Single strategies: `pyramid`.

@@ -17,9 +17,8 @@ import numpy as np
 from .. import workers
 from ..errors import CommandError, message
 from ..files.texts import read_json, write_json
-from .cells import Cell, Cells, machine, software
 from .options import VARIANT
-from .preset import read_preset
+from .preset import Cell, Cells, machine, read_preset, software
 from .project import Project
 from .scenes import integrator_of
 from .timing import timed

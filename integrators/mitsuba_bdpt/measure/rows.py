@@ -16,8 +16,7 @@ from ..files.images import read_layers, write_layers
 from ..files.texts import read_json, write_json
 from ..files.whole import replacing
 from . import agreement, analysis, metrics
-from .cells import FIRST_SEED, Cell, Cells
-from .preset import Preset
+from .preset import FIRST_SEED, Cell, Cells, Preset
 from .project import Project
 from .reference import Reference, load_reference, reference_path
 from .scenes import MeasuredScene, digest

@@ -30,11 +30,10 @@ from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
 from . import analysis, probes, showing
 from .bench import Bench, measure, measured
-from .cells import FIRST_SEED, Cell, Cells, machine, software
 from .making import Job, check, obtained
 from .options import VARIANT
 from .options import Sweep as Asked
-from .preset import Preset, read_preset
+from .preset import FIRST_SEED, Cell, Cells, Preset, machine, read_preset, software
 from .project import Project
 from .reference import load_reference, make_command, too_few
 from .rows import beside, cell_file, judge_of, read_rows, rows, store, write_tables
