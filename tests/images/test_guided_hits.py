@@ -317,7 +317,7 @@ def test_how_many_samples(isolated, chosen):
     width = len(WEIGHTINGS)
     base, none = np.ones((GROUPS, width)), np.zeros((GROUPS, width))
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
-    rays |= {"far": 0.0, "aimed": 0.05, "kinds": 1, "evenness": 0.0}
+    rays |= {"far": 0.0, "aimed": 0.05, "kinds": 1}
     each = np.tile(isolated, (GROUPS, 1))
     moments = Moments(base, none, none, none, each, np.ones(width), 1.0, rays, 4096)
     possible = [Configuration.weighted(w, 1, "none") for w in WEIGHTINGS if w.light and not w.inner]
@@ -339,7 +339,7 @@ def test_a_gain_has_to_be_seen_in_most_of_a_pilot(count, chosen):
     each = np.zeros((GROUPS, 1 + len(GUIDED)))
     each[:count] = [9.0, 0.5, 0.5, 0.5]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
-    rays |= {"far": 0.0, "aimed": 0.05, "kinds": 1, "evenness": 0.0}
+    rays |= {"far": 0.0, "aimed": 0.05, "kinds": 1}
     moments = Moments(none + 1, none, none, none, each, np.ones(width), 1.0, rays, 4096)
     possible = [Configuration.weighted(w, 1, "none") for w in WEIGHTINGS if w.light and not w.inner]
     table = choice.choose(moments, Alternatives(possible, True, guidable=True))

@@ -113,7 +113,7 @@ def moments_of(target, lanes, rounds=1, **parameters):
 
 def made_of(base, rays, light=0.0):
     """Moments of this ``base``, of which points take nothing off, and of splats, alike for all weightings."""
-    none, gain, rays = np.zeros_like(base), np.ones(base.shape[1]), {"evenness": 0.0} | rays
+    none, gain = np.zeros_like(base), np.ones(base.shape[1])
     isolated = np.zeros((len(base), 1 + len(GUIDED)))
     return moments.Moments(base, none, none + light, none, isolated, gain, 1.0, rays, 4096)
 
@@ -537,20 +537,28 @@ def test_why_there_is_no_pilot():
     assert "no pilot" not in bdpt().explain(cornell(), spp=1024)
 
 
-def test_path_tracing_alone_before_what_is_hardly_better():
-    """Expected: light subpaths that gain less than `LIGHT_GAIN` are left out, and it is said by how much;
-    those that gain more are used."""
-    shape = (moments.GROUPS, len(WEIGHTINGS))
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    alone, light = (WEIGHTINGS.index(w) for w in (ALONE, Weighting(1, 1, 1 / 16, 0)))
-    possible = [candidate(n, s, "none") for n, s in ((alone, 1), (light, 16))]
+@pytest.mark.parametrize("connections", ["none", "one"])
+def test_what_costs_more_has_to_gain(connections):
+    """Rationale: predictions are off by some 10 %, and pilots of other seeds choose something else where
+    candidates hardly differ. Expected: a candidate whose sample costs c times as much is chosen if it gains
+    more than c^`CAUTION`, and if it gains less that is said.
+    """
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "far"), 1.0)
+    rays["kinds"] = 1
+    inner = float(connections != "none")
+    alone, light = (WEIGHTINGS.index(w) for w in (ALONE, Weighting(1, 1, 1 / 16, inner)))
+    possible = [candidate(alone, 1, "none"), candidate(light, 4, connections)]
     cost = choice.cost(possible[1], rays)
-    for gain, chosen in ((1.1, False), (1.2, True)):
-        base = np.full(shape, 1.0)
+    needed = cost**choice.CAUTION
+    assert needed > 1.1
+    for gain, chosen in ((0.99 * needed, False), (1.01 * needed, True)):
+        base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
         base[:, light] = 1 / (gain * cost)
         table = choice.choose(made_of(base, rays), Alternatives(possible, True))
-        assert bool(table[0].candidate.light_paths) == chosen and len(table) == 2
-        assert chosen or "it gains 1.10x at most" in choice.left_out(table)[0]["why"]
+        assert bool(table[0].candidate.light_paths) == chosen
+        assert len(table) == 2
+        why = f"costs {cost:.2f} times as much: it has to gain {needed:.2f}x, and gains {gain:.2f}x"
+        assert chosen or why in choice.left_out(table)[0]["why"]
 
 
 def test_what_looks_better_says_why_it_is_not_chosen():
@@ -586,20 +594,8 @@ def test_what_looks_better_says_why_it_is_not_chosen():
             assert bool(why) == (row.time < table[0].time)
             if numbers := needed.search(why):
                 assert float(numbers[2]) <= float(numbers[1])
-            met.add(why.split(" ")[0] if not why[:1].isdigit() else "more")
-    assert met == {"", "light", "more", "connections=one", "without"}
-
-
-@pytest.mark.parametrize("light", [(0, 0), (0, 1), (1 / 4, 0)])
-def test_a_row_without_light_subpaths_has_a_reason_or_none(light):
-    """Rationale: the ratio of two numbers of light subpaths has no logarithm where one is 0. Expected: a row
-    with light subpaths names the gain that they need; there is no such rule for one without."""
-    row, chosen = (
-        choice.Prediction(Configuration(n, "none", 1, 1), cost=1.0, variance=v)
-        for n, v in zip(light, (1.0, 1.1), strict=True)
-    )
-    assert ("light subpaths have to gain" in choice.why_not(row, chosen)) == bool(light[0])
-    assert light[0] or not choice.why_not(row, chosen)
+            met.add(why.split(" ")[0])
+    assert met == {"", "a", "without"}
 
 
 @pytest.mark.parametrize("name, depth", [("veach_mis", 3), ("thin_lens", 8)])
@@ -886,33 +882,6 @@ def test_groups_that_find_less_than_nothing_turn_no_scale():
     assert choice._robust_mean(values) == pytest.approx(values.mean(axis=0))
 
 
-def test_the_same_kernel_where_it_hardly_matters():
-    """Rationale: another kernel takes seconds to compile in rooms of many materials, and seeds differ by what
-    pilots are off by. Expected: no connections (`KERNELS`) where drawing them takes 1 / 1.03 of the time, but
-    where it takes 1 / 1.1."""
-    numbers = [WEIGHTINGS.index(Weighting(1, 1, 1 / 16, inner)) for inner in (0, 1)]
-    possible = [candidate(n, 4, kind) for n, kind in zip(numbers, ("none", "one"), strict=True)]
-    kinds = ("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "kinds", "far")
-    rays = dict.fromkeys(kinds, 1.0)
-    ratio = choice.cost(possible[1], rays) / choice.cost(possible[0], rays)
-    for faster, chosen in ((1.03, "none"), (1.1, "one")):
-        base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
-        base[:, numbers[1]] = 1 / (faster * ratio)
-        table = choice.choose(made_of(base, rays), Alternatives(possible, True))
-        assert table[0].candidate.connections == chosen and len(table) == 2
-
-
-@pytest.mark.parametrize(("gain", "kappa"), [(1.05, 1 / 2), (1.2, 1 / 16)])
-def test_coefficients_under_a_nearly_uniform_sky(gain, kappa):
-    """Expected: 1/2, which such scenes have without a pilot, unless another one gains 1.1 (`UNIFORM_GAIN`)
-    over it; the coefficient 1, of the same variance as 1/2 here, is not taken."""
-    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
-    base[:, 0] = 1 / gain
-    rays = {"camera": 1.0, "shadow_s1": 1.0, "evenness": 1 / even_sky.UNIFORM}
-    table = choice.choose(made_of(base, rays), Alternatives(ALL_ALONE, True))
-    assert table[0].candidate.kappa_direct == kappa and all(row.candidate.kappa_direct < 1 for row in table)
-
-
 def test_recording_counts_in_short_renders():
     """Rationale: in previews most of the time is that of recording the kernel, twice as long with light
     subpaths. Expected: with 0.55 of the variance for a sixth more per sample light subpaths are taken for a
@@ -934,23 +903,6 @@ def test_recording_counts_in_short_renders():
     expected = 1 + (extra + fixed["light"] / 2**16) / (4 + fixed["start"] / 2**16)
     assert choice.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
     assert choice.cost(possible[0], rays, 1 << 16) == 1 == choice.cost(possible[0], rays)
-
-
-def test_twice_the_light_subpaths_have_to_gain():
-    """Rationale: along S the product of time and variance is flat, and pilots of other seeds wander on it.
-    Expected: of four and two camera subpaths per light subpath the four, where two gain 1.01, and two where
-    they gain 1.03 (`MORE_GAIN`: 1.02)."""
-    number = WEIGHTINGS.index(Weighting(1, 1, 1 / 16, 0))
-    possible = [candidate(number, served, "none") for served in (2, 4)]
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    each = [choice.cost(way, rays) for way in possible]
-    for gain, chosen in ((1.01, 4), (1.03, 2)):
-        # base + S light: (base + 4 light) cost_4 = gain (base + 2 light) cost_2, with base = 1.
-        light = (gain * each[0] - each[1]) / (4 * each[1] - 2 * gain * each[0])
-        table = choice.choose(
-            made_of(np.ones((moments.GROUPS, 10)), rays, light), Alternatives(possible, False)
-        )
-        assert table[0].candidate.camera_paths_per_light_path == chosen and len(table) == 2
 
 
 def test_certainty():
@@ -982,15 +934,6 @@ def test_losing_light_counts_beside_outliers():
     values[3, 7] = np.inf
     found = choice._robust_mean(values)
     assert np.isinf(found[7]) and found[8] == 1
-
-
-def test_outliers_of_the_draw_do_not_decide():
-    """Rationale: few samples show the outliers of unshadowed contributions but not those of all else.
-    Expected: what the draw adds is the mean of all groups but for the largest quarter."""
-    draw = np.ones((16, 2))
-    draw[3] = 100
-    draw[:, 1] = np.arange(16)
-    np.testing.assert_allclose(choice._trimmed_mean(draw), np.tile([1, 5.5], (16, 1)))
 
 
 def test_weightings_in_order():

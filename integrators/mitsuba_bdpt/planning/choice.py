@@ -15,7 +15,6 @@ import numpy as np
 from ..emitters.emission_tables import EmissionTables
 from ..transport.plan import GUIDED
 from .configuration import WEIGHTINGS, Configuration, Decision
-from .even_sky import SKY_DIRECT, UNIFORM, UNIFORM_GAIN
 from .moments import GROUPS, Moments
 
 # What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
@@ -74,21 +73,14 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
     return total / camera
 
 
-# With stratified points a coefficient of s = 1 other than 1 (under a nearly uniform sky: other than
-# `SKY_DIRECT`, and then `UNIFORM_GAIN`) has to gain this factor over path tracing alone: it evens out two
-# strategies whose noise good points may take off anyway, and what a pilot of 4,096 samples finds of that is
-# off by a fifth.
-DIRECT_GAIN = 1.3
+# A candidate whose sample costs c times as much has to gain c^CAUTION: predictions are off by some 10 %, and
+# where candidates hardly differ pilots of other seeds choose something else (docs/development/experiments.md,
+# "Choice of strategies").
+CAUTION = 0.3
 
-# Light subpaths have to gain this factor over path tracing alone: predictions are off by as much, and who
-# renders a plain scene should not notice that they were an option.
-LIGHT_GAIN = 1.15
-
-# Twice as many light subpaths have to gain this factor over fewer: numbers that hardly differ lie on one flat
-# line, along which pilots of other seeds wander, and what is cheap is less at the mercy of predictions. (Mean
-# of 32 pilots' time times error over the best: `uplight_room` 1.18 to 1.02, small_casters/sun_sphere 1.23 to
-# 1.10, small_casters/spot_sphere 1.24 to 1.30, elsewhere the same.)
-MORE_GAIN = 1.02
+# In the resamplings that `certainty` counts the chosen candidate takes at most so many times as long as the
+# best.
+NEAR = 1.15
 
 # Photon-guided BSDF sampling (s = 0) with one sample has to gain this factor in three quarters of the pilot's
 # groups. It removes outliers alone: where 2 is predicted, raw error times time falls by 1.4 to 2.8, and
@@ -99,11 +91,6 @@ GUIDE_GAIN = 2.5
 # A larger number of guided samples has to gain this factor over a smaller one: what guiding cannot help is in
 # no prediction of it.
 MORE_GUIDED_GAIN = 1.3
-
-# Among candidates whose times are within this factor of the best, that comes first whose kernel is the first
-# of these: pilots of other numbers of samples take the same kernel, which need not be compiled again.
-KERNEL_TIE = 1.05
-KERNELS = ("none", "one")
 
 # Bootstrap samples of a pilot's groups, see `certainty`.
 RESAMPLINGS = 100
@@ -119,8 +106,8 @@ LEAST_VARIANCE = 1e-4
 class Alternatives:
     """What a render may do: the ``candidates``, for so many ``samples`` that are still to come.
 
-    ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`
-    and `DIRECT_GAIN`; ``guidable``: whether s = 0 can be guided."""
+    ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`;
+    ``guidable``: whether s = 0 can be guided."""
 
     candidates: list[Configuration]
     stratified: bool
@@ -147,6 +134,11 @@ class Prediction:
     def time(self) -> float:
         """To a certain error, in a unit of its own."""
         return self.cost * self.variance
+
+    @property
+    def score(self) -> float:
+        """What is least in the choice: the time, and `CAUTION` about what costs more."""
+        return self.time * self.cost**CAUTION
 
     def with_emission(self, tables: EmissionTables, without_tables: bool) -> Prediction:
         """The same with light subpaths that ``tables`` guide, if there are some."""
@@ -214,36 +206,20 @@ def _guided(
 
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
-    """Predictions for the candidates, the best first."""
-    table = _predicted(moments, alternatives)
-    if alternatives.stratified:
-        table = _without_doubtful(table, moments.rays["evenness"] * UNIFORM >= 1)
-    table.sort(key=lambda row: row.time * MORE_GAIN ** -math.log2(row.candidate.camera_paths_per_light_path))
-    least = min((row.time for row in table), default=0.0)
-    tied = [row for row in table if row.candidate.light_paths and row.time <= KERNEL_TIE * least]
-    if tied:
-        _put_first(table, min(tied, key=lambda row: KERNELS.index(row.candidate.connections)))
-    # Path tracing alone before what is hardly better.
-    alone = next((row for row in table if not row.candidate.light_paths), None)
-    if alone is not None and alone.time <= LIGHT_GAIN * least:
-        _put_first(table, alone)
-    return table
-
-
-def _predicted(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
-    """All candidates of finite variance, in their order."""
+    """Predictions for the candidates of finite variance, the best first."""
     candidates = alternatives.candidates
     variances = _robust_mean(_by_group(moments, candidates, alternatives.stratified))
-    return [
+    table = [
         Prediction(c, cost(c, moments.rays, alternatives.samples), max(v, LEAST_VARIANCE))
         for c, v in zip(candidates, variances.tolist(), strict=True)
         if math.isfinite(v)
     ]
+    return sorted(table, key=lambda row: row.score)
 
 
 def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:
     """Variance of each candidate in each group of the pilot, shape (`GROUPS`, candidates)."""
-    drawn = moments.variance(_trimmed_mean(moments.draw), stratified)
+    drawn = moments.variance(moments.draw, stratified)
     every = moments.variance(0, stratified)
     columns = [
         (drawn if c.connections == "one" else every)[:, :, WEIGHTINGS.index(c.weighting)] for c in candidates
@@ -252,31 +228,11 @@ def _by_group(moments: Moments, candidates: list[Configuration], stratified: boo
     return parts[:, :, 0] + parts[:, :, 1] * [c.camera_paths_per_light_path for c in candidates]
 
 
-def _without_doubtful(table: list[Prediction], uniform: bool) -> list[Prediction]:
-    """Without the coefficients of s = 1 that gain too little over the usual one, see `DIRECT_GAIN`.
-
-    ``uniform``: whether the sky is nearly uniform.
-    """
-    usual, gain = (SKY_DIRECT, UNIFORM_GAIN) if uniform else (1, DIRECT_GAIN)
-
-    def is_usual(candidate: Configuration) -> bool:
-        return bool(candidate.light_paths) or candidate.kappa_direct == usual
-
-    alone = (row.variance for row in table if not row.candidate.light_paths and is_usual(row.candidate))
-    most = min(alone, default=math.inf) / gain
-    return [row for row in table if is_usual(row.candidate) or row.variance <= most]
-
-
-def _put_first(table: list[Prediction], row: Prediction):
-    table.remove(row)
-    table.insert(0, row)
-
-
 def certainty(moments: Moments, alternatives: Alternatives) -> float:
     """How sure the choice is: a share of bootstrap samples of the pilot.
 
     In what share of `RESAMPLINGS` of its independent groups the candidate that `choose` puts first is within
-    `LIGHT_GAIN` of the best.
+    `NEAR` of the best.
     """
     best = _unguided(moments, alternatives)[0].candidate
     random = np.random.default_rng(len(alternatives.candidates))
@@ -284,18 +240,8 @@ def certainty(moments: Moments, alternatives: Alternatives) -> float:
     for _ in range(RESAMPLINGS):
         table = _unguided(moments.of(random.integers(0, GROUPS, GROUPS)), alternatives)
         times = {row.candidate: row.time for row in table}
-        agree += times.get(best, math.inf) <= LIGHT_GAIN * min(times.values())
+        agree += times.get(best, math.inf) <= NEAR * min(times.values())
     return agree / RESAMPLINGS
-
-
-def _trimmed_mean(draw: np.ndarray) -> np.ndarray:
-    """What the draw of a connection adds: the mean of the groups but for the largest quarter.
-
-    Few samples show its outliers (the unshadowed 1 / dist^2), but not yet those of all else, beside which
-    they are small: in `ajar_door`, 60 % of the variance in 2^11 samples, 10 % in 2^17.
-    """
-    calm = np.sort(draw, axis=0)[: len(draw) * 3 // 4].mean(axis=0)
-    return np.broadcast_to(calm, draw.shape)
 
 
 def _robust_mean(values: np.ndarray) -> np.ndarray:
@@ -318,26 +264,18 @@ def _robust_mean(values: np.ndarray) -> np.ndarray:
 
 
 def why_not(row: Prediction, chosen: Prediction) -> str:
-    """Why ``row`` of the table of `choose` is not the ``chosen``, though it would take less time; else empty.
+    """Why ``row`` of the table of `choose` is not the ``chosen``.
 
-    The reasons are the rules of `choose`, in the order in which they have the last word.
+    Empty if it would not take less time.
     """
     gain = chosen.time / row.time
     if gain <= 1:
         return ""
     if chosen.candidate.guided and not row.candidate.guided:
         return "without guided s=0 it has the outliers of SDS paths, which are in no figure here"
-    if not chosen.candidate.light_paths and row.candidate.light_paths:
-        return f"light subpaths have to gain {LIGHT_GAIN:g}x, and gain {gain:.2f}x"
-    if not (chosen.candidate.light_paths and row.candidate.light_paths):
-        return ""  # no rule puts one without light subpaths behind a slower one
-    if chosen.candidate.connections != row.candidate.connections:
-        return f"connections={row.candidate.connections} has to gain {KERNEL_TIE:g}x, and gains {gain:.2f}x"
-    more = row.candidate.light_paths / chosen.candidate.light_paths
-    return (
-        f"{more:g} times as many light subpaths have to gain {MORE_GAIN ** math.log2(more):.3g}x, and gain "
-        f"{gain:.2f}x"
-    )
+    more = row.cost / chosen.cost
+    needed = f"{more**CAUTION:.2f}x"
+    return f"a sample of it costs {more:.2f} times as much: it has to gain {needed}, and gains {gain:.2f}x"
 
 
 def left_out(table: list[Prediction], guided: float = 0.0, name: str = "guided s=0") -> list[dict[str, str]]:
@@ -359,9 +297,9 @@ def left_out(table: list[Prediction], guided: float = 0.0, name: str = "guided s
     for name, lacks in without.items():
         others = [row for row in table if not lacks(row.candidate)]
         if others and lacks(table[0].candidate):
-            ratio = min(row.time for row in others) / table[0].time
+            best = min(others, key=lambda row: row.time)
+            ratio = best.time / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
-            if ratio < 1:
-                why = f"in the pilot it gains {1 / ratio:.2f}x at most, and a prediction is off by as much"
+            why = why_not(best, table[0]) or why
             skipped.append({"class": name, "level": "not worth its cost here", "why": why})
     return skipped

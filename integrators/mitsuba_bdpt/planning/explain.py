@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
-from .choice import LIGHT_GAIN, Prediction, why_not
+from .choice import NEAR, Prediction, why_not
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 _STARTS = {
@@ -142,7 +142,7 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
         lines.append(f"  they are of one light subpath at a time, not of {joined}")
     lines.append(
         f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
-        f"most {LIGHT_GAIN:g} times as long as the best"
+        f"most {NEAR:g} times as long as the best"
     )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")

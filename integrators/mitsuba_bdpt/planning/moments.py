@@ -133,8 +133,8 @@ class Moments:
     emissions, see `_of_tiles` (nothing: no cells). ``mean`` of the image (mean of the
     colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
     ``rays`` and connections per camera sample and kind, with one light subpath each, the number of ``kinds``
-    of BSDFs, ``far``, the share of light subpaths that start at infinity, and the sky's ``evenness``, its
-    mean radiance over its largest (0 if not all light is that of a sky); ``lanes``: number of camera samples.
+    of BSDFs, and ``far``, the share of light subpaths that start at infinity; ``lanes``: number of camera
+    samples.
     """
 
     base: np.ndarray

@@ -337,9 +337,7 @@ def measure(
     if everything.guidable and not guiding:
         found = replace(found, isolated=found.isolated[:, :0])
     known = {"kinds": prepared.traits.asked.kinds, "far": prepared.emitters.far_share}
-    contrast = prepared.emitters.contrast
     known["media"] = float(prepared.space is not None)
-    known["evenness"] = 1 / contrast if contrast < np.inf else 0.0  # also if it is no number
     return replace(found, rays=found.rays | known)
 
 
