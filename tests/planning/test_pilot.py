@@ -858,30 +858,6 @@ def test_weights_by_class():
     assert dr.all(shares.z >= weight * (1 - 1e-5))
 
 
-def test_outliers_of_all_do_not_count_and_of_one_do():
-    """Rationale: what a few light subpaths find can decide. Expected: a group in which all candidates are far
-    off counts as a usual one; one in which path tracing alone is, as it is; and one in which all are, but
-    some a hundred times as far (a small caustic that a single group has met), says so."""
-    values = np.ones((16, 44))
-    values[3] = 1000
-    assert choice._robust_mean(values) == pytest.approx(np.ones(44))
-    values = np.ones((16, 44))
-    values[5, :3] = 1000
-    assert choice._robust_mean(values)[0] > 50 and choice._robust_mean(values)[9] == 1
-    values = np.ones((16, 44))
-    values[3] = 10
-    values[3, :3] = 1000
-    assert choice._robust_mean(values)[0] == pytest.approx((15 + 100) / 16)
-
-
-def test_groups_that_find_less_than_nothing_turn_no_scale():
-    """Rationale: an unbiased estimate of little variance may be negative, and scales made of such ones would
-    have any size and sign. Expected: where one of two is negative in each group, the plain mean."""
-    values = np.where(np.arange(16)[:, None] % 2 == [0, 1], [1.0, 2.0], [-0.1, -0.2])
-    values *= 1 + np.arange(16)[:, None] / 16
-    assert choice._robust_mean(values) == pytest.approx(values.mean(axis=0))
-
-
 def test_recording_counts_in_short_renders():
     """Rationale: in previews most of the time is that of recording the kernel, twice as long with light
     subpaths. Expected: with 0.55 of the variance for a sixth more per sample light subpaths are taken for a
@@ -924,16 +900,6 @@ def test_certainty():
     assert choice.certainty(made_of(base, rays), Alternatives(possible, True)) == pytest.approx(
         0.64, abs=0.15
     )
-
-
-def test_losing_light_counts_beside_outliers():
-    """Rationale: infinite variance is light that a candidate cannot make. Expected: it stays infinite
-    although the group in which it was seen is left out as an outlier of all others."""
-    values = np.ones((16, 44))
-    values[3] = 1000
-    values[3, 7] = np.inf
-    found = choice._robust_mean(values)
-    assert np.isinf(found[7]) and found[8] == 1
 
 
 def test_weightings_in_order():

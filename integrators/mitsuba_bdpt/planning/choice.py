@@ -95,9 +95,6 @@ MORE_GUIDED_GAIN = 1.3
 # Bootstrap samples of a pilot's groups, see `certainty`.
 RESAMPLINGS = 100
 
-# Of a group's variance over the median of all groups': below it is noise, see `_robust_mean`.
-LEAST_USUAL = 0.1
-
 # Per sample, as relMSE: below it nobody sees noise, and candidates differ by that of the pilot.
 LEAST_VARIANCE = 1e-4
 
@@ -208,7 +205,7 @@ def _guided(
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first."""
     candidates = alternatives.candidates
-    variances = _robust_mean(_by_group(moments, candidates, alternatives.stratified))
+    variances = _by_group(moments, candidates, alternatives.stratified).mean(axis=0)
     table = [
         Prediction(c, cost(c, moments.rays, alternatives.samples), max(v, LEAST_VARIANCE))
         for c, v in zip(candidates, variances.tolist(), strict=True)
@@ -242,25 +239,6 @@ def certainty(moments: Moments, alternatives: Alternatives) -> float:
         times = {row.candidate: row.time for row in table}
         agree += times.get(best, math.inf) <= NEAR * min(times.values())
     return agree / RESAMPLINGS
-
-
-def _robust_mean(values: np.ndarray) -> np.ndarray:
-    """Mean over the groups (rows), of which the worst quarter counts as much as the next one.
-
-    Each is scaled down until the candidate (column) that suffers least there does so. An outlier that no
-    candidate does anything about would hide how they differ; what only some suffer from, such as path tracing
-    from a caustic, has to count.
-    """
-    finite = np.isfinite(values).all(axis=0)
-    if not finite.any():
-        return values.mean(axis=0)
-    values = np.where(finite, values, np.inf)  # losing light in one group is losing light
-    usual = values[:, finite] / np.maximum(np.median(values[:, finite], axis=0), LEAST_VARIANCE)
-    usual = np.maximum(usual, LEAST_USUAL)  # an estimate of little variance may be negative
-    least = usual.min(axis=1)
-    most = np.sort(least)[len(least) * 3 // 4 - 1]
-    scale = np.where(least > most, most / np.where(least > most, least, 1), 1)
-    return (values * scale[:, None]).mean(axis=0)
 
 
 def why_not(row: Prediction, chosen: Prediction) -> str:
