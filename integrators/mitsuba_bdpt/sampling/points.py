@@ -1,16 +1,14 @@
-"""The one place where random numbers come from.
+"""Random numbers of subpaths: the only source of them in a render.
 
-Every draw names its purpose and the vertex it serves, so that the point set can be exchanged:
+Every draw names its purpose and its vertex, so that the point set can be exchanged (`settings.POINTS`):
 
-* ``sobol``: Owen-scrambled Sobol' pairs for the purposes in `STRATIFIED` at every vertex: one
-  sequence over all samples of the image in pixel order (all samples of a pixel are neighbours
-  in it, so each pixel holds a net, and so does each power-of-two group of pixels). Draws of a subpath on
-  which one contribution depends together, up to the second vertex, are joint points of several
-  dimensions (`sobol.related`); further ones are joined vertex by vertex.
+* ``sobol``: Owen-scrambled Sobol' points for the purposes in `STRATIFIED`, in one sequence over all samples
+  of the image in pixel order, so that each pixel, and each aligned power-of-two group of pixels, holds a net.
+  Draws up to the second vertex of a subpath are joint points of several dimensions (`sobol.related`); later
+  draws are joint per vertex.
 * ``independent``: hashed numbers throughout.
 
-All else is hashed: a number is a function of seed, sample, vertex and purpose, so that no
-generator's state is carried along a path.
+All other numbers are hashes of seed, sample, vertex and purpose: no generator state is carried along a path.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from . import sobol
 
 
 class Purpose(IntEnum):
-    """What a random number decides; together with the vertex it names a dimension."""
+    """The decision that a random number makes; with the vertex it names a dimension."""
 
     FILM = 0
     APERTURE = 1
@@ -44,16 +42,14 @@ class Purpose(IntEnum):
     TRACKING = 14
 
 
-_PURPOSES = 16  # room per vertex in the numbering of dimensions
-_GROUP = 15  # the place in it of what joint draws share
-_SPREAD = 0x9E3779B1  # odd, so that dimensions stay distinct; spreads them over all bits
-_SECOND = 0x85EBCA6B  # tells the second number of a pair from the first
-_KEY = 0x27D4EB2F  # keeps the key of sample 0 from being 0
+_PURPOSES = 16  # dimensions reserved per vertex
+_GROUP = 15  # dimension of the shuffle that joint draws share
+_SPREAD = 0x9E3779B1  # odd, so that dimensions stay distinct
+_SECOND = 0x85EBCA6B  # separates the second number of a pair from the first
+_KEY = 0x27D4EB2F  # keeps the key of sample 0 nonzero
 
-# Stratified draws, with their number in `sobol.related`; those with None have a shuffle of their own. The
-# light samples of the first and second vertex may share a number: no contribution depends on both. Roulette
-# and the draw of connections gain nothing on a Cornell box, joined or not, and a factor of 4 in a closed room
-# where they are all the noise there is.
+# Stratified draws and their number in `sobol.related`; None: a shuffle of its own. The light samples of the
+# first and second vertex may share a number: no contribution depends on both.
 STRATIFIED = {
     "camera": {
         Purpose.FILM: 0,
@@ -81,10 +77,10 @@ STRATIFIED = {
 
 @dataclass
 class Stream:
-    """The random numbers of one subpath; ``UInt32``, unchanged along the subpath.
+    """Random numbers of one subpath, ``UInt32``, constant along the subpath.
 
-    ``digits`` is its place in the Sobol' sequence (reversed index), ``seed`` the sequence's, ``key`` that of
-    the hashed numbers.
+    ``digits``: reversed index in the Sobol' sequence; ``seed`` of the sequence; ``key`` of the hashed
+    numbers.
     """
 
     digits: mi.UInt32
@@ -93,9 +89,9 @@ class Stream:
 
 
 class Points:
-    """Hands out `Stream` objects and draws from them.
+    """Creates `Stream` objects and draws from them.
 
-    ``kind`` one of `settings.POINTS`; ``seed`` the render's seed (``mi.UInt32``).
+    ``kind``: one of `settings.POINTS`; ``seed`` of the render (``mi.UInt32``).
     """
 
     def __init__(self, kind: str, seed):
@@ -103,31 +99,31 @@ class Points:
         self.seed = seed
 
     def stream(self, side: str, index) -> Stream:
-        """Numbers of one subpath.
+        """Return the stream of one subpath.
 
-        ``side`` is ``camera`` or ``light``; ``index`` (``UInt64``) the subpath's place in the image's
+        ``side`` is ``camera`` or ``light``; ``index`` (``UInt64``) is the subpath's index in the image's
         sequence, unique over all passes.
         """
         side_seed = sobol.hash_u32(self.seed, mi.UInt32(1 if side == "light" else 2))
         low, seed = sobol.split_index(index, side_seed)
-        # A bijection of the index: no two of 2^32 samples of a sequence share their numbers.
+        # A bijection of the index: no two samples of a sequence of 2^32 share a key.
         return Stream(dr.brev(low), sobol.mix(seed), sobol.mix(low ^ _KEY))
 
     def draw_1d(self, side: str, stream: Stream, purpose: Purpose, vertex=0):
-        """One number in [0, 1) for ``purpose`` at ``vertex`` (a Python or Dr.Jit integer)."""
+        """Return a number in [0, 1); ``vertex`` is a Python or Dr.Jit integer."""
         return self._draw(side, stream, purpose, vertex, 1)
 
     def draw_2d(self, side: str, stream: Stream, purpose: Purpose, vertex=0):
-        """A point in [0, 1)^2 for ``purpose`` at ``vertex`` (a Python or Dr.Jit integer)."""
+        """Return a point in [0, 1)^2; ``vertex`` is a Python or Dr.Jit integer."""
         return self._draw(side, stream, purpose, vertex, 2)
 
     def series(self, stream: Stream, purpose: Purpose, vertex, number=0) -> mi.UInt32:
-        """The first word of a series of hashed numbers, for `sequential`; the ``number``-th of several."""
+        """Return the first word of series ``number`` of hashed numbers (`sequential`)."""
         word = sobol.mix(stream.key ^ _seed(stream, purpose, vertex))
         return word if isinstance(number, int) and number == 0 else sobol.mix(word + number)
 
     def _draw(self, side, stream, purpose, vertex, dims):
-        # The seed is in the dimension's word, not in the key: else the hashed numbers of two dimensions
+        # The seed enters the dimension's word, not the key: otherwise the hashed numbers of two dimensions
         # would be the same pairs for every seed, in another order.
         seed = _seed(stream, purpose, vertex)
         if self.kind == "sobol" and purpose in STRATIFIED[side]:
@@ -147,7 +143,7 @@ def _digits(stream, purpose, vertex, number, seed):
     """Digit word of a stratified draw, see `STRATIFIED`."""
     if number is None:
         return sobol.shuffled(stream.digits, seed)
-    # The light sample goes with the direction that led to its vertex.
+    # A light sample belongs to the group of the direction that led to its vertex.
     later = 1 if purpose is Purpose.EMITTER else 0
     group = mi.UInt32(vertex)
     group = dr.select(group <= 1 + later, 0, group - later)
@@ -161,7 +157,10 @@ def _hashed(word, dims):
 
 
 def sequential(word: mi.UInt32) -> tuple[mi.Float, mi.UInt32]:
-    """One number in [0, 1) of a series, and the word of the next one; `Points.series` has the first."""
+    """Return a number in [0, 1) of a series, and the word of the next one.
+
+    `Points.series` returns the first word.
+    """
     return _to_unit(sobol.mix(word)), word + _SPREAD
 
 

@@ -1,4 +1,4 @@
-"""Weighted reservoir sampling: one of a stream of candidates, in proportion to its size.
+"""Weighted reservoir sampling of one candidate from a stream.
 
 Source: M. T. Chao, "A general purpose unequal probability sampling plan", Biometrika 69 (1982).
 """
@@ -10,10 +10,10 @@ import mitsuba as mi
 
 
 def offer(total: mi.Float, size: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Bool, mi.Float]:
-    """Offer a candidate of this ``size``, after others of this ``total``; ``u`` is uniform in [0, 1).
+    """Offer a candidate of this ``size`` after others that sum to ``total``.
 
-    Returns the new total, whether the candidate replaces the one kept so far, and what is left of ``u`` after
-    that decision: u / share or (u - share) / (1 - share), which is uniform again.
+    ``u`` is uniform in [0, 1). Returns the new total, whether the candidate replaces the kept one, and ``u``
+    rescaled by that decision to be uniform again: u / share or (u - share) / (1 - share).
     """
     before, total = total, total + size
     u_total = u * total
