@@ -1,4 +1,4 @@
-"""Which renders can afford a pilot, and of how many samples."""
+"""Which renders run a pilot, and the pilot's number of samples."""
 
 from __future__ import annotations
 
@@ -9,50 +9,45 @@ from ..settings import Settings
 from ..transport.bsdf import Traits
 from ..transport.plan import Plan
 
-# Share of a render's samples that its pilot may take, and bounds of their number; a render of less than
-# `LEAST_SAMPLES` has none. A pilot's sample takes several times as long as one of path tracing alone,
-# and recording it longer than all of a short pilot's samples (scripts/overhead.py): 2 % of a render of
-# `CHEAP_SAMPLES` of path tracing alone. In between a pilot is asked where the scene alone does not tell what
-# pays: it is asked once for all renders of a scene, and what it decides is faster than a guess even in the
-# first (docs/method/skipping.md).
+# The pilot's share of a render's samples, bounds of the pilot's samples, and bounds of the render's samples:
+# a render below `LEAST_SAMPLES` runs no pilot; from `CHEAP_SAMPLES` on recording the pilot takes about 2 % of
+# the render. In between the pilot runs where the scene alone does not decide, once for all renders of a
+# scene. See docs/method/skipping.md and experiments, "First images".
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 
-# Costs of a pilot's kernel in a scene of many BSDFs (`bsdf.MANY`), in samples of a render without a pilot:
-# compiling per kind of BSDF, recording per BSDF. Longer renders run a pilot
-# (docs/development/experiments.md, "Choice of strategies").
+# Compilation per kind of BSDF and recording per BSDF of a pilot's kernel in a scene of many BSDFs
+# (`bsdf.MANY`), in samples of a render without a pilot. Longer renders run a pilot; see experiments, "Choice
+# of strategies".
 SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
 
-# Multiple of that length from which on the pilot also predicts the gain of guided s = 0, which takes three
-# kernels in place of one (docs/development/experiments.md, "Choice of strategies").
+# Multiple of that length from which on the pilot also predicts the gain of photon-guided BSDF sampling, which
+# takes three kernels instead of one; see experiments, "Choice of strategies".
 GUIDING_TIMES = 4
 
-# What a render is taken for whose number of samples is only a bound, see `expected_samples`.
+# Assumed samples of a render of unknown length, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
 
-# Up to this ratio of its largest radiance to its mean a sky is even: a clear one without its sun has some
-# ten, one with it thousands.
+# A sky is even up to this ratio of largest to mean radiance (a clear sky without its sun has about ten).
 EVEN = 100
 
-# Films of fewer pixels ask no pilot, which takes splats for as noisy as those of an image of many pixels, and
-# have a light subpath for each camera subpath, since those that share one are correlated.
+# Films of fewer pixels run no pilot, whose variance of splats assumes an image of many pixels. They trace a
+# light subpath per camera subpath, since camera subpaths that share one are correlated.
 FEW_PIXELS = 64
 
 
 def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
-    """Samples still to come of a render with ``left`` more at most.
+    """Number of samples still to come in a render with at most ``left`` more.
 
-    Under ``timeout`` and ``target_error`` nobody knows: as many as are ``done``, or `PROVISIONAL_SAMPLES`. (A
-    pilot that takes half of the render would be as bad as one that sees rare paths which the render does not
-    meet.)
+    Unknown under ``timeout`` and ``target_error``: then as many as are ``done``, or `PROVISIONAL_SAMPLES`.
     """
     open_end = settings.target_error > 0 or 0 <= settings.timeout < math.inf
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 
 def least_samples(traits: Traits) -> int:
-    """Least number of samples of a render for which a pilot runs. ``traits``: of the scene's BSDFs."""
+    """Least number of samples of a render that runs a pilot; ``traits`` of the BSDFs."""
     asked = traits.asked
     if not asked.many:
         return LEAST_SAMPLES
@@ -60,19 +55,19 @@ def least_samples(traits: Traits) -> int:
 
 
 def predicts_guiding(traits: Traits, samples: int) -> bool:
-    """Whether the pilot of a render with ``samples`` samples predicts the gain of guided s = 0."""
+    """Whether a pilot predicts the gain of photon-guided BSDF sampling."""
     return not traits.asked.many or samples >= GUIDING_TIMES * least_samples(traits)
 
 
 def lanes(samples: int) -> int:
-    """Samples of the pilot of a render of so many, which are enough for one."""
+    """Number of pilot samples for a render of ``samples`` samples."""
     return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
 
 
 def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
-    """What a render begins with: ``full``, unless its film has few pixels.
+    """The plan before any decision.
 
-    Then there is a light subpath for each camera subpath, unless parameters say how many.
+    ``full``, but on few pixels with one light subpath per camera subpath, unless set by parameters.
     """
     return (
         replace(full, camera_paths_per_light_path=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
@@ -80,12 +75,12 @@ def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
 
 
 def is_open(full: Plan, settings: Settings) -> bool:
-    """Whether there is something to choose: nothing is given by hand, and light subpaths are possible."""
+    """Whether light subpaths are possible and no parameter fixes the strategies."""
     return full.light and not is_by_hand(settings)
 
 
 def is_by_hand(settings: Settings) -> bool:
-    """Whether parameters say what is done. (Strategy images want all strategies.)"""
+    """Whether parameters fix the strategies (strategy images need all of them)."""
     return not _is_auto(settings) or settings.decisions is not None or settings.strategy_images
 
 

@@ -14,22 +14,22 @@ SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
 
 
 def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:
-    """All configurations that lose no light which ``full`` finds, with one inner connection or none.
+    """All configurations that sample the light that ``full`` samples.
 
-    (All of them gain 1.02 at most in the scenes of docs/reports/choices.json, 1.13 in one of a small caustic,
-    and one pilot of 32 chose them where they take 2.1 times as long.)
+    With one inner connection or none: all connections hardly gain (experiments, "Choice of strategies").
     """
 
     def lost_without_arrival(plan: Plan) -> tuple[UnreachablePaths, ...]:
-        """A small lens is a poor finder of what t = 0 alone finds: it does not stand for connections.
+        """Paths that are not sampled, when neither t = 0 nor merging counts.
 
-        Nor does merging, which is not unbiased.
+        A small lens rarely samples what only t = 0 samples, and merging is not unbiased: neither replaces
+        connections.
         """
         return unreachable_paths(prepared, replace(plan, arrival=False, merging=False), settings)
 
     found: list[Configuration] = []
     lost = lost_without_arrival(full)
-    # A sensor with area sees delta emitters by light subpaths alone.
+    # A sensor with area sees delta emitters only by light subpaths.
     tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
     for weighting in WEIGHTINGS:
         if (weighting.inner and full.connections == "none") or (tied and not weighting.light):
@@ -37,6 +37,6 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
         connections = "one" if weighting.inner else "none"
         if lost_without_arrival(Configuration.weighted(weighting, 1, connections).plan(full)) != lost:
             continue
-        most = 1 / weighting.light if weighting.light else 1  # a coefficient beyond the count is of no use
+        most = 1 / weighting.light if weighting.light else 1  # a larger coefficient is of no use
         found += [Configuration.weighted(weighting, n, connections) for n in SERVED if n <= most]
     return found

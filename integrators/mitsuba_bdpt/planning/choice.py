@@ -1,7 +1,7 @@
 """Chooses the most efficient configuration from a pilot's statistics.
 
-The least cost times variance wins, after what stratified points take off the variances. Costs are counted,
-not timed (see `COSTS`), so that the same seed leads to the same decision on every machine.
+Minimises cost^(1 + `CAUTION`) times variance, the stratification gain included. Costs are counted, not timed
+(see `COSTS`): equal seeds give equal decisions on all machines.
 """
 
 from __future__ import annotations
@@ -17,41 +17,36 @@ from ..transport.plan import GUIDED
 from .configuration import WEIGHTINGS, Configuration, Decision
 from .moments import GROUPS, Moments
 
-# What takes how long, in units of a ray of a camera subpath (closest hit or shadow, with all that belongs to
-# it). Fitted to candidates in 29 scenes on two cores (docs/reports/choices.json): off by 6 % (root mean
-# square) for the ratios of their times.
+# Costs in units of a ray of a camera subpath (closest hit or shadow ray, including shading). Fitted; see
+# experiments, "Choice of strategies".
 COSTS = {
-    "light_path": 1.7,  # to start a light subpath
-    "far": 2.0,  # beside it, to start one from infinity
-    "light": 0.76,  # each of its rays
-    "light_in_media": 1.2,  # the same in a scene with media
-    "inner": 0.55,  # to look for connections at all, per sample
-    "joined": 0.65,  # a connection that is drawn and tested
-    "shadow_inner": 0.65,  # each that is tested, where all are
-    # In a scene with media, a pair that is evaluated by the lane of a packet that has most of them: others
-    # wait for it, and long subpaths differ. (Six scenes: 0.13 to 0.28.)
+    "light_path": 1.7,  # starting a light subpath
+    "far": 2.0,  # additional cost of starting one at infinity
+    "light": 0.76,  # a ray of a light subpath
+    "light_in_media": 1.2,  # a ray of a light subpath in a scene with media
+    "inner": 0.55,  # looking for connections, per sample
+    "joined": 0.65,  # a drawn and tested connection
+    "shadow_inner": 0.65,  # a tested connection, if all are tested
+    # With media: an evaluated pair of the lane of a packet with most pairs, for which the others wait.
     "packets": 0.18,
-    "guide": 3.0,  # a vertex where s = 0 is guided
-    "aimed": 7.0,  # each guided sample of it
-    "diverging": 0.5,  # a pair whose BSDFs are evaluated, where the lanes of a packet meet different ones
+    "guide": 3.0,  # a vertex with photon-guided BSDF sampling
+    "aimed": 7.0,  # a guided sample of such a vertex
+    "diverging": 0.5,  # an evaluated pair of BSDFs, if the lanes of a packet have different BSDFs
 }
 
-# What a render takes besides its samples, most of it to record its kernel, in the same unit: with path
-# tracing alone, for light subpaths beside it, for connections. (Renders of 2 samples of 16^2 pixels in seven
-# scenes: 8 to 13 ms, 8 to 17 ms, 0 to 2 ms, where a ray takes 34 to 53 ns on two cores.) Previews of 128^2 at
-# 4 samples per pixel have 200,000 to 500,000 rays.
+# Cost of a render besides its samples, mainly recording of its kernel, in the same unit: path tracing alone,
+# plus light subpaths, plus connections, plus guiding. See experiments, "Choice of strategies".
 FIXED = {"start": 180e3, "light": 250e3, "inner": 20e3, "guided": 600e3}
 
-# Numbers of kinds of BSDFs from which on, and up to which, the lanes of a packet take turns in evaluating
-# theirs. (BSDFs of one kind share their functions. By the number of BSDFs, a connection seemed to cost 1.3
-# times what it does in a room of 12 BSDFs of 5 kinds, and path tracing alone was chosen there.)
+# Numbers of kinds of BSDFs between which the lanes of a packet increasingly take turns in evaluating their
+# BSDFs. BSDFs of one kind share their functions.
 FEW_KINDS, MANY_KINDS = 2, 16
 
 
 def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = math.inf) -> float:
-    """Cost of a sample in a render of so many ``samples``; that of path tracing alone is 1.
+    """Cost of a sample in a render of ``samples`` samples; path tracing alone costs 1.
 
-    What is `FIXED` is included. ``rays`` per sample of the pilot, see `moments.Moments`.
+    Includes `FIXED`. ``rays`` per sample of the pilot, see `moments.Moments`.
     """
     total = camera = rays["camera"] + rays["shadow_s1"] + FIXED["start"] / samples
     if candidate.light_paths:
@@ -73,38 +68,34 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
     return total / camera
 
 
-# A candidate whose sample costs c times as much has to gain c^CAUTION: predictions are off by some 10 %, and
-# where candidates hardly differ pilots of other seeds choose something else (docs/development/experiments.md,
-# "Choice of strategies").
+# A candidate whose sample costs c times as much has to gain c^CAUTION, since predictions are inexact; see
+# experiments, "Choice of strategies".
 CAUTION = 0.3
 
-# In the resamplings that `certainty` counts the chosen candidate takes at most so many times as long as the
-# best.
+# `certainty` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
 
-# Photon-guided BSDF sampling (s = 0) with one sample has to gain this factor in three quarters of the pilot's
-# groups. It removes outliers alone: where 2 is predicted, raw error times time falls by 1.4 to 2.8, and
-# trimmed error times time rises by 1.2 to 1.6. (Of eight pilots in seven scenes at 4 to 256 samples per pixel
-# of 128^2 none predicts 2.3 to 3.5; see docs/method/skipping.md.)
+# Photon-guided BSDF sampling with one sample has to gain this factor in three quarters of the pilot's groups.
+# It removes outliers only, at a cost; see experiments, "Photon-guided BSDF sampling".
 GUIDE_GAIN = 2.5
 
-# A larger number of guided samples has to gain this factor over a smaller one: what guiding cannot help is in
-# no prediction of it.
+# A larger number of guided samples has to gain this factor over a smaller one.
 MORE_GUIDED_GAIN = 1.3
 
-# Bootstrap samples of a pilot's groups, see `certainty`.
+# Bootstrap resamplings of a pilot's groups, see `certainty`.
 RESAMPLINGS = 100
 
-# Per sample, as relMSE: below it nobody sees noise, and candidates differ by that of the pilot.
+# relMSE per sample below which noise is invisible, and differences of candidates are the pilot's noise.
 LEAST_VARIANCE = 1e-4
 
 
 @dataclass(frozen=True)
 class Alternatives:
-    """What a render may do: the ``candidates``, for so many ``samples`` that are still to come.
+    """The ``candidates`` for a render with ``samples`` samples still to come.
 
-    ``stratified``: whether its points will be better than independent ones, see `moments.Moments.variance`;
-    ``guidable``: whether s = 0 can be guided."""
+    ``stratified``: whether its points are stratified, see `moments.Moments.variance`; ``guidable``: whether
+    photon-guided BSDF sampling is possible.
+    """
 
     candidates: list[Configuration]
     stratified: bool
@@ -116,9 +107,9 @@ class Alternatives:
 class Prediction:
     """The predicted efficiency of a candidate.
 
-    ``cost`` of a sample (path tracing alone: 1); its ``variance`` as relMSE, before what points take off that
-    of all candidates, without isolated light where s = 0 can be guided; ``gain``: see `guided_gain`;
-    ``without_tables``: not of the tables that guide emission.
+    ``cost`` of a sample (path tracing alone: 1); ``variance``: relMSE per sample including the stratification
+    gain, without SDS paths where s = 0 can be guided; ``gain``: see `guided_gain`; ``without_tables``: the
+    figures do not include guided emission.
     """
 
     candidate: Configuration
@@ -129,30 +120,30 @@ class Prediction:
 
     @property
     def time(self) -> float:
-        """To a certain error, in a unit of its own."""
+        """Time to a given error, in arbitrary units."""
         return self.cost * self.variance
 
     @property
     def score(self) -> float:
-        """What is least in the choice: the time, and `CAUTION` about what costs more."""
+        """The quantity that the choice minimises: `time` times cost^`CAUTION`."""
         return self.time * self.cost**CAUTION
 
     def with_emission(self, tables: EmissionTables, without_tables: bool) -> Prediction:
-        """The same with light subpaths that ``tables`` guide, if there are some."""
+        """The same with emission guided by ``tables``, if it has light subpaths."""
         if not self.candidate.light_paths:
             return self
         candidate = replace(self.candidate, emission=tables)
         return replace(self, candidate=candidate, without_tables=without_tables)
 
     def decided(self, first_pass: int, mean: float) -> Decision:
-        """The decision for the candidate from the pass ``first_pass`` on; ``mean`` of the image."""
+        """The candidate's decision from pass ``first_pass`` on; ``mean`` of the image."""
         return Decision.of(self.candidate, first_pass, cost=self.cost, variance=self.variance, mean=mean)
 
 
 def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
-    """Predictions for the candidates, the best first; without those that lose light.
+    """Predictions for the candidates of finite variance, the best first.
 
-    Before them the best of them with s = 0 guided, if that pays.
+    Preceded by the best one with photon-guided BSDF sampling, if that pays.
     """
     table = _unguided(moments, alternatives)
     if guided := _guided(moments, alternatives, table):
@@ -167,10 +158,10 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
 
 
 def guided_gain(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> float:
-    """Factor by which guiding s = 0 shortens the time to the same error; 0 where that is impossible.
+    """Factor by which guiding s = 0 shortens the time to equal error; 0 if impossible.
 
-    Outliers included. The lower quartile of the pilot's groups, for the smallest number of guided samples:
-    errors that guiding does not reduce are in no prediction of it. ``table`` of `choose`.
+    Outliers included. Lower quartile of the pilot's groups, for the smallest number of guided samples.
+    ``table`` of `choose`.
     """
     found = _guided(moments, alternatives, [row for row in table if not row.candidate.guided])
     return found[0][0] if found else 0.0
@@ -179,24 +170,24 @@ def guided_gain(moments: Moments, alternatives: Alternatives, table: list[Predic
 def _guided(
     moments: Moments, alternatives: Alternatives, table: list[Prediction]
 ) -> list[tuple[float, Prediction]]:
-    """The best way with light subpaths and each number of guided samples, after its gain, see `guided_gain`.
+    """For each number of guided samples: gain and best prediction with light subpaths.
 
-    Path tracing alone would guide more than the pilot has seen: what light tracing joins. The number of light
-    subpaths and their coefficients are chosen before and do not depend on it: outliers would hide how other
-    candidates differ.
+    Gain: see `guided_gain`. Path tracing alone would guide more vertices than the pilot measures, those that
+    light tracing samples. The number of light subpaths and the coefficients do not depend on guiding: its
+    outliers would hide the differences of the candidates.
     """
     lit = next((row for row in table if row.candidate.light_paths), None)
     if not alternatives.guidable or lit is None or not moments.isolated.size:
         return []
     alone, *guided = moments.isolated.T
     others = _by_group(moments, [table[0].candidate, lit.candidate], alternatives.stratified)
-    best, variance = np.maximum(others, LEAST_VARIANCE).T  # an estimate of little variance may be negative
+    best, variance = np.maximum(others, LEAST_VARIANCE).T  # estimates of small variances may be negative
     before = table[0].cost * (best + alone)
     found: list[tuple[float, Prediction]] = []
     for samples, isolated in zip(GUIDED, guided, strict=True):
         candidate = replace(lit.candidate, guided=samples)
         each = cost(candidate, moments.rays, alternatives.samples)
-        # Not of the means: a few vertices may have all of the variance, and means of few groups swing.
+        # Not the ratio of means: a few vertices may hold all of the variance.
         gain = float(np.quantile(before / (each * (variance + isolated)), 1 / 4))
         found.append((gain, replace(lit, candidate=candidate, cost=each, gain=gain)))
     return found
@@ -226,10 +217,9 @@ def _by_group(moments: Moments, candidates: list[Configuration], stratified: boo
 
 
 def certainty(moments: Moments, alternatives: Alternatives) -> float:
-    """How sure the choice is: a share of bootstrap samples of the pilot.
+    """Confidence in the choice, from bootstrap resamplings of the pilot's groups.
 
-    In what share of `RESAMPLINGS` of its independent groups the candidate that `choose` puts first is within
-    `NEAR` of the best.
+    Share of `RESAMPLINGS` in which the candidate that `choose` puts first is within `NEAR` of the best.
     """
     best = _unguided(moments, alternatives)[0].candidate
     random = np.random.default_rng(len(alternatives.candidates))
@@ -242,7 +232,7 @@ def certainty(moments: Moments, alternatives: Alternatives) -> float:
 
 
 def why_not(row: Prediction, chosen: Prediction) -> str:
-    """Why ``row`` of the table of `choose` is not the ``chosen``.
+    """Why ``row`` of the table of `choose` is not ``chosen``.
 
     Empty if it would not take less time.
     """
@@ -257,9 +247,9 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
 
 
 def left_out(table: list[Prediction], guided: float = 0.0, name: str = "guided s=0") -> list[dict[str, str]]:
-    """What the best of `choose` does without, and why, as in ``statistics["skipped"]``.
+    """What the best of `choose` leaves out, and why, as in ``statistics["skipped"]``.
 
-    ``guided``: its `guided_gain`, of what has this ``name``.
+    ``guided``: the `guided_gain` of the class ``name``.
     """
     skipped: list[dict[str, str]] = []
     if guided and not table[0].candidate.guided:

@@ -1,8 +1,7 @@
-"""The configurations of a render: how many light subpaths, which connections, with which coefficients.
+"""Configurations of a render: light subpaths, connections, coefficients.
 
-A pilot tells the variance of each of `WEIGHTINGS`; a `Configuration` adds the numbers of subpaths and
-connections, and is what the kernel is told. A `Decision` is one that a render adopts, with what was predicted
-of it; it has a form in JSON.
+A pilot estimates the variance of each of `WEIGHTINGS`. A `Configuration` adds the numbers of subpaths and
+connections. A `Decision` is a configuration in use with its predictions; it has a JSON form.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from ..transport.plan import GUIDED, JOINED, Plan
 
 @dataclass(frozen=True)
 class Weighting:
-    """Coefficients kappa of the classes `mis.CLASSES`, relative to the densities of one sample each."""
+    """Coefficients kappa of the classes `mis.CLASSES`, relative to one sample each."""
 
     hit: float
     direct: float
@@ -27,7 +26,7 @@ class Weighting:
     inner: float
 
     def of(self, kind: str) -> float:
-        """kappa of a class."""
+        """Coefficient kappa of the class ``kind``."""
         return getattr(self, kind)
 
     @property
@@ -36,7 +35,7 @@ class Weighting:
         return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
 
 
-# In this order: each class is in use from some weighting on.
+# In this order each class, once in use, stays in use.
 WEIGHTINGS = (
     *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
     *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
@@ -46,12 +45,12 @@ WEIGHTINGS = (
 
 @dataclass(frozen=True)
 class Configuration:
-    """A way to render.
+    """Number of light subpaths, connections and coefficients of a render.
 
-    The parameters ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``), the coefficients kappa
-    of t <= 1, over its count (``kappa_light``), and of s = 1 (``kappa_direct``). ``guided``: samples
-    by which s = 0 is at a vertex; with `merging`, not 0 if vertices are merged though s = 0 finds that light.
-    ``emission``: what guides that of light subpaths; ``joined``: with so many of them each camera subpath is.
+    ``light_paths`` and ``connections`` (``none``, ``one`` or ``all``) are the parameters; ``kappa_light`` is
+    the coefficient of t <= 1 over its count, ``kappa_direct`` that of s = 1; ``guided``: guided samples per
+    vertex (with `merging`: nonzero if vertices are merged although s = 0 samples that light); ``emission``:
+    tables of guided emission; ``joined``: light subpaths with which each camera subpath is connected.
     """
 
     light_paths: float
@@ -64,7 +63,7 @@ class Configuration:
 
     @classmethod
     def weighted(cls, weighting: Weighting, served: int, connections: str) -> Configuration:
-        """That of a pilot's ``weighting``, with a light subpath for so many camera subpaths."""
+        """The configuration of a ``weighting`` with S = ``served``."""
         return cls(
             light_paths=1 / served if weighting.light else 0.0,
             connections=connections,
@@ -74,17 +73,17 @@ class Configuration:
 
     @property
     def weighting(self) -> Weighting:
-        """The weighting whose variance is that of this configuration, up to the numbers of subpaths."""
+        """The weighting with the variance of this configuration, up to subpath counts."""
         inner = float(self.connections != "none")
         return Weighting(1, self.kappa_direct, self.kappa_light * self.light_paths, inner)
 
     @property
     def camera_paths_per_light_path(self) -> int:
-        """Camera subpaths that a light subpath serves (S), 1 without light subpaths."""
+        """Camera subpaths per light subpath (S); 1 without light subpaths."""
         return round(1 / self.light_paths) if self.light_paths else 1
 
     def plan(self, full: Plan) -> Plan:
-        """``full`` with what is not done left out."""
+        """``full`` restricted to this configuration."""
         light = self.light_paths > 0
         adopted = replace(
             full,
@@ -103,12 +102,11 @@ class Configuration:
         return replace(adopted, camera_paths_per_light_path=served, joined=joined, emission=emission)
 
 
-# Contributions below a share of the image's mean play roulette before their ray is traced: below this one,
-# and below this multiple of a sample's relative variance. It adds at most the share to the variance, in most
-# scenes a tenth of that, but all of it in a furnace, where hardly anything else is noisy.
+# Contributions below a share of the image's mean play roulette before their shadow ray is traced: the smaller
+# of this share and this multiple of a sample's relative variance. It bounds the variance that roulette adds.
 MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 
-# Of a recorded number: what single precision still holds when it is multiplied.
+# Bound of recorded numbers, so that products fit into single precision.
 LARGEST = 1e30
 
 # Entries of a record, see `Decision.record`.
@@ -120,10 +118,11 @@ ENTRIES = (
 
 @dataclass(frozen=True)
 class Decision(Configuration):
-    """The configuration of a render from the pass number ``first_pass`` on, and what was predicted of it.
+    """The configuration from pass ``first_pass`` on, with its predictions.
 
-    ``cost`` of a sample (path tracing alone: 1), its ``variance`` as in `choice.Prediction`, and the
-    image's ``mean``, the scale of roulette."""
+    ``cost`` of a sample (path tracing alone: 1); ``variance`` as in `choice.Prediction`; ``mean`` of the
+    image, the scale of roulette.
+    """
 
     first_pass: int
     cost: float
@@ -134,9 +133,9 @@ class Decision(Configuration):
     def of(
         cls, chosen: Configuration, first_pass: int, *, cost: float, variance: float, mean: float
     ) -> Decision:
-        """The decision for a configuration of which ``cost``, ``variance`` and ``mean`` are predicted.
+        """Return the decision for a configuration with these predictions.
 
-        They have six digits: further ones depend on the order in which a pilot's lanes were added up.
+        Rounds them to six digits: further digits depend on the order of a pilot's atomic additions.
         """
         cost, variance, mean = (float(f"{number:.6g}") for number in (cost, variance, mean))
         what = {f.name: getattr(chosen, f.name) for f in fields(Configuration)}
@@ -144,11 +143,11 @@ class Decision(Configuration):
 
     @property
     def threshold(self) -> float:
-        """The size below which contributions play roulette."""
+        """Absolute size below which contributions play roulette."""
         return self.mean * min(MOST_ROULETTE, ROULETTE_PER_VARIANCE * self.variance)
 
     def record(self) -> dict[str, Any]:
-        """As in ``statistics["decisions"]``."""
+        """Entry of ``statistics["decisions"]``."""
         return {
             "pass": self.first_pass,
             "light_paths": self.light_paths,
@@ -164,10 +163,9 @@ class Decision(Configuration):
 
 
 def read_decisions(text: str) -> tuple[Decision, ...]:
-    """The parameter ``decisions``: JSON as in ``statistics``.
+    """Parse the parameter ``decisions``: JSON as in ``statistics``.
 
-    An empty list means a render without a pilot. Raises `UsageError` saying what is wrong, and in which
-    entry.
+    An empty list means a render without a pilot. Raises `UsageError` naming the entry and the mistake.
     """
     where = ""
     made: list[Decision] = []
@@ -196,7 +194,7 @@ def _is_list(value: Any) -> TypeGuard[list[Any]]:
 
 
 def _is_object(value: Any) -> TypeGuard[dict[str, Any]]:
-    """Whether a value of JSON is an object."""
+    """Whether a JSON value is an object."""
     return isinstance(value, dict)
 
 
@@ -222,7 +220,7 @@ def _read_decision(entry: Any) -> Decision:
         least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
         if not least <= value <= LARGEST:
             raise ValueError(f"{name}={value!r}")
-    guided = entry.get("guided", 0)  # which records of older versions lack
+    guided = entry.get("guided", 0)  # missing in records of older versions
     if isinstance(guided, bool) or guided not in (0, *GUIDED):
         raise ValueError(f"guided={guided!r}")
     joined = entry.get("joined", 1)
@@ -241,7 +239,7 @@ def _read_decision(entry: Any) -> Decision:
 
 
 def _number(entry: dict[str, Any], name: str) -> float:
-    """A number of JSON: neither a boolean, which Python takes for one, nor text that holds one."""
+    """Return a JSON number; booleans and numeric strings raise `TypeError`."""
     value = entry[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{name}={value!r} must be a number")

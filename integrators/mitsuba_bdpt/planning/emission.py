@@ -1,22 +1,20 @@
 # pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-"""Learns from a pilot where light subpaths should set out to: `emission_tables.EmissionTables`.
+"""Fits tables of guided emission, `emission_tables.EmissionTables`, to a pilot.
 
-A contribution of the pilot with the weighted size v lies on a path whose emission is in some cell of the
-tables, whichever strategy has made it; q is the share in the sum of its densities of those strategies whose
-light subpath chooses that emission (t <= 1, inner). Tables multiply that density by a + b r, with r of the
-cell, a `Factor` that is 0 and 1 where all is by the table. The second moment (balance heuristic) is then
-v^2 / (1 - q + q (a + b r)): the gain of any table is known from samples without one. With
+A contribution of weighted size v lies on a path whose emission is in a cell of the tables, whichever strategy
+sampled it. q is the share, in its sum of densities, of the strategies whose light subpath chooses that
+emission (t<=1, inner). Tables multiply this density by f = a + b r, with r of the cell and a, b the `Factor`
+(0, 1 where the table alone decides). The second moment (balance heuristic) is then v^2 / (1 - q + q f):
+samples without a table give the gain of any table. With
 
     D = 1 - q + q a + q b,   l = q b / D,   it is   v^2 / D / (1 - l + l r).
 
-The best r of a mean of 1 is the fixed point of r^2 <- r^2 sum of v^2 / D l / (1 - l + l r)^2.
-(E. Veach 1997, section 9.2; of that kind are P. Grittmann et al. 2018, and P. Dutre and Y. Willems 1995, who
-have no l.)
+The best r of mean 1 is the fixed point of r^2 <- r^2 sum of v^2 / D l / (1 - l + l r)^2. (E. Veach 1997,
+section 9.2; similar, without l: P. Grittmann et al. 2018, P. Dutre and Y. Willems 1995.)
 
-A table that noise has made destroys what points achieve, so one that half of a pilot has taught has to gain
-on the other half.
+Tables of noise destroy the stratification gain: those of one half of a pilot have to gain on the other.
 """
 
 from __future__ import annotations
@@ -34,46 +32,41 @@ from ..transport.contribution import Contribution
 from .configuration import Configuration
 from .moments import HEARD_TILES, tile_of
 
-# Halves of a pilot, and classes of l / (1 - l), each four times the one before.
+# Halves of a pilot, and classes of l / (1 - l), a factor of four apart.
 HALVES, CLASSES = 2, 8
 
-# Columns of a cell: the classes, and the second moments before, by l and whole.
+# Columns of a cell: the classes, then the second moments without tables, times l and whole.
 BEFORE = 2
 COLUMNS = CLASSES + BEFORE
 
-# What l / (1 - l), and l, are in the classes, about.
+# Representative l / (1 - l), and l, of the classes.
 ODDS = 4.0 ** (np.arange(CLASSES) - (CLASSES - 1) / 2)
 _SHARES = ODDS / (1 + ODDS)
 
-# Densities are this or more: 1 / 0.25 is the most by which a contribution can rise.
+# Lower bounds of the relative density: 1 / 0.25 is the largest factor by which a contribution can grow.
 LEAST = (0.5, 0.25)
 
-# What has to be left of the second moments, by l, at most (the geometric mean of all and of all but `WORST`).
+# Most that may remain of second moments (times l): geometric mean of all cells and of all but `WORST`.
 PAYS = 0.93
 
-# Cells that are left out of the second judgement: in `glass_caustics` second moments are outliers.
+# Share of cells left out of the second judgement: outliers.
 WORST = 0.02
 
-# Tables of an emitter that has less than this part in what all save are left out: looking densities up takes
-# time at every vertex. (In `ring_caustic` those of the sky have 0.004.)
+# Emitters with less than this share of the total gain get no tables: lookups cost time at each vertex.
 PART = 0.01
 
-# How often tables of so many cells in each direction are blurred, by what was heard: the first that pays, if
-# the last does. (In `thin_lens` at 16 samples per pixel the first alone does, and light subpaths that it aims
-# have half of path tracing's efficiency by trimmed errors.) Half of a pilot, which judges what half has
-# taught, likes tables smoother than the whole teaches them best: in `pool` tables that are blurred twice look
-# better, and have an error 3 % larger. (Of 12 pilots in `ajar_door` tables of 24 x 24 that are blurred once
-# pay in 1, three times in 3.)
+# Blurs of accumulated tables by their side: the first that pays, if the last pays. One half of a pilot
+# judging tables of the other prefers smoother tables than the whole pilot does.
 BLURS = {24: (1, 3), 16: (1, 2), 8: (1,), 4: (1,)}
 
-# Steps towards the fixed point.
+# Iterations of the fixed point.
 _STEPS = 16
 
 
 class Listener:
-    """Sums of what a pilot's contributions tell about their emissions, of ``cells`` cells of all tables.
+    """Accumulates emission statistics of a pilot in ``cells`` cells of all tables.
 
-    Of each cell v^2 / D by class, then v^2 without tables: times l, and as it is (`BEFORE`).
+    Per cell: v^2 / D by class, then v^2 without tables, times l and whole (`BEFORE`).
     """
 
     def __init__(self, region: Region, cells: int):
@@ -84,9 +77,9 @@ class Listener:
     def hear(
         self, c: Contribution, position: mi.Point2f, half: mi.UInt32, square: mi.Float64, active: mi.Bool
     ):
-        """Add a contribution of this squared size to the ``position`` on the film, where ``active``.
+        """Accumulate a contribution with squared size ``square`` at a film ``position``.
 
-        Where no light subpath could have made its path, it is none of any table's.
+        Ignores paths that no light subpath can sample.
         """
         hit, direct, light, inner = c.shares  # pyright: ignore[reportGeneralTypeIssues]
         cell: Cell = c.emission  # pyright: ignore[reportAssignmentType]
@@ -103,15 +96,15 @@ class Listener:
             dr.scatter_reduce(dr.ReduceOp.Add, self._sums, value, place + column, active)
 
     def evaluated(self) -> np.ndarray:
-        """Shape (`HALVES`, tiles, cells, `COLUMNS`)."""
+        """Emission statistics of shape (`HALVES`, tiles, cells, `COLUMNS`)."""
         return np.array(self._sums).reshape(HALVES, HEARD_TILES**2, self.cells, COLUMNS)
 
 
 @dataclass(frozen=True)
 class Learnt:
-    """What a pilot has taught: ``tables`` that gain, or None, and what they leave of second moments.
+    """Fitted ``tables``, or None without gain, and what they leave of second moments.
 
-    ``left`` of those of strategies whose light subpath chooses the emission, ``whole`` of those of all.
+    ``left``: of the strategies whose light subpath chooses the emission; ``whole``: of all strategies.
     """
 
     tables: EmissionTables | None
@@ -120,10 +113,10 @@ class Learnt:
 
 
 def learn(heard: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
-    """What a pilot teaches that has ``heard`` this, see `moments.Moments`.
+    """Fit tables to the emission statistics ``heard``, see `moments.Moments`.
 
-    Tables have ``side`` x ``side`` cells; ``counts`` of each emitter's. They are of the first of `BLURS` that
-    pays, if the last one does.
+    Tables have ``side`` x ``side`` cells; ``counts``: number of tables per emitter. Uses the first of `BLURS`
+    that pays, if the last one pays.
     """
     heard = heard.reshape(HALVES, -1, side, side, COLUMNS)
     if not heard.any() or not np.isfinite(heard).all():
@@ -133,7 +126,7 @@ def learn(heard: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
 
 
 def _learnt(heard: np.ndarray, times: int, counts: Sequence[int]) -> Learnt:
-    """What is taught by sums that are blurred so many ``times``."""
+    """Fit tables to statistics blurred ``times`` times."""
     halves = [_fitted(half, times) for half in heard]
     guided = _worth_a_table(heard, halves, counts)
     judged: dict[float, Learnt] = {}
@@ -152,7 +145,7 @@ def _learnt(heard: np.ndarray, times: int, counts: Sequence[int]) -> Learnt:
 
 
 def _worth_a_table(heard: np.ndarray, halves: list[np.ndarray], counts: Sequence[int]) -> np.ndarray:
-    """Of each table whether its emitter has a part in what the ``halves``' tables save of the other half."""
+    """Mask of the tables whose emitter contributes to the gain, cross-validated."""
     a = LEAST[-1]
     saved = sum(
         half[..., CLASSES] - _light_side(half, a + (1 - a) * taught)
@@ -164,7 +157,7 @@ def _worth_a_table(heard: np.ndarray, halves: list[np.ndarray], counts: Sequence
 
 
 def left_out(chosen: Configuration, learnt: Learnt | None) -> list[dict[str, str]]:
-    """Why what was ``learnt`` is not used by the ``chosen`` way, as in ``statistics["skipped"]``."""
+    """Why ``chosen`` does not use ``learnt``, as in ``statistics["skipped"]``."""
     if learnt is None or chosen.emission is not None:
         return []
     why = f"in the pilot tables leave {learnt.left:.0%} of light subpaths' part of the squared error"
@@ -175,7 +168,7 @@ def left_out(chosen: Configuration, learnt: Learnt | None) -> list[dict[str, str
 
 
 def left_by(tables: EmissionTables, heard: np.ndarray) -> float:
-    """What ``tables`` leave of the second moment of light-side strategies in all that was ``heard``."""
+    """Second moment of the light-side strategies that ``tables`` leave of ``heard``."""
     whole = heard.reshape(HALVES, -1, tables.side, tables.side, COLUMNS).sum(axis=0)
     densities = tables.densities()
     guided = (densities != 1).any(axis=(1, 2))
@@ -183,14 +176,14 @@ def left_by(tables: EmissionTables, heard: np.ndarray) -> float:
 
 
 def _fitted(heard: np.ndarray, times: int) -> np.ndarray:
-    """The best densities for what was ``heard``, blurred so many ``times``.
+    """The best densities for the statistics ``heard``, blurred ``times`` times.
 
-    Of the shape (tables, side, side, `COLUMNS`); 1 in tables of which nothing was heard.
+    Shape (tables, side, side, `COLUMNS`); 1 in tables without statistics.
     """
     squares = heard[..., :CLASSES]
     for _ in range(times):
         squares = _blurred(squares)
-    known = squares.any(axis=-1)  # under a sky a twentieth of all cells
+    known = squares.any(axis=-1)  # under a sky 5 % of the cells
     table, squares = np.nonzero(known)[0], squares[known]
     density = np.ones(len(squares))
     for _ in range(_STEPS):
@@ -204,7 +197,7 @@ def _fitted(heard: np.ndarray, times: int) -> np.ndarray:
 
 
 def _blurred(squares: np.ndarray) -> np.ndarray:
-    """Each cell with its neighbours, as 1 : 2 : 1 in both directions: 4,096 samples are few for 576 cells."""
+    """Blur each cell with its neighbours, 1 : 2 : 1 in both directions."""
     for axis in (1, 2):
         pad = [(0, 0)] * squares.ndim
         pad[axis] = (1, 1)
@@ -220,14 +213,14 @@ def _totals(density: np.ndarray) -> np.ndarray:
 
 
 def _light_side(heard: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Second moments of light-side strategies with these densities."""
+    """Second moments of the light-side strategies with these densities."""
     return (heard[..., :CLASSES] * _SHARES / _totals(density)).sum(axis=-1)
 
 
 def _left(heard: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndarray:
-    """What is left of second moments, shape (2, 2), if these tables are ``guided`` by their densities.
+    """What tables ``guided`` by their densities leave of second moments, shape (2, 2).
 
-    By l and whole; of all cells and without `WORST` of those that have any.
+    Times l and whole; of all cells, and of all but `WORST` of the nonempty ones.
     """
     whole = (heard[..., :CLASSES] / _totals(density)).sum(axis=-1)
     before = [heard[..., CLASSES + i] for i in range(BEFORE)]

@@ -1,4 +1,4 @@
-"""What is decided under an even sky without a pilot."""
+"""Decisions under an even sky, without a pilot."""
 
 from __future__ import annotations
 
@@ -9,30 +9,26 @@ from .budget import CHEAP_SAMPLES, EVEN
 from .candidates import candidates
 from .configuration import Configuration, Decision
 
-# kappa of s = 1 under a sky of a ratio up to `UNIFORM`, where s = 0 has hardly any noise of its own; 1 under
-# other even ones. Efficiency over path with multijitter at 64 spp with 1, 1/2, 1/4: 1.03, 1.09, 1.04 in
-# `open_sky`, 1.02, 1.00, 0.95 in `smallvcm_cornell_sky`, 0.62, 1.18, 1.83 in `furnace_white`. Error of
-# plastic and metal on a floor under maps of the ratios 1.05, 5.9, 13, with 1/2 over that with 1: 0.84, 1.06,
-# 1.06. From `UNIFORM_SAMPLES` on a pilot chooses: with 24 seeds 1/16 gains 0.8 to 1.2 over 1/2 in `open_sky`,
-# 0.8 to 1.0 in `smallvcm_cornell_sky`, 1.0 to 1.9 (renders: 2.3) in `furnace_white`.
+# kappa of s = 1 under a sky of a ratio up to `UNIFORM`, where s = 0 has little noise (1 under other even
+# skies). From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
 SKY_DIRECT, UNIFORM, UNIFORM_SAMPLES = 1 / 2, 2, 1 << 20
 
-# Multiple of the least length of a render with a pilot at which such a gain pays for the pilot.
+# Multiple of the least length of a render with a pilot from which on that gain pays for the pilot.
 UNIFORM_TIMES = 10
 
 
 def decision(
     prepared: PreparedScene, full: Plan, settings: Settings, samples: int, least: int
 ) -> Decision | None:
-    """The decision for a render of so many ``samples`` for which the scene alone suffices.
+    """Decision for a render of ``samples`` samples that needs no pilot, or None.
 
-    A pilot, which renders of ``least`` samples ask elsewhere, would take too much of it: under an even sky,
-    path tracing alone. (Camera subpaths meet such a sky wherever its light enters, caustics included, and
-    light subpaths hardly find the way in.)
+    Path tracing alone under an even sky in a render too short for a pilot (``least`` samples elsewhere):
+    camera subpaths hit such a sky wherever its light enters, caustics included, and light subpaths rarely
+    find the way in.
     """
     contrast = prepared.emitters.contrast
     most = max(UNIFORM_TIMES * least, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
-    if samples >= most or not contrast <= EVEN:  # also if it is no number
+    if samples >= most or not contrast <= EVEN:  # also if it is NaN
         return None
     if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
         return None

@@ -1,4 +1,4 @@
-"""What a render does and does not do, and why, in words."""
+"""Describes which strategies a render uses and skips, and why."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _RESTS = {
 
 
 def words(lost: UnreachablePaths) -> str:
-    """Paths that no strategy in use can make, in words."""
+    """Describe paths that no strategy in use can sample."""
     starts = " or ".join(_STARTS[start] for start in lost.starts)
     vertex, vertices = "surface", "surfaces"
     if lost.volumes:
@@ -34,7 +34,7 @@ def words(lost: UnreachablePaths) -> str:
 
 
 def subpaths(count: int) -> str:
-    """So many camera subpaths, in words."""
+    """Number of camera subpaths as text."""
     return f"{count} camera subpaths" if count > 1 else "camera subpath"
 
 
@@ -46,10 +46,11 @@ def explain(
     certainty: float = 0.0,
     lost_by_pilot: int = 0,
 ) -> str:
-    """Text about the strategies in use and those that are skipped.
+    """Describe the strategies in use and those skipped.
 
-    ``table`` is a pilot's, see `choice.choose`, and `choice.certainty`; empty without one. ``lost_by_pilot``:
-    how many of its values were not finite."""
+    ``table``: a pilot's predictions (`choice.choose`), with `choice.certainty`; empty without a pilot.
+    ``lost_by_pilot``: number of non-finite values of the pilot.
+    """
     used = [
         name
         for name, on in (
@@ -106,7 +107,7 @@ def _aimed(p: Plan) -> str:
 
 
 def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> list[str]:
-    """What the pilot found: the best of each combination and number of light subpaths."""
+    """Describe the best prediction of each combination and number of light subpaths."""
     if not table:
         return []
     head = (

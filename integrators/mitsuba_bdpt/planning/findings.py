@@ -1,4 +1,4 @@
-"""What earlier renders of a scene have found, as long as nothing was edited."""
+"""Cached results of earlier renders of a scene, valid until it is edited."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ Found = TypeVar("Found")
 
 
 class Findings:
-    """What is known of the scene that one render traces, by the kind of finding and a key.
+    """Cached results for the scene of one render, by kind and key.
 
-    The parameters of scene and sensor are read once (up to 8 ms), and again after `expire`."""
+    Reads the parameters of scene and sensor once (up to 8 ms), and again after `expire`.
+    """
 
     def __init__(self, prepared: PreparedScene, sensor: mi.Sensor):
         self._prepared, self._sensor = prepared, sensor
         self._state: tuple[State, int] | None = None
 
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
-        """What ``look()`` finds, and whether an earlier render has found it for this ``key``."""
+        """Return the result of ``look()`` and whether it was cached for this ``key``."""
         return remembered(self._prepared.scene, self._sensor, kind, (self._scene_state(), key), look)
 
     def expire(self):
-        """Look at the parameters again: somebody may have edited them."""
+        """Read the parameters again before the next lookup: they may have been edited."""
         self._state = None
 
     def _scene_state(self) -> tuple[State, int]:
-        """What tells scene and sensor from themselves after an edit."""
+        """Fingerprint of all parameters of scene and sensor; detects edits."""
         if self._state is None:
             state = State.of([self._prepared.scene, self._sensor])
             self._state = state, self._prepared.camera.region.border

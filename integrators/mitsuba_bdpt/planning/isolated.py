@@ -2,7 +2,7 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""The pilot's estimate of what photon-guided BSDF sampling gains, see `transport.photons.guiding_benefit`."""
+"""The pilot's predicted gain of guiding, see `transport.photons.guiding_benefit`."""
 
 from __future__ import annotations
 
@@ -25,21 +25,20 @@ from ..transport.photons.photon_pass import photons_of, trace_guide
 from ..transport.plan import Plan
 from .moments import FINE, GROUPS, Isolated, tile_of
 
-# Camera samples, most of whose subpaths end at once. Photon subpaths that estimate; also the most photon
-# subpaths of the guide.
+# Camera samples (most subpaths end at once); photon subpaths of the estimate, and the most of the guide.
 LANES, PHOTONS = 1 << 14, 1 << 16
 
-# Estimates of s = 0 beyond the light that arrives times the render's samples over this number are left out:
-# a render rarely samples such light, so that it is missing from the image and adds no noise.
+# Estimates of s = 0 above the arriving light times ``samples`` / SHARE are dropped: a render rarely samples
+# such light, so that it adds no noise to the image.
 SHARE = 16
 
 
 def measure(
     prepared: PreparedScene, plan: Plan, settings: Settings, seed: mi.UInt32, samples: float
 ) -> Isolated | None:
-    """Second moments of s = 0 where ``plan`` can guide it, in a render of ``samples`` camera samples.
+    """Second moments of s = 0 where ``plan`` can guide it.
 
-    None if there is no photon.
+    ``samples``: camera samples of the render. None without photons.
     """
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
     aim = Aim.of(prepared.scene, prepared.emitters)
@@ -63,20 +62,19 @@ def measure(
 
 
 def group(lane: mi.UInt32) -> mi.UInt32:
-    """Return the independent part of the pilot to which a ``lane`` belongs.
+    """Index of the independent part of the pilot to which a ``lane`` belongs.
 
-    Neighbouring lanes belong to different parts, in random order: otherwise the parts would be columns of
-    films of some widths, and each would measure a region of its own.
+    Neighbouring lanes belong to different parts, in random order: else parts could be columns of the film.
     """
     return (lane + sobol.mix(lane // GROUPS)) % GROUPS
 
 
-# Width of a row: even, so that Dr.Jit adds it as a packet.
+# Width of a row, even: Dr.Jit then adds it as a packet.
 _WIDTH = MOMENTS + MOMENTS % 2
 
 
 class Sums:
-    """Sums of the lanes' `Found`, by group and fine tile."""
+    """Sums of the lanes' `Found` by group and fine tile."""
 
     def __init__(self, region: Region):
         self._region = region
@@ -85,14 +83,14 @@ class Sums:
         dr.make_opaque(self._sums, self._aimed)
 
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
-        """Accumulate the `Found` of a ``lane`` whose camera sample has this ``position`` on the film."""
+        """Accumulate the `Found` of a ``lane`` at a film ``position``."""
         row = group(lane) * FINE**2 + tile_of(self._region, position)
         values = mi.ArrayXd(found.moments + [mi.Float64(0)] * (_WIDTH - MOMENTS))
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
         dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))
 
     def evaluated(self) -> tuple[np.ndarray, int]:
-        """The sums, shape (`GROUPS`, fine tiles, moments), and how many vertices could be guided."""
+        """Sums, shape (`GROUPS`, fine tiles, moments), and number of guidable vertices."""
         dr.eval(self._sums, self._aimed)
         sums = np.array(self._sums).reshape(GROUPS, FINE**2, _WIDTH)[:, :, :MOMENTS]
         return sums, int(self._aimed[0])

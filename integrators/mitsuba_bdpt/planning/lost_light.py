@@ -2,14 +2,13 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""How much of an image's light no strategy finds: from a delta emitter by delta events to the eye.
+"""Estimates the share of an image's light on SDS paths that no strategy samples.
 
-It leaves a delta emitter through glass (or another delta surface) and is seen through glass. Such a path has
-no two neighbours that could be joined: lamp, delta surfaces, one other surface, delta surfaces, sensor.
-`possible.unreachable_paths` says where they are possible; here they are estimated as a photon map does it, by
-a few thousand subpaths from either end that take delta events alone. Paths with several other surfaces, no
-two of which are neighbours, are left out, and so is the lamp itself, seen in a mirror. The other surface is
-taken to reflect evenly what it reflects in all, glossy ones too: of these a single view shows more or less.
+Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
+reaches the sensor; no two neighbouring vertices can be connected. `possible.unreachable_paths` decides
+whether such paths are possible. The estimate is a small photon map: a few thousand subpaths from either end
+that follow delta events only. It leaves out paths with several non-delta surfaces that are not neighbours,
+and lamps seen in a mirror. Glossy surfaces count as diffuse with equal albedo.
 """
 
 from __future__ import annotations
@@ -37,32 +36,26 @@ from ..transport.plan import Plan
 from .possible import Start, unreachable_paths
 
 if TYPE_CHECKING:
-    from drjit.auto.ad import PCG32  # that of Mitsuba, of which its stubs do not know
+    from drjit.auto.ad import PCG32  # Mitsuba's class, missing in its stubs
 
-# Subpaths from either end, and how many of those that arrive are compared, at most. The relative standard
-# deviation (24 seeds) is 0.06 for a block of glass that fills the view, and 0.07, 0.18, 0.28 and 0.31 in the
-# first four scenes with such light: enough to tell what is `WORTH_A_WORD`, not for a number to rely
-# on. A look takes 60 to 90 ms on two busy cores, 0.3 to 0.4 s where its kernels have to be compiled.
+# Subpaths from either end, and the most that are compared of those that arrive. The noise of the estimate
+# suffices for `WORTH_A_WORD`, not for a figure to rely on; see experiments, "Vertex merging".
 SUBPATHS, COMPARED = 1 << 13, 1 << 11
 
-# Light subpaths that are looked at for hits of the sensor: a meter of 10 square centimetres, 3 m from a lamp,
-# gets two of them.
+# Light subpaths tested for hits of a sensor: about two hit 10 cm^2 at a distance of 3 m from a lamp.
 HITTING = 1 << 18
 
-# Edges after which a subpath of delta events ends: through twelve panes, or reflected as often within glass.
-# (In `lamp_behind_glass` 12 find 5 % less than 24, and 48 no more; elsewhere 8 find all.)
+# Most edges of a subpath of delta events (twelve panes).
 LONGEST = 24
 
-# Radius of the disk around a point that is seen in which light counts, in distances between such points:
-# disks overlap, so that no light falls between them, and are still small beside the image. (With 0.75 noise
-# is up to 1.6 times as large; with 3, as disks reach beyond what is lit, up to 6 % less is found.)
+# Radius of the disk around a seen point in which photons count, in distances between such points: disks
+# overlap, and remain small relative to the image.
 RADIUS = 1.5
 
-# Share of an image's light from which on its loss is worth a word. (A caustic beneath a glass ball, seen
-# through the ball, has a thousandth.)
+# Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
 
-# Lamps that a message names, at most.
+# Most lamps named in a message.
 NAMED = 3
 
 SEED = 0x6C6F7374
@@ -78,12 +71,11 @@ _PLUGINS = {
 
 @dataclass
 class _Ends:
-    """Where subpaths meet the first surface that has a lobe that is not delta.
+    """Ends of subpaths: the first surface with a lobe that is not delta.
 
-    ``p`` position, ``n`` geometric normal on the side they come from, ``through``: light is scattered through
-    the surface, ``weight`` and ``reflectance`` of the surface as `_carried`, ``edges``, ``distance``
-    travelled (of what is seen: the radius of its disk, see `_seen`), ``through_shape``: index of the first
-    shape with a delta event, ``active``: there is such an end.
+    ``p``: position; ``n``: geometric normal on the incident side; ``through``: the surface transmits;
+    ``weight`` and ``reflectance`` as `_carried`; ``distance`` travelled (from the sensor: radius of the disk,
+    see `_seen`); ``through_shape``: index of the first shape with a delta event.
     """
 
     p: mi.Point3f
@@ -97,11 +89,9 @@ class _Ends:
     active: mi.Bool
 
     def some(self):
-        """Of the active ones `COMPARED` at most, evenly chosen.
+        """Return at most `COMPARED` active ends, their indices, and ends per returned end.
 
-        Also their indices, and how many each stands for.
-
-        None in the first place where there are none.
+        The ends are None if there is none.
         """
         dr.eval(self)
         index = dr.compress(self.active)
@@ -118,10 +108,9 @@ class _Ends:
 
 @dataclass
 class _Walk:
-    """A subpath on its way.
+    """State of a subpath.
 
-    Its ray, what it carries, its edges, the distance that it has come, the index of the first shape with a
-    delta event; whether it goes on.
+    Fields as in `_Ends`; ``distance``: travelled.
     """
 
     ray: mi.Ray3f
@@ -134,10 +123,9 @@ class _Walk:
 
 @dataclass(frozen=True)
 class LostLight:
-    """What no strategy samples: the mean over the film, by the index of the emitter.
+    """Unsampled light: mean over the film by emitter index.
 
-    ``colours`` as they are summed; ``through``: ids of the shapes through which most of it is seen, the
-    brightest first.
+    ``through``: ids of the shapes through which most of it is seen, the brightest first.
     """
 
     colours: dict[int, np.ndarray]
@@ -145,7 +133,7 @@ class LostLight:
 
     @property
     def radiance(self) -> dict[int, float]:
-        """The brightest colour of the sum over all lamps, divided in proportion to each lamp's brightest."""
+        """Brightest colour of the sum, divided in proportion to each lamp's brightest."""
         single = {i: float(colour.max()) for i, colour in self.colours.items()}
         brightest = float(sum(self.colours.values()).max()) if single else 0.0
         scale = brightest / max(sum(single.values()), np.finfo(float).tiny)
@@ -153,28 +141,27 @@ class LostLight:
 
     @property
     def intensity(self) -> float:
-        """The mean over the colours, in which pilots measure images."""
+        """Mean over the colours, the measure of images in pilots."""
         return float(sum(colour.mean() for colour in self.colours.values()))
 
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
-    """Whether the scene's emitters, surfaces and sensor leave room for such paths."""
-    if plan.arrival or not prepared.emitters.traced:  # what starts no light subpath has none to look with
+    """Whether emitters, surfaces and sensor of the scene allow such paths."""
+    if plan.arrival or not prepared.emitters.traced:  # the estimate traces light subpaths
         return False
-    if plan.merging:  # which finds the paths that are looked at
+    if plan.merging:  # which samples these paths
         return False
-    if prepared.space is not None:  # what it looks with knows surfaces only
+    if prepared.space is not None:  # the estimate does not support media
         return False
     lost = unreachable_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
 
 
 def estimate(prepared: PreparedScene, plan: Plan, max_depth: int) -> LostLight:
-    """Estimate the light that is lost.
+    """Estimate the unsampled light.
 
-    ``max_depth`` see `Settings`. An emitter whose estimate is NaN or infinite has none, and a warning says
-    so, as of one that emits into directions that are: a render that does not make such paths may meet no such
-    number itself, and `diagnostics` is asked only if it did.
+    ``max_depth``: see `Settings`. Skips emitters whose estimate or emitted direction is non-finite and warns;
+    the render itself may not meet that value.
     """
     total = np.zeros((len(prepared.scene.emitters()), len(mi.UnpolarizedSpectrum())))
     through: tuple[str, ...] = ()
@@ -201,17 +188,17 @@ def estimate(prepared: PreparedScene, plan: Plan, max_depth: int) -> LostLight:
 
 
 def _ids(shapes: mi.UInt32, found: mi.UnpolarizedSpectrum) -> tuple[str, ...]:
-    """Ids of the ``shapes`` through which `NAMED` at most of what was ``found`` is seen, the most first."""
+    """Ids of at most `NAMED` ``shapes`` through which most of ``found`` is seen."""
     values = np.sum([np.array(colour) for colour in found], axis=0)
     amounts = np.bincount(shapes.numpy(), np.where(np.isfinite(values), values, 0))
     order = [i for i in np.argsort(-amounts) if i and amounts[i] >= WORTH_A_WORD * amounts.sum()]
     names = [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0].id() for i in order[:NAMED]]
-    # A shape without id, or one that was merged of several, has none, or one that Mitsuba made up.
+    # Shapes without an id, and merged shapes, have none or one made up by Mitsuba.
     return tuple(name for name in names if name and not name.startswith("_unnamed_"))
 
 
 def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
-    """Say of which emitters, by their ``indices``, the light that is lost cannot be told."""
+    """Warn of emitters whose unsampled light cannot be estimated."""
     emitters = prepared.scene.emitters()
     lamps = " and ".join(called(emitters[i]) for i in indices[:NAMED])
     text = (
@@ -222,15 +209,18 @@ def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
 
 
 def shares(lost: LostLight, mean: float) -> dict[int, float]:
-    """Shares of the light of an image with this ``mean`` of its brightest colour, by the emitter's index."""
+    """Shares of the image's light by emitter index.
+
+    ``mean`` of the image's brightest colour.
+    """
     whole = mean + sum(lost.radiance.values())
     return {i: radiance / whole for i, radiance in lost.radiance.items()}
 
 
 def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
-    """`shares` before the first pass, by the ``mean`` intensity that a pilot has measured.
+    """`shares` before the first pass, from the ``mean`` intensity of a pilot.
 
-    Empty if their sum is below twice `WORTH_A_WORD`, since the estimate of a pilot may be twice too large.
+    Empty if their sum is below twice `WORTH_A_WORD`: a pilot's estimate may be twice too large.
     """
     share = lost.intensity / (mean + lost.intensity)
     if not share >= 2 * WORTH_A_WORD:
@@ -240,9 +230,9 @@ def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
 
 
 def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], through: Iterable[str]) -> str:
-    """What is missing, and what to do, if it is `WORTH_A_WORD`; else empty.
+    """Warning about missing light with its remedy; empty below `WORTH_A_WORD`.
 
-    ``shares`` of the image's light by the index of the emitter; ``through`` see `LostLight`.
+    ``shares`` of the image's light by emitter index; ``through``: see `LostLight`.
     """
     lost = sum(shares.values())
     if not lost >= WORTH_A_WORD:
@@ -265,7 +255,7 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], thro
 
 
 def called(emitter: mi.Emitter) -> str:
-    """An emitter by its kind and the nearest id."""
+    """Name an emitter by its kind and nearest id."""
     kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
     if emitter.id():
         return f"{kind} '{emitter.id()}'"
@@ -280,7 +270,7 @@ def _remedy(emitters: Iterable[mi.Emitter]) -> str:
 
 
 def shared_sample(prepared: PreparedScene, generator: PCG32) -> Shared:
-    """Time and wavelengths of subpaths."""
+    """Sample time and wavelengths of subpaths."""
     sensor = prepared.camera.sensor
     time = sensor.shutter_open() + generator.next_float32() * sensor.shutter_open_time()
     if not mi.is_spectral:
@@ -295,19 +285,18 @@ def _two(generator: PCG32) -> mi.Point2f:
 
 
 def _carried(value: mi.Spectrum):
-    """What a subpath carries: its colour.
+    """Colour carried by a subpath.
 
-    In spectral variants the mean over the wavelengths in each of them, since those of the other end are
-    others.
+    In spectral variants the mean over its wavelengths, since the other end has different ones.
     """
     colour = mi.unpolarized_spectrum(value)
     return dr.mean(colour) + dr.zeros(mi.UnpolarizedSpectrum) if mi.is_spectral else colour
 
 
 def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi.UInt32, mi.Bool]:
-    """Where light of delta emitters arrives by delta events and next-event estimation does not find it.
+    """Where light of delta emitters arrives that next-event estimation does not find.
 
-    Also the emitters' indices, and the mask of subpaths whose ray is not finite, which hit nothing.
+    Also the emitters' indices, and the mask of subpaths with a non-finite ray, which hit nothing.
     """
     ray, weight, active, beam, index, generator = _emitted(prepared, SUBPATHS)
     astray = active & ~(dr.all(dr.isfinite(ray.o)) & dr.all(dr.isfinite(ray.d)))
@@ -318,26 +307,25 @@ def _lit(prepared: PreparedScene, plan: Plan, max_depth: int) -> tuple[_Ends, mi
 
 
 def _emitted(prepared: PreparedScene, count: int):
-    """The first rays of ``count`` light subpaths.
+    """Sample the first rays of ``count`` light subpaths.
 
-    With what they carry; masks of those from delta emitters, and of beams; the emitters' indices; random
-    numbers for the rest of the subpaths.
+    Returns rays, weights, masks of delta emitters and of beams, emitter indices, and the generator.
     """
     generator = mi.PCG32(count, SEED, 1)
     shared = shared_sample(prepared, generator)
     e = prepared.emitters.sample_emission(_two(generator), _two(generator), shared, mi.Bool(True))
-    active = e.delta & ~spectra.is_zero(e.weight)  # what is not finite is kept, to be said
+    active = e.delta & ~spectra.is_zero(e.weight)  # non-finite values are kept for the warning
     ray, beam = rays.spawn(e.anchor, e.d, shared), mi.Bool(e.beam)
     weight, index = mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(e.weight)), e.index
-    ray.maxt = dr.full(mi.Float, dr.inf, count)  # as wide as those of the sensor, for the same kernel
+    ray.maxt = dr.full(mi.Float, dr.inf, count)  # as wide as the sensor's, for the same kernel
     dr.make_opaque(ray, weight, active, beam, index, generator)
     return ray, weight, active, beam, index, generator
 
 
 def arriving(prepared: PreparedScene, sensor: Sensor, max_depth: int) -> list[int]:
-    """Indices of the delta emitters of which light subpaths hit the ``sensor`` by delta events alone.
+    """Indices of the delta emitters with light on ``sensor`` by delta events only.
 
-    Direct light counts of beams only.
+    Includes direct light only of beams.
     """
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         ray, weight, active, beam, index, generator = _emitted(prepared, HITTING)
@@ -347,9 +335,9 @@ def arriving(prepared: PreparedScene, sensor: Sensor, max_depth: int) -> list[in
 
 
 def _seen(prepared: PreparedScene, plan: Plan, max_depth: int) -> _Ends:
-    """What is seen by delta events in a way that t = 1 does not find.
+    """Points seen through delta events that t = 1 does not sample.
 
-    Weights are those of the irradiance there, distances the radii of the disks that stand for these points.
+    Weights multiply irradiance; distances are the radii of the points' disks.
     """
     generator = mi.PCG32(SUBPATHS, SEED, 2)
     shared, camera = shared_sample(prepared, generator), prepared.camera
@@ -382,9 +370,10 @@ def _follow(
     adjoint: bool,
     sensor: Sensor | None = None,
 ) -> _Ends:
-    """Follow rays by delta events to the first surface that has another lobe, by intensity alone.
+    """Follow rays by delta events to the first surface with another lobe.
 
-    Where one has both, a coin decides. One kernel for both sides. With a ``sensor``: to where they hit it.
+    Traces intensity only. Chooses with probability 1/2 where a surface has both. One kernel for both sides.
+    With a ``sensor``: follows rays to where they hit it.
     """
     context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
     last, is_adjoint = dr.opaque(mi.UInt32, min(max_depth, LONGEST)), dr.opaque(mi.Bool, adjoint)
@@ -413,7 +402,7 @@ def _follow(
         bs, factor = surface.sample(context, si, generator.next_float32(), _two(generator), active)
         active &= mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         factor = mi.unpolarized_spectrum(factor)
-        factor *= dr.select(is_adjoint, dr.square(bs.eta), 1)  # refraction scales radiance alone
+        factor *= dr.select(is_adjoint, dr.square(bs.eta), 1)  # refraction scales radiance only
         weight = dr.select(active, weight * factor, weight)
         active &= ~spectra.is_zero(weight)
         anchor = rays.surface_anchor(si, ray, prepared.emitters.shape_errors)
@@ -430,7 +419,7 @@ def _follow(
 
 
 def _hits(sensor: Sensor, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-    """Mask: the last edge of a subpath, from a delta event or a beam to ``si``, hits the ``sensor``."""
+    """Mask: the last edge, after a delta event or from a beam, hits ``sensor``."""
     cos = dr.abs(dr.dot(si.n, ray.d))
     walk = SimpleNamespace(previous=ray.o, d=ray.d, pi=si, active=active)
     vertex = SimpleNamespace(si=si, hit=active & si.is_valid(), cos=cos)
@@ -445,16 +434,16 @@ def _nowhere() -> _Ends:
 
 
 def _reflectance(si: mi.SurfaceInteraction3f, surface: mi.BSDFPtr, generator: PCG32, active: mi.Bool):
-    """What a surface reflects of all that arrives from where ``si`` is seen.
+    """Albedo of a surface for the direction from which ``si`` is seen.
 
-    Known for diffuse ones; of others one sample, whose mean it is.
+    Evaluated for diffuse BSDFs; of others a one-sample estimate.
     """
     even = mi.unpolarized_spectrum(surface.eval_diffuse_reflectance(si, active))
     flags = mi.BSDFFlags.Smooth
     context = mi.BSDFContext(mi.TransportMode.Radiance, +flags)
     _, glossy = surface.sample(context, si, generator.next_float32(), _two(generator), active)
     diffuse = _has(surface, mi.BSDFFlags.Diffuse)
-    # Mitsuba's answer of BSDFs that do not know their own is a value in one direction, which has no bound.
+    # Mitsuba's default of `eval_diffuse_reflectance` is a BSDF value in one direction, which is unbounded.
     return _carried(dr.select(diffuse, dr.minimum(even, 1), mi.unpolarized_spectrum(glossy)))
 
 
@@ -464,8 +453,8 @@ def _end(
     """The end of a subpath at ``si``."""
     kinds = (mi.BSDFFlags.DiffuseTransmission, mi.BSDFFlags.GlossyTransmission)
     front, back = (_has(surface, side) for side in (mi.BSDFFlags.FrontSide, mi.BSDFFlags.BackSide))
-    seen = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, front, back)  # the other side of most BSDFs is black
-    # `mask` answers for what is inside of it.
+    seen = dr.select(mi.Frame3f.cos_theta(si.wi) > 0, front, back)  # most BSDFs are black on the other side
+    # `mask` returns the reflectance of its nested BSDF.
     opacity = 1 - mi.unpolarized_spectrum(surface.eval_null_transmission(si, walk.active))
     return _Ends(
         p=mi.Point3f(si.p),
@@ -485,7 +474,7 @@ def _has(surface: mi.BSDFPtr, kind: mi.BSDFFlags):
 
 
 def _meetings(photons: _Ends, points: _Ends, max_depth: int):
-    """What each of the ``photons`` adds to the ``points`` around it, and a shape through which it is seen."""
+    """Contribution of each photon to the points around it, and a shape in between."""
     count = dr.opaque(mi.UInt32, dr.width(points.p))
     longest = dr.opaque(mi.UInt32, max_depth)
 
@@ -503,5 +492,5 @@ def _meetings(photons: _Ends, points: _Ends, max_depth: int):
     width = dr.width(photons.p)
     state = mi.UInt32(0), dr.zeros(mi.UnpolarizedSpectrum, width), dr.zeros(mi.UInt32, width)
     _, total, shape = dr.while_loop(state, lambda i, *_: i < count, body, label="meetings")
-    # One that meets nothing adds nothing, even if its weight is not finite.
+    # A photon without neighbours contributes 0 even if its weight is non-finite.
     return dr.select(spectra.is_zero(total), 0, total * photons.weight), shape

@@ -1,8 +1,8 @@
-"""Light of delta emitters that falls on a sensor with area and that no strategy in use samples.
+"""Warns of unsampled light of delta emitters that falls on a sensor with area.
 
 It arrives directly or by delta events (mirrors, glass). Camera subpaths do not hit such an emitter and
-next-event estimation starts at a surface: only (1,1), of direct light, and t = 0 sample it. Where a render
-does without them, the emitters whose light arrives are found with shadow rays, or with light subpaths.
+next-event estimation starts at a surface: only (1,1), of direct light, and t = 0 sample it. Without them,
+shadow rays or light subpaths find the emitters whose light arrives.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from .findings import Findings
 from .lost_light import NAMED, called, shared_sample
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
-# Points of the sensor to which each emitter is connected.
+# Points on the sensor to which each emitter is connected.
 POINTS = 1 << 10
 
 
 def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
-    """The warnings about such light, directly and by delta events; none if no such light is missing."""
+    """Warnings about such light, direct and by delta events; empty if none is missing."""
     lost = [paths for paths in unreachable_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
     return [_warning(prepared, plan, settings, findings, paths) for paths in lost]
 
 
 def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str:
-    """The warning about the light of lost ``paths`` that end at the sensor; empty if none arrives."""
+    """Warning about light of ``paths`` that end at the sensor; empty if none arrives."""
     direct = Start.DIRECT_DELTA_EMITTER in paths.starts
     look = partial(_arriving, prepared, direct, settings.max_depth)
     found, _ = findings.find("missed direct light", (direct, settings.max_depth), look)
@@ -52,7 +52,7 @@ def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str
 
 
 def _cause(prepared: PreparedScene, plan: Plan, settings: Settings, strategy: str) -> tuple[str, str]:
-    """Why a ``strategy`` is not in use, and what to do."""
+    """Why ``strategy`` is not in use, and the remedy."""
     is_batch = prepared.camera.sensor.class_name() == "BatchSensor"
     if not prepared.camera.connectible:
         remedy = "render the views one by one" if is_batch else "use an area light"
@@ -67,13 +67,13 @@ def _cause(prepared: PreparedScene, plan: Plan, settings: Settings, strategy: st
 
 
 def _arriving(prepared: PreparedScene, direct: bool, max_depth: int) -> tuple[int, ...]:
-    """Indices of the first delta emitters whose light arrives at the sensor, `NAMED` + 1 at most.
+    """Indices of at most `NAMED` + 1 delta emitters whose light arrives at the sensor.
 
-    Directly, or else by delta events.
+    Directly if ``direct``, else by delta events.
     """
     views = _with_area(prepared)
     if not direct:
-        # `lost_light` knows surfaces only, and emitters that light subpaths start from.
+        # `lost_light` supports neither media nor emitters without light subpaths.
         if prepared.space is not None or not prepared.emitters.traced:
             return ()
         found = {i for view in views for i in lost_light.arriving(prepared, view, max_depth)}
@@ -88,7 +88,7 @@ def _arriving(prepared: PreparedScene, direct: bool, max_depth: int) -> tuple[in
 
 
 def _with_area(prepared: PreparedScene) -> list[Sensor]:
-    """The sensor, or the views of a batch, as far as they have area and can be connected."""
+    """The sensor, or the views of a batch, that have area and can be connected."""
     camera = prepared.camera
     views = checks.views(camera.sensor)
     found = [kinds.prepare(view, prepared.emitters.shape_errors, prepared.scene) for view in views]
@@ -114,7 +114,7 @@ def _arrives(prepared: PreparedScene, sensor: Sensor, emitter: mi.Emitter) -> bo
 
 
 def _occluded(prepared: PreparedScene, join: CameraJoin, ds: mi.DirectionSample3f, infinite: bool, shared):
-    """Mask: a surface is in between; none counts in scenes with media, whose boundaries are surfaces."""
+    """Mask: a surface blocks the edge; with media False, as boundaries are surfaces."""
     if prepared.space is not None:
         return mi.Bool(False)
     if infinite:

@@ -2,10 +2,10 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""Statistics of a pilot: variances of every way to render, and what points take off them.
+"""Statistics of a pilot: variances of all weightings, and stratification gains.
 
-Arithmetic on NumPy arrays that a `pilot.Pilot` has filled; it knows no scene. The equations are those of
-`pilot`. `SAMPLE` and `SPLAT` are the rows that a pilot keeps.
+NumPy arithmetic on the arrays of a `pilot.Pilot`, whose module has the equations. `SAMPLE` and `SPLAT` are
+the rows that a pilot stores.
 """
 
 from __future__ import annotations
@@ -31,38 +31,38 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Layout:
-    """The parts of a row, by name: how many numbers each has, in their order."""
+    """Named parts of a row: their sizes, in order."""
 
     parts: dict[str, int]
 
     @property
     def width(self) -> int:
-        """Numbers of a row: an even one, so that Dr.Jit adds it as a packet."""
+        """Numbers per row, even: Dr.Jit then adds it as a packet."""
         used = sum(self.parts.values())
         return used + used % 2
 
     def place(self, name: str) -> slice:
-        """Where the numbers of a part are."""
+        """Slice of a part."""
         names = list(self.parts)
         first = sum(self.parts[other] for other in names[: names.index(name)])
         return slice(first, first + self.parts[name])
 
     def of(self, rows: np.ndarray, name: str) -> np.ndarray:
-        """A part of all rows; their numbers lie along the last axis."""
+        """A part of all rows, along the last axis."""
         return rows[..., self.place(name)]
 
     def row(self, values: Mapping[str, list[Any]]) -> list[Any]:
-        """The numbers of one row, from lists by the names of its parts."""
+        """One row from lists by the names of its parts."""
         return [x for name in self.parts for x in values[name]]
 
 
-# How many weightings use a class of strategies: the last ones.
+# Number of weightings that use a class of strategies: the last ones.
 _USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
 
-# Of a camera sample, for each weighting: its estimate, and the second moments of its contributions without
-# t <= 1, less their squares; for each weighting with t <= 1 their second moments by it; for each weighting
-# with inner connections what drawing one adds. Then the number of its vertices that were joined; its tile; in
-# scenes with media the number of pairs that were evaluated, else 0.
+# Per camera sample, for each weighting: estimate, and second moments of contributions without t<=1, less
+# their squares; for each weighting with t<=1 the second moments due to t<=1; for each weighting with inner
+# connections the variance of drawing one. Then the number of connected vertices; the tile; in scenes with
+# media the number of evaluated pairs, else 0.
 SAMPLE = Layout(
     {
         "estimate": len(WEIGHTINGS),
@@ -75,11 +75,11 @@ SAMPLE = Layout(
     }
 )
 
-# Parts of `SAMPLE` that are sums over the contributions.
+# Parts of `SAMPLE` that are sums over contributions.
 SUMS = ("estimate", "moment", "light", "draw")
 
-# The size of splats, their second moments without t <= 1, those of them that are rare (see `pilot.SELDOM`),
-# and their second moments by t <= 1.
+# Size of splats, their second moments without t <= 1, the rare part of these (see `pilot.SELDOM`), and their
+# second moments due to t <= 1.
 SPLAT = Layout(
     {
         "size": 1,
@@ -89,52 +89,52 @@ SPLAT = Layout(
     }
 )
 
-# Tiles of the image in each direction: of those whose brightness is known by itself, and of the larger ones
-# that stand in for them as far as it is noise. (A caustic and its shadow are smaller than the larger ones: in
-# small_casters/point_sphere splats would seem an eighth as noisy as they are.)
+# Tiles of the image per direction: fine ones with their own brightness, and larger ones that replace it where
+# it is noisy. (A caustic and its shadow are smaller than the larger tiles.)
 FINE, TILES = 32, 8
 
-# The same for what is heard of emissions.
+# The same for emission statistics.
 HEARD_TILES = 4
 
-# Independent parts of the pilot, among which outliers are looked for.
+# Independent parts of the pilot, for resampling.
 GROUPS = 16
 
-# The least that nets leave, of what can be told from so few.
+# Least stratification gain that this number of nets can resolve.
 LEAST_GAIN = 1e-3
 
-# Camera samples of a pixel whose products give its squared mean (more of them where there are few pixels).
+# Least number of camera samples per pixel; their products estimate the squared mean.
 PER_PIXEL = 2
 
 
-# A weighting whose relative variance comes out beyond this is ruled out, see `pilot.LOST`.
+# Weightings of a larger relative variance are ruled out, see `pilot.LOST`.
 RULED_OUT = 1e15
 
-# What nets leave is known from some 128 pairs of them: of the logarithm of a weighting's gain so much is its
-# own, the rest that of all weightings. (All of it: one pilot of 32 chooses twice the best in `cornell_box`.)
+# Weight of a weighting's own log stratification gain, from some 128 pairs of nets, against the mean of all.
 OWN_GAIN = 0.3
 
 
-# Fields of `Moments` that have a row for each group, and all of its arrays.
+# Fields of `Moments` with a row per group.
 _OF_GROUPS = ("base", "rare", "light", "draw", "isolated")
 _ARRAYS = (*_OF_GROUPS, "gain", "emission")
 
 
 @dataclass(frozen=True)
 class Moments:
-    """What a pilot found, in units of the image's relative squared error per sample and pixel.
+    """What a pilot measured: relative squared error per sample and pixel.
 
-    ``base``, ``rare``, ``light`` and ``draw`` have the shape (`GROUPS`, weightings): with independent numbers
-    variance is ``base`` + S ``light``, plus ``draw`` where one inner connection is drawn; ``rare`` is that
-    part of ``base`` which paths have that are made too rarely for points to help. ``gain``, of each
-    weighting, is what the points of a net leave of the rest of ``base``. ``isolated``, shape (`GROUPS`,
-    numbers): the variance of paths on which s = 0 can be guided, which are in no other, if it is not, and
-    with each of `plan.GUIDED` numbers of samples (no numbers: not measured). ``emission``: what was heard of
-    emissions, see `_of_tiles` (nothing: no cells). ``mean`` of the image (mean of the
-    colours, emitters seen directly left out; the median of the groups', so that no outlier sets it);
-    ``rays`` and connections per camera sample and kind, with one light subpath each, the number of ``kinds``
-    of BSDFs, and ``far``, the share of light subpaths that start at infinity; ``lanes``: number of camera
-    samples.
+    With independent numbers the variance is ``base`` + S ``light``, plus ``draw`` where one inner connection
+    is drawn.
+
+    * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, weightings). ``rare``: the part of ``base`` on
+      paths too rare for stratification.
+    * ``gain`` by weighting: the factor that the points of a net leave of ``base`` - ``rare``.
+    * ``isolated``, shape (`GROUPS`, numbers): variance of the paths on which s = 0 can be guided, excluded
+      from all others: unguided, then with each of `plan.GUIDED` (no columns: not measured).
+    * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
+    * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
+    * ``rays``: rays and connections per camera sample by kind, with one light subpath each, the number of
+      ``kinds`` of BSDFs, and ``far``, the share of light subpaths that start at infinity.
+    * ``lanes``: number of camera samples.
     """
 
     base: np.ndarray
@@ -151,25 +151,20 @@ class Moments:
     def variance(self, draw: np.ndarray | float, stratified: bool = False) -> np.ndarray:
         """Relative variance per sample, shape (`GROUPS`, 2, weightings).
 
-        First what does not depend on S, ``draw`` (`Moments.draw`, or 0 for all connections) included, then
-        what grows with it, that of splats; with independent numbers, or with what ``stratified`` points leave
-        of it.
+        First the part independent of S, including ``draw`` (`Moments.draw`, or 0 for all connections), then
+        the part proportional to S, that of splats. ``stratified``: includes the stratification gain.
         """
         base = self.base
         if stratified:
-            # Not of splats, which land in pixels by chance: 0.2 to 1.3 is left of these in 22 scenes. (Mean
-            # of 32 pilots' time times error over the best with 1 in place of 0.75, the median: `uplight_room`
-            # 1.05 to 1.02, `veach_bidir` 1.07 to 1.02, `thin_lens` 1.24 to 1.17, small_casters/spot_sphere
-            # 1.30 to 1.23, small_casters/sun_sphere 1.06 to 1.19.)
+            # Not of splats, which land in pixels by chance; see experiments, "Choice of strategies".
             base = self.rare + self._left_by_points() * (base - self.rare)
         return np.stack([base + draw, self.light], axis=1)
 
     def _left_by_points(self) -> np.ndarray:
-        """What the points of a pixel leave of the variance, by weighting.
+        """Stratification gain of the points of a pixel, by weighting.
 
-        Of what nets of `NET` leave, see `OWN_GAIN`, what 64 leave. (Fitted to pilots with nets of 64 points
-        in 32 scenes: where 8 leave 0.65 these leave 0.65 of it again, at 0.3 half, at 0.05 a third, at 0.01 a
-        fifth, within a factor of 1.6 in all but four.)
+        Extrapolates the factor of nets of `NET` (see `OWN_GAIN`) to 64 points. Fitted; see experiments,
+        "Choice of strategies".
         """
         possible = np.isfinite(self.base).all(axis=0)
         common = self.gain[possible].mean() if possible.any() else 1.0
@@ -177,11 +172,11 @@ class Moments:
         return gain ** (1.35 + gain)
 
     def of(self, groups: np.ndarray) -> Moments:
-        """The moments of these of its groups, by number."""
+        """The moments of the groups with these indices."""
         return replace(self, **{n: getattr(self, n)[groups] for n in _OF_GROUPS})
 
     def joined(self, other: Moments) -> Moments:
-        """This pilot and another, of which each counts by its number of ``lanes``."""
+        """This pilot and another combined, weighted by ``lanes``."""
         share = self.lanes / (self.lanes + other.lanes)
 
         def mean(a: Any, b: Any) -> Any:
@@ -199,9 +194,9 @@ class Moments:
 class Samples:
     """Camera samples of a pilot, one row each.
 
-    The ``estimate`` of each weighting, sums of second moments (``moment`` without t <= 1, less the squares
-    that are in the estimate, ``light`` by t <= 1), what drawing one connection adds (``draw``), the fine
-    ``tile``. Of neighbours each `PER_PIXEL` are of the same pixel; in nets each `NETS` times `NET`.
+    ``estimate`` by weighting; sums of second moments (``moment`` without t <= 1, less the squares that are in
+    the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; fine ``tile``. Each
+    `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
     """
 
     estimate: np.ndarray
@@ -212,16 +207,16 @@ class Samples:
 
     @staticmethod
     def of_rows(rows: np.ndarray) -> Samples:
-        """Those of a pilot's rows of `rows.SAMPLE`."""
+        """Parse rows of `SAMPLE`."""
         found = {f.name: SAMPLE.of(rows, f.name) for f in fields(Samples)}
         return Samples(**found | {"tile": found["tile"][:, 0].astype(int)})
 
 
 @dataclass(frozen=True)
 class Splats:
-    """Sums of the splats of so many ``lanes`` light subpaths.
+    """Sums of the splats of ``lanes`` light subpaths.
 
-    By the group of the subpath and fine tile: shape (`GROUPS`, fine tiles, `rows.SPLAT`).
+    Shape (`GROUPS`, fine tiles, `SPLAT`), by the group of the subpath and fine tile.
     """
 
     sums: np.ndarray
@@ -229,26 +224,26 @@ class Splats:
 
 
 def tile_of(region: Region, position: mi.Point2f, tiles: int = FINE) -> mi.UInt32:
-    """The number of the tile at a ``position`` on the film, of so many in each direction."""
+    """Index of the tile at a film ``position``, with ``tiles`` per direction."""
     uv = dr.clip(region.to_uv(position), 0, 1)
     xy = dr.minimum(mi.Point2u(uv * tiles), tiles - 1)
     return mi.UInt32(xy.y * tiles + xy.x)
 
 
 def group(lane: Lanes) -> Lanes:
-    """The independent part to which a sample, or the light subpath of a lane, belongs.
+    """Index of the independent part of a sample, or of a lane's light subpath.
 
-    The `PER_PIXEL` samples of a pixel, whose products are taken, are in the same.
+    The `PER_PIXEL` samples of a pixel, whose products are taken, belong to one group.
     """
     return lane // PER_PIXEL % GROUPS
 
 
 @dataclass(frozen=True)
 class Isolated:
-    """Light that s = 0 finds where it can be guided.
+    """Light that s = 0 finds where it can be guided (SDS paths).
 
-    ``sums`` of its moments (`guiding_benefit.Found`) over ``lanes`` camera samples, shape (`GROUPS`, fine
-    tiles, moments); ``aimed``: vertices of one where s = 0 can be guided.
+    ``sums`` of moments (`guiding_benefit.Found`) over ``lanes`` camera samples, shape (`GROUPS`, fine tiles,
+    moments); ``aimed``: guidable vertices per camera sample.
     """
 
     sums: np.ndarray
@@ -264,10 +259,10 @@ def moments(
     isolated: Isolated | None = None,
     heard: np.ndarray | None = None,
 ) -> Moments:
-    """The moments of a pilot of independent ``samples``, and ``nets``.
+    """The moments of a pilot of independent ``samples`` and ``nets``.
 
-    ``splats`` count as if there were one light subpath per camera sample; ``rays`` are per camera sample;
-    ``isolated`` light is in no sample. ``heard``: see `emission.Listener`.
+    ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
+    ``isolated`` light is in no sample; ``heard``: see `emission.Listener`.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
@@ -281,7 +276,7 @@ def moments(
     of_sample = inverse[groups % 2, samples.tile][:, None]
 
     def summed(values: np.ndarray | None, of_splats: str | None = None) -> np.ndarray:
-        """By group, one column per weighting: those that have no use for ``values`` come first."""
+        """Sums by group and weighting; weightings without ``values`` come first."""
         total = SPLAT.of(weighted, of_splats) if of_splats else weighted[:, :0]
         if values is not None:
             of_samples = _by_group(values * of_sample) * (GROUPS / count)
@@ -309,10 +304,10 @@ def moments(
 
 
 def _of_tiles(heard: np.ndarray | None, samples: Samples, splats: np.ndarray) -> np.ndarray:
-    """What was heard of emissions relative to the brightness of its place, `HEARD_TILES` in each direction.
+    """Emission statistics relative to the brightness of `HEARD_TILES`^2 tiles.
 
-    Shape (2, cells, classes), per sample; no cells if nothing was listened to. ``splats``: shares of the fine
-    tiles of an image's brightness.
+    Shape (2, cells, columns), per sample; no cells if ``heard`` is None. ``splats``: shares of the fine tiles
+    in the image's brightness.
     """
     if heard is None:
         return np.zeros((2, 0, 0))
@@ -326,12 +321,12 @@ def _of_tiles(heard: np.ndarray | None, samples: Samples, splats: np.ndarray) ->
     brightness += over_tiles(splats) * HEARD_TILES**2
     norms = brightness**2 + 0.01 * brightness.mean() ** 2
     found = np.einsum("htck,t->hck", heard, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
-    # What is no number would be one in no pilot that is joined with this one.
+    # A non-finite value would spoil all pilots that are combined with this one.
     return found if np.isfinite(found).all() else np.zeros_like(found)
 
 
 def _other(estimate: np.ndarray) -> np.ndarray:
-    """For each sample another one of its pixel."""
+    """For each sample another sample of its pixel."""
     return estimate.reshape(-1, PER_PIXEL, estimate.shape[1])[:, ::-1].reshape(estimate.shape)
 
 
@@ -344,23 +339,21 @@ def _by_group(values: np.ndarray) -> np.ndarray:
 
 
 def _norms(samples: Samples, half: np.ndarray, splats: np.ndarray) -> np.ndarray:
-    """What squared errors are divided by, of each fine tile.
+    """Denominators of the squared errors by fine tile, shape (2, tiles).
 
-    The squared brightness, and a hundredth of that of the image, as relMSE has it.
-
-    Shape (2, tiles): for each half of the samples, told by ``half`` (0 or 1 each), fine tiles have the
-    brightness that the other half has found: an outlier would hide itself. ``splats`` of the halves, shape
-    (2, tiles): their shares of a whole image's.
+    Squared brightness plus 0.01 of the image's squared mean brightness, as in relMSE. For each half of the
+    samples, given by ``half`` (0 or 1), the brightness is that of the other half: an outlier would hide
+    itself. ``splats``: shares of the halves in the image, shape (2, tiles).
     """
     last = samples.estimate[:, -1]
     place = half * FINE**2 + samples.tile
     counts = np.bincount(place, minlength=2 * FINE**2).reshape(2, FINE, FINE).astype(float)
     sums = np.bincount(place, last, 2 * FINE**2).reshape(2, FINE, FINE)
-    splats = splats.reshape(2, FINE, FINE) * FINE**2  # radiance, of which each half has a part
+    splats = splats.reshape(2, FINE, FINE) * FINE**2  # radiance, half in each
     coarse = _over_blocks(sums.sum(axis=0)) / np.maximum(_over_blocks(counts.sum(axis=0)), 1)
     coarse += _over_blocks(splats.sum(axis=0)) / (FINE // TILES) ** 2
     floor = 0.01 * coarse.mean() ** 2
-    # A tile's own brightness is worth as many samples of the larger one as it has noise.
+    # Weight of the larger tile against a tile's own samples: their noise.
     square = last**2 + samples.moment[:, -1] - last * _other(samples.estimate)[:, -1]
     first = (coarse**2 + floor).ravel()[samples.tile]
     noise = np.sum(square / np.where(first > 0, first, np.inf)) / len(last)
@@ -377,13 +370,13 @@ def _norms(samples: Samples, half: np.ndarray, splats: np.ndarray) -> np.ndarray
 
 
 def _over_blocks(values: np.ndarray) -> np.ndarray:
-    """Sums over the larger tiles, in place of each fine one."""
+    """Sums over the larger tiles, at each fine tile."""
     many = FINE // TILES
     return np.kron(_sums_of_blocks(values, TILES), np.ones((many, many)))
 
 
 def _sums_of_blocks(values: np.ndarray, tiles: int) -> np.ndarray:
-    """Sums over larger tiles, so many in each direction, of ``values`` of the fine ones."""
+    """Sums of fine ``values`` over larger tiles, ``tiles`` per direction."""
     many = FINE // tiles
     return values.reshape(tiles, many, tiles, many).sum(axis=(1, 3))
 
@@ -396,11 +389,12 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def _gain(estimate: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Variance of a sample among points of a net over that of an independent one, by weighting; 1 at most.
+    """Variance of a sample in a net over that of an independent one, at most 1.
 
-    ``estimate`` of the samples in nets, ``inverse`` of the norm of their places. The square of the difference
-    of two nets' means is twice the variance of such a mean, without bias; so is the mean square of the
-    samples less the product of the two means the variance of a sample."""
+    By weighting. ``estimate`` of the samples in nets, ``inverse`` of their norms. Unbiased: the squared
+    difference of two nets' means is twice the variance of a mean; the mean square less the product of the two
+    means is the variance of a sample.
+    """
     width = estimate.shape[1]
     nets = estimate.reshape(-1, NETS, NET, width)
     first, second = nets.mean(axis=2).transpose(1, 0, 2)

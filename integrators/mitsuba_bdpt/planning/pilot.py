@@ -2,31 +2,30 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""A pilot: a few thousand bidirectional samples that tell the variance of every way to render.
+"""A pilot: a few thousand bidirectional samples that estimate all variances.
 
-Whether light subpaths and inner connections pay is decided per image (`choice.choose`), by cost times
-variance of each candidate: path tracing alone, with light tracing, with inner connections, each with
-several numbers S of camera subpaths per light subpath and several coefficients.
+`choice.choose` decides per image whether light subpaths and inner connections pay, by cost times variance of
+the candidates: path tracing alone, with light tracing, with inner connections, each with several numbers S of
+camera subpaths per light subpath and several coefficients.
 
-All variances come from the *same* samples, which use every strategy (S = 1, all inner connections, balance
-heuristic with kappa = 1), so that a candidate is not judged by the samples that it would have
-missed. For a contribution f / p of the pilot with weight w and shares s_i of the classes i in the sum of
-all densities, and a candidate with counts n_i and coefficients kappa_i (E. Veach 1997, section 9.2),
+All variances come from the *same* samples, which use all strategies (S = 1, all inner connections, balance
+heuristic with kappa = 1): a candidate is also judged by paths that it would have missed. For a contribution f
+/ p of the pilot with weight w and shares s_i of the classes i in the sum of all densities, and a candidate
+with counts n_i and coefficients kappa_i (E. Veach 1997, section 9.2),
 
 * the candidate's own estimate of the path is (w f / p) kappa_own / (n_own sum_i kappa_i s_i);
 * its second moment is the pilot's mean of (w f / p)^2 sum_i (kappa_i^2 s_i / n_i) / (sum_i kappa_i s_i)^2.
 
-To the second moments come the products of different contributions within a camera sample, and off goes the
-squared mean of the pixel, estimated without bias from two independent samples of it. The samples use
-neither roulette on connections nor the draw of one connection; what the draw adds to the variance is known
-from the unshadowed contributions.
+The variance is the sum of the second moments and of the products of different contributions within a camera
+sample, less the squared mean of the pixel, estimated without bias from two independent samples. The samples
+use neither roulette of connections nor a drawn connection; the variance of the draw follows from unshadowed
+contributions.
 
-Points that are better than independent ones take off most of the variance of camera samples in smooth regions
-(to a hundredth under a sky), hardly any where a path is rarely found, and little of that of splats, which
-land in pixels by chance. How much is measured: half of the samples lie in pairs of nets of one pixel,
-which give the variance of a net's mean beside that of its samples (`moments.Moments.gain`).
+Stratified points reduce the variance of camera samples in smooth regions (up to a hundredfold under a sky),
+hardly that of rare paths, and little that of splats. Half of the samples lie in pairs of nets of one pixel,
+which measure this stratification gain (`moments.Moments.gain`).
 
-All is relative to the brightness of the place: a splat in a shadow weighs as much as that pixel is dark.
+All variances are relative to the local brightness.
 """
 
 from __future__ import annotations
@@ -61,53 +60,48 @@ if TYPE_CHECKING:
     from ..transport.subpaths import CameraSample
     from ..transport.walk import Vertex
 
-    # One number for each of the last weightings; of a camera sample by the name of a part of its row.
+    # One number for each of the last weightings; a camera sample has one by name of a part of its row.
     Row = list[mi.Float64]
     Total = dict[str, Row | mi.UInt32]
 
-# A path counts as if a candidate made it at least once in so many times that the pilot makes it, or in as
-# many as a sample of the pilot stands for: what a render is not likely to meet is missing from its image, not
-# noise. (Reflections of the sun made path tracing alone in `window_room` look 1.1 to 16 times as slow as the
-# best; so it is 1.1 to 2.3. 64 would say 1.1, as renders show, but the same of rooms with a small caustic.)
+# A path counts as if a candidate sampled it at least once per RAREST samples of it by the pilot, or per as
+# many as a pilot's sample represents: what a render is unlikely to sample is missing light, not noise. See
+# experiments, "Choice of strategies".
 RAREST = 1024
 
-# In a render of up to so many samples it is at least once in `RAREST_IN_SHORT`. That trades the mean error of
-# many renders, to which those that meet rare light add most, for the trimmed one, which whoever renders a
-# preview sees. (In `thin_lens` path tracing alone has 1.6 times the efficiency by trimmed errors at 4 and 16
-# samples per pixel of 128^2, and 0.9 and 0.24 times by the mean of raw ones; at 64 light subpaths have 1.4
-# times by trimmed ones. In no other scene of the benchmark the choice changes.)
+# The same bound in a render of up to SHORT samples: favours the trimmed error, which is what a preview shows,
+# over the mean error of many renders. See experiments, "Choice of strategies", short renders.
 SHORT, RAREST_IN_SHORT = 1 << 18, 16
 
-# The square of what a weighting cannot make counts so many times in its moments, and one whose relative
-# variance comes out beyond `moments.RULED_OUT` is ruled out: it misses a millionth of a pixel or more. (Any
-# miss must not do so: between points of one plane rounding leaves cosines of 1e-20, contributions of 1e-40,
-# and densities that single precision takes for 0.)
+# Factor of the squared size of a path that a weighting cannot sample; `moments.RULED_OUT` then rules out
+# weightings that miss a millionth of a pixel or more. Smaller misses must pass: rounding leaves cosines of
+# 1e-20 between points of one plane, and densities that are 0 in single precision.
 LOST = 1e30
 
-# Of a pilot's camera samples one in so many is in a net.
+# One in NET_SHARE of a pilot's camera samples is in a net.
 NET_SHARE = 2
 
-# Light subpaths for each camera sample of a pilot, most of them without one: they are cheap, and few of them
-# meet a small thing that casts a caustic (of 4,096 from a lamp over a small glass cube, about six).
+# Light subpaths per camera sample, most of them without one: they are cheap, and few hit a small caster of a
+# caustic.
 LIGHT_TIMES = 4
 
-# Paths of light tracing that camera subpaths make less than once in so many times as the pilot are too rare
-# for points to help: fewer than one falls into a net.
+# Paths of light tracing that camera subpaths sample less than once in SELDOM times as often as the pilot do
+# not gain from stratification: fewer than one falls into a net.
 SELDOM = 16
 
 
-# Lanes that go through a loop together, as long as one of them does.
+# Lanes that run a loop together.
 PACKET = 16
 
-# Of `Counters`, what light subpaths count alone.
+# `Counters` of light subpaths only.
 _OF_LIGHT = ("light", "shadow_t1")
 
 
 class Pilot:
-    """Sink (see `sink`) of a pilot's contributions, in a scene with or without ``media``.
+    """Sink (see `image.sink`) of a pilot's contributions, with or without ``media``.
 
-    Those of a ``batch``, in which of camera samples that follow one another each `PER_PIXEL` are of the same
-    pixel, in nets each `batch.NETS` times `batch.NET`. A ``listener`` hears where their paths are emitted.
+    In a ``batch`` each `PER_PIXEL` consecutive camera samples are of one pixel, in nets each `batch.NETS`
+    times `batch.NET`. A ``listener`` accumulates emission statistics.
     """
 
     alpha = False
@@ -121,7 +115,7 @@ class Pilot:
         listener: emission.Listener | None = None,
     ):
         self._listener = listener
-        # Of a splat over that of a camera sample.
+        # Weight of a splat relative to a camera sample.
         self._weight = batch.size / batch.lanes
         self._region, self._lanes, self._media = region, batch.lanes, media
         self._first_net = batch.pixels * batch.samples
@@ -131,12 +125,12 @@ class Pilot:
         dr.make_opaque(self._samples, self._splats)
 
     def begin(self) -> Total:
-        """Nothing found yet."""
+        """Zero totals."""
         counted = ("joined", "evaluated") if self._media else ("joined",)
         return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {name: mi.UInt32(0) for name in counted}
 
     def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
-        """Add a contribution with t >= 2."""
+        """Accumulate a contribution with t >= 2."""
         size = self._size(c)
         self._hear(c, size, start.position, c.active)
         own, squares = self._parts(size, c)
@@ -146,13 +140,13 @@ class Pilot:
     def connect(
         self, kernel: Kernel, z: Vertex, lane: Lane, stream: Stream, total: Total, start: CameraStart
     ) -> tuple[Total, Counters]:
-        """Join the camera vertex ``z`` with all light vertices of its lane."""
+        """Connect the camera vertex ``z`` with all light vertices of its lane."""
 
         def add(c: Contribution, seen: Contribution, total: dict[str, Row]) -> dict[str, Row]:
             size = self._size(c)
             own, squares = self._parts(size, c)
             unshadowed = own
-            if kernel.space is not None:  # its weight was not known before
+            if kernel.space is not None:  # its weight depends on the medium
                 c, size = seen, self._size(seen)
                 own, squares = self._parts(size, seen)
             self._hear(replace(c, emission=lane.emission), size, start.position, seen.active)
@@ -165,20 +159,19 @@ class Pilot:
         found |= {name: total[name] for name in ("moment", "light")}
         found, counted = connections.connect_all(kernel, z, lane.path, stream, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
-        # Drawn in proportion to its unshadowed size, each stands for all: the second moment is the sum of all
-        # sizes times that of the visible ones, where that of all connections is the square of the latter.
+        # A connection drawn in proportion to its unshadowed size represents all: its second moment is the sum
+        # of all sizes times that of the visible ones; that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
-        # Which `connect_all` has counted.
         rays = counted.shadow_inner
         joined = total["joined"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
-        # In the order of `begin`, as a loop's state has to be.
+        # In the order of `begin`, as the state of a loop requires.
         found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
         if self._media:
             found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
 
     def splat(self, kernel: Kernel, c: Contribution, shared: Shared) -> Counters:
-        """Add a contribution with t <= 1."""
+        """Accumulate a contribution with t <= 1."""
         size = self._size(c)
         row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + tile_of(self._region, c.position)
         _, found = self._parts(size, c)
@@ -188,7 +181,7 @@ class Pilot:
         return Counters()
 
     def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
-        """Add a camera sample."""
+        """Accumulate a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
         others = {"joined": total["joined"], "tile": tile_of(self._region, sample.start.position)}
         others["evaluated"] = total["evaluated"] if self._media else 0
@@ -199,17 +192,20 @@ class Pilot:
     def _hear(self, c: Contribution, size: mi.Float64, position: mi.Point2f, active: mi.Bool):
         if self._listener is not None:
             lane = dr.arange(mi.UInt32, self._lanes)
-            # Samples of a pixel are in the same half.
+            # Samples of a pixel are in one half.
             pair = (lane - self._first_net) // (NETS * NET)
             half = dr.select(lane < self._first_net, moments.group(lane), pair) % 2
             self._listener.hear(c, position, half, dr.square(size), active & (size > 0))
 
     def evaluate(self, counts: mi.UInt64):
-        """Run what was recorded, and ``counts`` with it."""
+        """Evaluate the recorded kernel together with ``counts``."""
         dr.eval(self._samples, self._splats, counts)
 
     def moments(self, counts: dict[str, int], isolated: Isolated | None = None) -> Moments:
-        """What was found; ``counts`` what the lanes counted, ``isolated`` light is in no sample."""
+        """The pilot's moments.
+
+        ``counts`` of the lanes' counters; ``isolated`` light is in no sample.
+        """
         rows = np.array(self._samples).reshape(-1, SAMPLE.width)
         parts = slice(self._first_net), slice(self._first_net, None)
         independent, nets = (moments.Samples.of_rows(rows[part]) for part in parts)
@@ -226,19 +222,20 @@ class Pilot:
         return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, isolated, heard)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
-        """What a contribution ``c`` of this weighted ``size`` adds.
+        """What a contribution ``c`` of weighted ``size`` adds.
 
-        Its estimates, of the weightings that have its class, and a dictionary of what it adds to ``moment``
-        and ``light``, see `rows.SAMPLE`.
+        Estimates of the weightings that use its class, and a dictionary of what it adds to ``moment`` and
+        ``light``, see `moments.SAMPLE`.
         """
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
         own, squares, lights = [], [], []
         for w in WEIGHTINGS:
             total = _dot(w, shares, 1)
-            # With inner connections every class is in use; what cannot make the path is ruled out.
+            # With inner connections all classes are in use; weightings that cannot sample the path are ruled
+            # out.
             possible = mi.Bool(True) if w.inner else total > 0
-            # How often it makes the path when the pilot does once: see `RAREST`.
+            # Rate of the path relative to the pilot: see `RAREST`.
             seldom = dr.maximum(1, self._least / _dot(w, shares, 0))
             scale = size / (total * seldom)
             square = dr.square(scale) * seldom
@@ -254,10 +251,10 @@ class Pilot:
         return own, {"moment": squares, "light": lights}
 
     def _rare(self, size: mi.Float64, c: Contribution, squares: Row) -> Row:
-        """Of the ``squares`` of a contribution of light tracing, those that points do not help.
+        """The part of ``squares`` of a splat that does not gain from stratification.
 
-        They are of paths that camera subpaths make too rarely, see `SELDOM`. (Not light that comes from a
-        lamp without a detour: every camera sample finds it with s = 1, if that can find it at all.)
+        It is on paths that camera subpaths sample too rarely, see `SELDOM`. Excludes light directly from a
+        lamp, which every camera sample finds with s = 1 if that is possible.
         """
         shares = _shares(size, c) | {"light": 0}
         often = (c.s == 2) & (shares["direct"] > 0)
@@ -269,18 +266,16 @@ class Pilot:
     def _size(self, c: Contribution) -> mi.Float64:
         """Weighted size of a contribution that counts, in double precision.
 
-        Its square, in any unit of radiance, is too large or too small for single (at 1e12 outliers are, at
-        1e20 all).
+        Its square overflows or underflows single precision in some units of radiance.
 
-        Emitters seen directly do not count: relative to what is around them their edges would outweigh all
-        else, and they are as noisy in any way of rendering, but for lamps much smaller than a pixel, which
-        (1,1) finds and path tracing alone hardly.
+        Directly seen emitters do not count: their edges would outweigh all else relative to their
+        surroundings, and are equally noisy in all configurations.
         """
         return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
 
 
 def rarest(stands_for: float, lanes: int) -> float:
-    """See `RAREST`, of a pilot of so many ``lanes`` that each ``stand for`` so many samples of the render."""
+    """See `RAREST`; each of ``lanes`` represents ``stands_for`` samples of the render."""
     return RAREST_IN_SHORT if stands_for * lanes <= SHORT else max(stands_for, RAREST)
 
 
@@ -295,9 +290,9 @@ def measure(
 ) -> Moments:
     """Run a pilot of about ``lanes`` camera samples, spread over the image.
 
-    Each of them ``stands_for`` so many of the render. ``guiding``: whether the gain of guided s = 0 is
-    predicted where it is possible, which takes two more kernels. Light that could be guided is in no sample
-    either way, since its outliers would hide how candidates differ.
+    Each represents ``stands_for`` samples of the render. ``guiding``: predict the gain of photon-guided BSDF
+    sampling where possible, with two more kernels. Guidable light is in no sample either way: its outliers
+    would hide the differences of the candidates.
     """
     everything = replace(
         plan,
@@ -328,7 +323,7 @@ def measure(
     chosen = min(lanes // samples, pixels)
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
     pilot = Pilot(region, batch, rarest(stands_for, all_lanes), prepared.space is not None, listener)
-    # What is not in nets are independent numbers: the squared mean follows from products of samples.
+    # Samples outside nets use independent numbers: products of samples give the squared mean.
     points = Points(settings.points, seed)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
@@ -342,9 +337,9 @@ def measure(
 
 
 def _add(target: mi.Float64, layout: Layout, found: Mapping[str, Row], row: mi.UInt32, active: mi.Bool):
-    """Add what was ``found`` to a row of ``target``, as a packet.
+    """Add ``found`` to a row of ``target`` as a packet.
 
-    (`dr.scatter` would evaluate what was recorded so far.)
+    `dr.scatter` would evaluate the recorded computations.
     """
     values = layout.row(found)
     packet = mi.ArrayXd(values + [mi.Float64(0)] * (layout.width - len(values)))
@@ -352,12 +347,15 @@ def _add(target: mi.Float64, layout: Layout, found: Mapping[str, Row], row: mi.U
 
 
 def _shares(size: mi.Float64, c: Contribution) -> dict[str, mi.Float | int]:
-    """Shares of the classes in the sum of all densities; where there is nothing they may be 0 / 0."""
+    """Shares of the classes in the sum of all densities.
+
+    May be 0 / 0 where ``size`` is 0.
+    """
     return dict(zip(mis.CLASSES, dr.select(size > 0, c.shares, 1), strict=True))
 
 
 def _mean_colour(c: Contribution) -> mi.Float64:
-    """Mean of the colours of a contribution, in double precision, which adds up unlike the largest."""
+    """Mean over the colours in double precision; additive, unlike the maximum."""
     colours = [mi.Float64(dr.abs(colour)) for colour in mi.unpolarized_spectrum(c.value)]
     return sum(colours) / len(colours) * mi.Float64(c.weight)
 
@@ -367,9 +365,9 @@ def _none(n: int) -> Row:
 
 
 def _sums(total: Row, more: Row) -> Row:
-    """``total`` with ``more``, which has an entry for the last weightings only, added to these.
+    """Add ``more``, of the last weightings only, to ``total``.
 
-    What gets nothing is left as it is: loops do not hold it, see `walk.Walk`.
+    Entries without an addend stay the same object, so that loops do not store them (see `walk.Walk`).
     """
     first = len(total) - len(more)
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]

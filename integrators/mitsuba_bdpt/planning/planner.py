@@ -2,7 +2,7 @@
 # pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
 # pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
 # pyright: reportUnknownVariableType=false
-"""Decides how a render goes on: by parameters, by the scene alone, or by pilots."""
+"""Decides how a render proceeds: by parameters, by the scene alone, or by pilots."""
 
 from __future__ import annotations
 
@@ -29,26 +29,23 @@ from .findings import Findings
 from .moments import Moments
 from .possible import plan, unreachable_paths, why_not_joined
 
-# Samples per pixel after which a pilot is asked again, then after four times as many, and so on.
+# Samples per pixel after which a second pilot runs, then after four times as many, and so on.
 FIRST_REPEAT = 32
 
-# Share of a render after which none is asked any more: what is left has to pay for it.
+# Share of a render after which no pilot runs: the rest has to pay for it.
 LATEST_REPEAT = 1 / 4
 
-# Where path tracing alone is the best without tables, a second pilot is asked with them, if they promise to
-# make light subpaths better than it by this factor.
+# Where path tracing alone is best without tables, a second pilot runs with them if they are predicted to make
+# light subpaths better than it by this factor.
 AIMED_GAIN = 1.15
 
-# Where the fewest light subpaths are chosen, with one connection, camera subpaths are joined with several of
-# them, drawn by a guess (`connections`), in renders of so many samples and pixels, 64 of which share four
-# light subpaths. (Efficiency with four over that with one, 16 samples per pixel of 128^2: `ajar_door` 1.32,
-# `uplight_room` 1.36, `cornell_box` 1.46, `window_room` 1.47, `furnace_point` 1.68, `pool_floor` 0.98. Where
-# more light subpaths are chosen it is 0.73 to 1.30.) Not where BSDFs scatter to the other side, which guesses
-# do not know well, and on CPUs alone: on others it was not measured, and lanes need four times the local
-# memory.
+# Where the fewest light subpaths and one connection are chosen, camera subpaths connect with several light
+# subpaths, drawn by an approximation (`connections`), in renders of at least so many samples and pixels. Not
+# with transmissive BSDFs, which the approximation does not cover, and only with LLVM: lanes need four times
+# the local memory. See experiments, "Several light subpaths per lane".
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
-# Tables that a later pilot has taught replace earlier ones if they leave this part of what those leave.
+# Tables of a later pilot replace earlier ones if they leave this part of their second moments.
 BETTER_TABLES = 0.95
 
 # Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
@@ -60,16 +57,15 @@ UNMEASURED = (
     },
 )
 
-# Why a pilot that was asked decides nothing. (Emission that the sensor sees directly is the same for all.)
+# Why a pilot decides nothing. Directly seen emission is the same for all candidates.
 SAW_NOTHING = "it found no light but that of emitters which the sensor sees directly"
 NOT_FINITE = "it found no finite value"
 
 
 class Pilots(NamedTuple):
-    """How many pilots were ``asked``, and when the next one is due.
+    """Number of pilots that ran, and when the next one is due.
 
-    Of so many of them the findings were ``remembered``; ``repeat``: samples per pixel after which the next
-    one is due.
+    ``remembered``: cached ones among them; ``repeat``: samples per pixel after which the next one is due.
     """
 
     asked: int = 0
@@ -79,10 +75,11 @@ class Pilots(NamedTuple):
 
 @dataclass(frozen=True)
 class Decided:
-    """What a render has decided so far; a part of its progress.
+    """Decisions of a render so far; part of its progress.
 
-    ``left_out``: what the last of the ``decisions`` does without, as in ``statistics["skipped"]``;
-    ``no_pilot``: why the first pilot was not asked, or decided nothing; ``moments`` of all pilots."""
+    ``left_out``: what the last of ``decisions`` leaves out, as in ``statistics["skipped"]``; ``no_pilot``:
+    why the first pilot did not run or did not decide; ``moments`` of all pilots.
+    """
 
     decisions: tuple[Decision, ...] = ()
     left_out: tuple[dict[str, str], ...] = ()
@@ -93,10 +90,10 @@ class Decided:
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a pilot says.
+    """Result of a pilot.
 
-    The ``table`` of its predictions, the best first, and what that leaves out; the ``moments`` that they
-    follow from, those of the pilot ``with_tables`` of emission if there was one; how many were ``asked``.
+    ``table`` of predictions, the best first, and what the best leaves out; ``moments`` that they follow from,
+    and those of the pilot ``with_tables`` of emission, if one ran; number of pilots ``asked``.
     """
 
     table: tuple[choice.Prediction, ...]
@@ -107,14 +104,15 @@ class _Answer:
 
 
 class Planner:
-    """The ``plan`` of one render of ``spp`` samples per pixel, and who decides it.
+    """The ``plan`` of one render of ``spp`` samples per pixel, and its decisions.
 
-    ``full``: the plan before any decision; ``threshold`` of roulette, in units of the image, or ``None``
-    before a decision; ``changes``: how often a decision made another plan of it; ``decided``: what goes on
-    with the render. All methods take ``passes``, the samples per pixel of each pass that is done."""
+    ``full``: the plan before any decision; ``threshold`` of roulette in units of the image, None before a
+    decision; ``changes``: number of decisions that changed the plan; ``decided``: saved with the render.
+    ``passes``: samples per pixel of each finished pass.
+    """
 
-    # What pilots draw is the same in renders of all seeds, so that all decide alike. (Of 32 the one
-    # whose choices have the least time times error in the scenes of docs/reports/choices.json.)
+    # The same for all seeds of a render, so that all decide alike. Of 32 the one with the most efficient
+    # choices.
     pilot_seed = 30
 
     def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: Findings):
@@ -122,13 +120,13 @@ class Planner:
         self._pixels = int(prepared.camera.region.size.prod())
         self.full = self.plan = budget.first_plan(plan(prepared, settings), settings, self._pixels)
         self.threshold, self.changes, self.decided = None, 0, Decided()
-        # What the newest pilot with tables of emission has found, where there was one.
+        # Moments of the newest pilot with tables of emission.
         self._with_tables: Moments | None = None
 
     def begin(self, passes: tuple[int, ...]) -> bool:
         """Adopt what the scene alone decides, before the first pass.
 
-        Returns whether a pilot is to be asked about what is still to come.
+        Returns whether a pilot is to run.
         """
         settled, decision = self._settled(passes)
         if not passes and self._settings.decisions is None:
@@ -138,7 +136,7 @@ class Planner:
         return not settled
 
     def is_repeat_due(self, passes: tuple[int, ...]) -> bool:
-        """Whether it is time for another pilot, early in a long render; true once for each time."""
+        """Whether another pilot is due, early in a long render; true once for each."""
         pilots, done = self.decided.pilots, sum(passes)
         if not passes or done < pilots.repeat or self._settings.variance or self._settings.decisions:
             return False
@@ -149,11 +147,11 @@ class Planner:
         return done <= LATEST_REPEAT * self._spp
 
     def ask(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
-        """Ask a pilot and adopt what it says; returns its predictions, the best first."""
+        """Run a pilot and adopt its decision; returns its predictions, the best first."""
         samples = self._expected(passes)
         if self.decided.pilots.asked:
             answer = self._answer(samples)
-        else:  # that of each render of the scene
+        else:  # the first pilot of all renders of the scene
             key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
             answer, is_known = self._findings.find("answers", key, lambda: self._answer(samples))
             if is_known:
@@ -166,13 +164,13 @@ class Planner:
         return list(answer.table)
 
     def _answer(self, samples: int) -> _Answer:
-        """What a pilot, and the earlier ones of this render with it, say of so many ``samples``."""
+        """Result of a pilot combined with the earlier ones of this render."""
         found, before = self._measured(samples), self.decided.moments
         moments = found if before is None else before.joined(found)
         self.decided = replace(self.decided, moments=moments)
         alternatives, left_out = self._alternatives(samples), ()
         table = choice.choose(moments, alternatives)
-        if not moments.mean > 0:  # a pilot that sees nothing, or NaN, says nothing
+        if not moments.mean > 0:  # the pilot saw no light, or NaN
             table = []
         if table:
             table, learnt = self._aimed(table, moments, samples)
@@ -189,7 +187,7 @@ class Planner:
     def _aimed(
         self, table: list[choice.Prediction], moments: Moments, samples: int
     ) -> tuple[list[choice.Prediction], emission.Learnt | None]:
-        """The ``table`` of a pilot with what it teaches about emission, where that pays; and what that is."""
+        """Add guided emission to ``table`` where it pays; also returns what was learnt."""
         self._with_tables = None
         if not moments.emission.size:
             return table, None
@@ -211,7 +209,7 @@ class Planner:
         return [row.with_emission(tables, is_lit) for row in table], learnt
 
     def _joined(self, row: choice.Prediction, samples: int) -> choice.Prediction:
-        """``row``, joined with more light subpaths where that pays, see `JOINED_SAMPLES`."""
+        """``row`` with several light subpaths per lane where that pays (`JOINED_SAMPLES`)."""
         candidate = row.candidate
         fewest = candidate.connections == "one" and candidate.light_paths == min(n for n in LIGHT_PATHS if n)
         if (
@@ -229,7 +227,7 @@ class Planner:
         return why_not_joined(self._prepared, self.full.merging)
 
     def _learnt(self, moments: Moments, samples: int) -> emission.Learnt:
-        """What the pilots teach about emission, remembered of the first (20 ms under a sky)."""
+        """Fit tables of emission; the first pilot's are cached (20 ms under a sky)."""
         emitters = self._prepared.emitters
 
         def learn() -> emission.Learnt:
@@ -240,10 +238,9 @@ class Planner:
         return self._findings.find("emission", (self._settings, self.pilot_seed, samples), learn)[0]
 
     def _measured(self, samples: int, tables: EmissionTables | None = None) -> Moments:
-        """What a pilot for a render of so many ``samples`` finds (see `pilot.measure`), with these tables.
+        """Moments of a pilot (`pilot.measure`) for ``samples`` samples with these tables.
 
-        Where the same one was traced in an earlier render, and nothing was edited since, that is remembered:
-        it would find the same.
+        Cached for later renders until an edit.
         """
         count, pilots = budget.lanes(samples), self.decided.pilots
         pilots = pilots._replace(asked=pilots.asked + 1)
@@ -265,7 +262,7 @@ class Planner:
         return found
 
     def replay(self, passes: tuple[int, ...]):
-        """Adopt the decision that the parameters give for the next pass, if there is one."""
+        """Adopt the decision that the parameters give for the next pass, if any."""
         for decision in self._settings.decisions or ():
             if decision.first_pass == len(passes):
                 self.adopt(decision, replayed(decision))
@@ -280,8 +277,8 @@ class Planner:
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on.
 
-        If that differs from before, with points of their own: lanes serve other samples, and what was half
-        done of the old sequence would not be finished.
+        A changed plan uses new points: lanes sample other pixels, and the rest of the old sequence would be
+        missing.
         """
         if decision.joined > 1 and (why := self._why_not_joined()):
             raise UsageError(
@@ -296,33 +293,33 @@ class Planner:
         self.threshold, self.plan = decision.threshold, adopted
 
     def restore(self, decided: Decided):
-        """Go on from what was decided in an earlier part of the render."""
+        """Resume from the decisions of an earlier part of the render."""
         for decision in decided.decisions:
             self.adopt(decision, decided.left_out)
         self.decided = decided
 
     def certainty(self, passes: tuple[int, ...]) -> float:
-        """`choice.certainty` of what the pilots decided."""
+        """`choice.certainty` of the pilots' decision."""
         moments = self._with_tables or self.decided.moments
         return choice.certainty(moments, self._alternatives(self._expected(passes)))
 
     def lost_by_pilots(self) -> int:
-        """Values of the pilots that were not finite, and counted as zero."""
+        """Number of non-finite values of the pilots, counted as zero."""
         moments = self.decided.moments
         return 0 if moments is None else round(moments.rays["non_finite"] * moments.lanes)
 
     def why_no_pilot(self, passes: tuple[int, ...] = ()) -> str:
-        """Why there is no table of a pilot's, as a sentence."""
+        """Sentence: why there are no predictions of a pilot."""
         return f"no pilot: {self._settled(passes)[0] or self._why_undecided()}"
 
     def _why_undecided(self) -> str:
-        """Why the pilots that were asked decide nothing."""
+        """Why the pilots that ran decided nothing."""
         return NOT_FINITE if self.lost_by_pilots() else SAW_NOTHING
 
     def _settled(self, passes: tuple[int, ...]) -> tuple[str, Decision | None]:
-        """Why no pilot is asked about the rest of the render, and what is decided without one.
+        """Why no pilot runs for the rest of the render, and the decision without one.
 
-        The reason is empty if one is asked; the decision is ``None`` if there is none.
+        An empty reason means that one runs.
         """
         if not budget.is_open(self.full, self._settings):
             by_hand = budget.is_by_hand(self._settings)
@@ -340,12 +337,12 @@ class Planner:
         return "", None
 
     def _alternatives(self, samples: int) -> choice.Alternatives:
-        """What may be done with so many ``samples`` that are still to come."""
+        """The alternatives for ``samples`` samples still to come."""
         possible = candidates(self._prepared, self.full, self._settings)
         return choice.Alternatives(possible, self._settings.points == "sobol", samples, self.full.guidable)
 
     def _expected(self, passes: tuple[int, ...]) -> int:
-        """Samples still to come, as far as that is known."""
+        """Expected number of samples still to come."""
         done = sum(passes)
         left = (self._spp - done) * self._pixels
         return budget.expected_samples(self._settings, left, done * self._pixels)

@@ -1,4 +1,4 @@
-"""What a render does and does not need: the strategies in use, their counts and coefficients."""
+"""The strategies that the scene and the parameters allow: the `Plan`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .budget import EVEN
 
 
 def plan(prepared: PreparedScene, settings: Settings) -> Plan:
-    """Decide from the scene alone what is impossible, and apply the parameters given by hand."""
+    """Rule out impossible strategies and apply parameters set by hand."""
     emitters, camera = prepared.emitters, prepared.camera
     skipped: list[dict[str, str]] = []
 
@@ -31,7 +31,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     hit = emitters.hittable or skip("s=0", "impossible", "no emitter that a ray can hit")
 
     def possible(name: str, needed: int, where: bool, why: str) -> bool:
-        """A class that joins surfaces, on paths of ``needed`` edges or more."""
+        """Whether a class that connects vertices is possible, on ``needed`` edges or more."""
         why = _why_not(prepared, settings.max_depth, needed) or ("" if where else why)
         return skip(name, "impossible", why) if why else True
 
@@ -49,7 +49,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     if why and settings.photon_guiding == "always":
         skip("guided s=0", "impossible", why)
     guidable = not why
-    if merging:  # a pilot may do without it where s = 0 finds that light too
+    if merging:  # a pilot may choose not to merge where s = 0 samples that light too
         guidable = guidable and not (emitters.unhittable or emitters.beams)
     elif guidable and settings.photon_guiding == "never":
         guidable = skip("guided s=0", "by hand", "photon_guiding=never")
@@ -89,7 +89,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
 
 
 def why_not_joined(prepared: PreparedScene, merging: bool) -> str:
-    """Why camera subpaths cannot be connected with several light subpaths at a time; empty if they can."""
+    """Why camera subpaths cannot connect with several light subpaths, or empty."""
     if prepared.space is not None:
         return "in scenes with media"
     if merging:
@@ -100,7 +100,7 @@ def why_not_joined(prepared: PreparedScene, merging: bool) -> str:
 
 
 def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str] | None:
-    """The level and why emission cannot be guided; None if it can."""
+    """Level and reason why emission cannot be guided; None if it can."""
     if settings.emission_guiding == "never":
         return "by hand", "emission_guiding=never"
     if not emitters.table_count:
@@ -115,7 +115,7 @@ def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[st
 
 
 def _defaults(settings: Settings) -> tuple[float, str]:
-    """``light_paths`` and ``connections`` in effect: given by hand, or by ``skip``."""
+    """``light_paths`` and ``connections`` in effect: set by hand, or by ``skip``."""
     everything = settings.skip == "none"
     light_paths, connections = settings.light_paths, settings.connections
     if isinstance(light_paths, str):  # "auto"
@@ -123,7 +123,7 @@ def _defaults(settings: Settings) -> tuple[float, str]:
     if connections == "auto":
         connections = "all" if everything else "one"
     if settings.strategy_images and connections == "one":
-        connections = "all"  # a drawn connection is no estimate of each strategy by itself
+        connections = "all"  # a drawn connection does not estimate each strategy
     return light_paths, connections
 
 
@@ -131,7 +131,7 @@ _UNTRACED = "no light subpath can start from the emitters"
 
 
 def _why_not(prepared: PreparedScene, depth: int, needed: int) -> str:
-    """Why no path of ``needed`` edges can be made by joining vertices; empty if nothing forbids it."""
+    """Why no path of ``needed`` edges can be connected; empty if one can."""
     if depth < needed:
         return f"max_depth={depth} allows no such path"
     if prepared.emitters.count == 0:
@@ -144,14 +144,14 @@ def _why_not(prepared: PreparedScene, depth: int, needed: int) -> str:
 
 
 def _why_no_light(emitters: Emitters, settings: Settings) -> str:
-    """Why no path reaches the sensor at all; empty if one may."""
+    """Why no path reaches the sensor; empty if one may."""
     if settings.max_depth < 1:
         return "max_depth=0 allows no path"
     return "" if emitters.count else "the scene has no emitter"
 
 
 def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -> str:
-    """Why (1,1) is impossible; empty if it is not."""
+    """Why (1,1) is impossible; empty if it is possible."""
     if not camera.connectible:
         return camera.reason
     if settings.hide_emitters:
@@ -166,7 +166,7 @@ def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -
 
 
 def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
-    """Why t=0 is impossible; empty if it is not."""
+    """Why t=0 is impossible; empty if it is possible."""
     emitters, camera = prepared.emitters, prepared.camera
     if not camera.area:
         return camera.no_area
@@ -183,7 +183,7 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
 
 
 def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
-    """Why no vertex can be merged; empty if some may be. ``delta``: some BSDF has such a lobe."""
+    """Why no vertex can be merged, or empty. ``delta``: a BSDF has a delta lobe."""
     if not emitters.traced:
         return _UNTRACED
     if direct and not (delta or emitters.beams):
@@ -191,12 +191,12 @@ def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
     return ""
 
 
-# Edges of an isolated path at least: lamp, glass, a vertex, the sensor.
+# Least number of edges of an SDS path: lamp, glass, a vertex, the sensor.
 SHORTEST = 3
 
 
 def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, direct: bool) -> str:
-    """Why s = 0 cannot be guided, or gains nothing by it; empty if neither."""
+    """Why s = 0 cannot be guided, or does not gain by it; empty if neither."""
     if prepared.space is not None:
         return "photons in scenes with participating media are not traced"
     if settings.strategy_images:
@@ -211,7 +211,7 @@ def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, dire
 
 
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
-    """Whether the scene's box reaches behind the far plane of a sensor that has one."""
+    """Whether the scene's box extends behind the far plane of the sensor, if any."""
     if not isinstance(sensor, mi.ProjectiveCamera) or not prepared.surfaces:
         return False
     box, to_world = scene_box(prepared.scene), world_matrix(sensor)
@@ -221,7 +221,7 @@ def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
 
 
 class Start(Enum):
-    """Where paths begin that no camera subpath finds: neither by a hit nor by next-event estimation."""
+    """Starts of paths that camera subpaths sample neither by a hit nor by next event."""
 
     DELTA_EMITTER = "a delta emitter seen through delta surfaces"
     BEAM = "directionalarea, which emits into one direction"
@@ -229,7 +229,7 @@ class Start(Enum):
 
 
 class Rest(Enum):
-    """What follows such a start on paths that only some strategies can make."""
+    """Continuations of such a start that only some strategies sample."""
 
     SEEN_VERTEX = "a vertex that is not delta, seen by the sensor"
     VERTICES = "two vertices or more that are not delta, then delta surfaces or none"
@@ -240,10 +240,10 @@ class Rest(Enum):
 
 @dataclass(frozen=True)
 class UnreachablePaths:
-    """Paths that no strategy in use makes: from one of the ``starts`` by the ``rest``.
+    """Paths that no strategy in use samples: from one of ``starts`` by ``rest``.
 
-    ``needs`` is the strategy that would make them, empty if there is none. ``longest``, for `Rest.LONG`: the
-    number of edges beyond which they are not made. ``volumes``: vertices that are not delta may lie in media.
+    ``needs``: the strategy that would sample them, empty if none would; ``longest``, for `Rest.LONG`: the
+    number of edges up to which they are sampled; ``volumes``: non-delta vertices may lie in media.
     """
 
     starts: tuple[Start, ...]
@@ -254,15 +254,15 @@ class UnreachablePaths:
 
 
 def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnreachablePaths, ...]:
-    """Paths that no strategy in use can make.
+    """Paths that no strategy in use samples, in a fixed order.
 
-    The order is always the same, so that two answers can be compared. In words: `explain.words`.
+    `explain.words` describes them.
     """
     emitters, camera = prepared.emitters, prepared.camera
     lost: list[UnreachablePaths] = []
     deltas = prepared.delta and emitters.unhittable
     starts = (Start.DELTA_EMITTER,) * deltas + (Start.BEAM,) * emitters.beams
-    if not p.arrival:  # t = 0 finds all that follow
+    if not p.arrival:  # t = 0 samples all that follow
         for start in starts:
             if not p.splat:
                 lost.append(UnreachablePaths((start,), Rest.SEEN_VERTEX, "t=1"))
@@ -279,7 +279,7 @@ def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> t
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
         lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))
-    if p.merging:  # makes what has a vertex where it may be done
+    if p.merging:  # samples all paths with a vertex for merging
         lost = [paths for paths in lost if paths.rest in (Rest.SENSOR, Rest.LONG)]
     volumes = prepared.space is not None and prepared.space.media.scatters
     return tuple(replace(paths, volumes=volumes) for paths in lost)
