@@ -1,4 +1,4 @@
-"""What tells a scene from itself after an edit of its parameters."""
+"""Fingerprints of scene parameters, to detect edits."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ import numpy as np
 
 from .introspection import all_parameters, own_parameters
 
-# Arrays of up to so many entries are kept, so that no other gets their number. Larger ones would outlive a
-# scene that takes gigabytes.
+# Largest array (entries) that is kept alive: its index stays unique, without holding gigabytes.
 KEPT = 64
 
 
 @dataclass(frozen=True)
 class State:
-    """A record of the parameters of Mitsuba's objects, to find edits by.
+    """Fingerprint of the parameters of Mitsuba's objects; equal if nothing was edited.
 
-    Equal to a later one, also as a key, if nothing was edited in between. ``marks``: small arrays of Dr.Jit
-    by their number, transformations too, larger ones by a checksum of their contents, all else by its text.
-    ``kept``: what is known by its number.
+    ``marks``: JIT indices of small arrays, checksums of larger arrays, text of all other values. ``kept``:
+    the arrays known by index, kept alive so that Dr.Jit does not reuse the index.
     """
 
     marks: tuple[Any, ...]
@@ -33,7 +31,7 @@ class State:
 
     @classmethod
     def of(cls, owners: Iterable[mi.Object], deep: bool = True) -> State:
-        """The present state of ``owners``, and of all that they hold if ``deep``."""
+        """Return the present state of ``owners``, and of their children if ``deep``."""
         marks, kept = [], []
         own = (own_parameters(owner).values() for owner in owners)
         for value in all_parameters(owners) if deep else chain.from_iterable(own):
@@ -49,12 +47,12 @@ class State:
 
 
 def _checksum(value) -> tuple:
-    """Type, shape and CRC-32 of the contents of an array (4 GB/s on one core)."""
+    """Type, shape and CRC-32 of an array's contents (4 GB/s on one core)."""
     if dr.is_tensor_v(value):
         return (*value.shape, *_checksum(value.array))
     if dr.depth_v(value) > 1:
         return tuple(_checksum(part) for part in value)
     value = dr.detach(value)
-    # Without a copy where the memory is the processor's.
+    # Zero-copy in LLVM variants.
     data = np.from_dlpack(value) if dr.backend_v(value) == dr.JitBackend.LLVM else value.numpy()
     return type(value).__name__, len(data), zlib.crc32(data.view(np.uint8))

@@ -1,4 +1,4 @@
-"""What Mitsuba's objects hold."""
+"""Children and parameters of Mitsuba's objects."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from . import renamed
 
 
 def number(x) -> float:
-    """A number of Python from one of Dr.Jit."""
+    """Convert a Dr.Jit number to a Python float."""
     return float(dr.slice(x) if dr.is_array_v(x) else x)
 
 
 def named(owner) -> str:
-    """What a message calls an object: its id in quotation marks, or that it has none, with what tells it."""
+    """Identify an object in a message: by its id, its shape's id or its class name."""
     if owner.id():
         return f"'{owner.id()}'"
     shape = owner.get_shape() if isinstance(owner, (mi.Emitter, mi.Sensor)) else None
@@ -28,7 +28,7 @@ def named(owner) -> str:
 
 
 def children(owner) -> dict:
-    """What ``owner`` holds, by name: objects and numbers, as its ``traverse`` reports them."""
+    """Return the child objects and numbers that ``owner.traverse`` reports, by name."""
     return _collector(mi.variant())().of(owner)
 
 
@@ -40,7 +40,7 @@ def is_instance(shape: mi.Shape) -> bool:
 def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes in the scene's shape groups.
 
-    An instance does not tell which group it is of: groups are found among what the scene holds.
+    Instances do not expose their group: groups are found among the scene's children.
     """
     shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
     groups = [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
@@ -48,14 +48,14 @@ def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def all_shapes(scene: mi.Scene) -> list[mi.Shape]:
-    """The scene's shapes, those in shape groups included."""
+    """Return the scene's shapes, including those in shape groups."""
     return [*scene.shapes(), *grouped_shapes(scene)]
 
 
 def own_parameters(owner) -> dict:
     """Return the parameters of ``owner`` alone, by name.
 
-    ``mi.traverse`` goes through all objects that it holds, which takes longer.
+    Cheaper than ``mi.traverse``, which visits all descendants.
     """
     collector = _collector(mi.variant())()
     found = collector.of(owner)
@@ -67,24 +67,25 @@ def own_parameters(owner) -> dict:
 
 
 def _value(value, cpptype, owner):
-    """The parameter itself, as ``mi.traverse`` reads it.
+    """Return the parameter's value, read as ``mi.traverse`` does.
 
-    A plugin in Python puts the value, one of Mitsuba's a pointer to a value of this C++ type. Raises
-    ``UnsupportedError`` if it is an animated transformation."""
+    Python plugins put the value itself, C++ plugins a pointer to a value of type ``cpptype``. Raises
+    ``UnsupportedError`` for an animated transformation.
+    """
     if renamed.is_transform(value):
         return renamed.transform(value, _called(owner))
     return value if cpptype is None else mi.get_property(value, cpptype, owner)
 
 
 def all_parameters(owners):
-    """The parameters of ``owners`` and of all that they hold, each object's once, after its class's name."""
+    """Yield class name and parameters of ``owners`` and their descendants, each once."""
     collector = _collector(mi.variant())()
     left, seen = list(owners), {}
     while left:
         owner = left.pop()
         if id(owner) in seen:
             continue
-        seen[id(owner)] = owner  # which lives as long as its number is known
+        seen[id(owner)] = owner  # kept alive: ids are reused
         yield owner.class_name()
         for name, value in collector.of(owner).items():
             if isinstance(value, mi.Object):
@@ -94,22 +95,22 @@ def all_parameters(owners):
 
 
 def matrix_of(owner) -> np.ndarray:
-    """The matrix of the parameter ``to_world`` of ``owner``: (4, 4), in double precision."""
+    """The ``to_world`` matrix of ``owner``: (4, 4), double precision."""
     return _entries(own_parameters(owner)["to_world"].matrix)
 
 
 def world_transform(endpoint: mi.Emitter | mi.Sensor):
-    """The transformation of an emitter or a sensor; raises ``UnsupportedError`` if it is animated."""
+    """Return an endpoint's ``to_world``; raises ``UnsupportedError`` if animated."""
     return renamed.transform(endpoint.world_transform(), _called(endpoint))
 
 
 def world_matrix(endpoint: mi.Emitter | mi.Sensor) -> np.ndarray:
-    """The matrix of `world_transform`: (4, 4), in double precision."""
+    """The matrix of `world_transform`: (4, 4), double precision."""
     return _entries(world_transform(endpoint).matrix)
 
 
 def check_not_animated(owners: Iterable):
-    """Raise ``UnsupportedError`` if one of ``owners`` moves while the shutter is open."""
+    """Raise ``UnsupportedError`` if one of ``owners`` has an animated transformation."""
     for owner in owners if renamed.may_be_animated() else ():
         own_parameters(owner)
 
@@ -119,15 +120,15 @@ def _called(owner) -> str:
 
 
 def inverse_of(owner) -> np.ndarray:
-    """Return what Mitsuba takes to be the inverse of `matrix_of`, kept beside it.
+    """Return the inverse that Mitsuba stores beside `matrix_of`.
 
-    It is wrong after ``rotate`` about an axis that is not of length 1, which Mitsuba takes for a rotation.
+    It is wrong after ``rotate`` about an axis of length other than 1: Mitsuba assumes a rotation.
     """
     return _entries(own_parameters(owner)["to_world"].inverse().matrix)
 
 
 def _entries(matrix) -> np.ndarray:
-    """A matrix of Dr.Jit, in double precision. (One by one: no kernel runs, as for the matrix as a whole.)"""
+    """Convert a Dr.Jit matrix to double precision, entry by entry to launch no kernel."""
     return np.array([[number(matrix[i, j]) for j in range(4)] for i in range(4)], dtype=np.float64)
 
 
@@ -135,8 +136,8 @@ def _entries(matrix) -> np.ndarray:
 def _collector(variant: str):
     """Return the class that collects parameters, one per variant.
 
-    A class made for each call would be garbage that only the cycle collector frees; until then it keeps
-    emitters alive beyond their scene, and the next virtual call of any scene crashes.
+    A class per call would be cyclic garbage that keeps emitters alive beyond their scene, and the next
+    virtual call of any scene would crash.
     """
 
     class Collector(mi.TraversalCallback):
@@ -147,7 +148,7 @@ def _collector(variant: str):
             return found
 
         def put(self, name, value, flags, cpptype=None):
-            # Shapes of a group that have no id are all called "shape": numbered, as by ``mi.traverse``.
+            # Shapes of a group without ids are all called "shape": number them as ``mi.traverse`` does.
             first, count = name, self.times.get(name, 0)
             while name in self.found:
                 count += 1

@@ -1,4 +1,4 @@
-"""Guards of Dr.Jit while kernels are recorded."""
+"""Helpers for recording Dr.Jit kernels."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ import numpy as np
 
 from .introspection import own_parameters
 
-# Numbers in a row without an emitter after which no more are expected; those of freed ones are used again.
+# Consecutive unused registry indices that end the search; indices of freed emitters are reused.
 _GAP = 64
 
 
 def float64(x) -> np.ndarray:
-    """The numbers of an array of Dr.Jit in double precision, those of lanes that are masked out included.
+    """Convert a Dr.Jit array to double precision, including masked lanes.
 
-    These hold whatever lay in memory: where it is a signalling NaN, NumPy's cast reports an invalid value.
+    Masked lanes hold arbitrary memory: NumPy's warning about signalling NaNs is suppressed.
     """
     with np.errstate(invalid="ignore"):
         return np.array(x, dtype=np.float64)
 
 
 def registered_emitters() -> list[str]:
-    """Class names of all emitters in the process: a virtual call visits those of other scenes too."""
+    """Class names of all emitters in the process; virtual calls visit all of them."""
     found, index, missing = [], 0, 0
     while missing < _GAP:
         index += 1
@@ -36,7 +36,7 @@ def registered_emitters() -> list[str]:
 
 
 def _emitter(index: int):
-    """The emitter that Dr.Jit gave this number to, or None."""
+    """Return the emitter with this registry index, or None."""
     try:
         return dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(index))[0]
     except RuntimeError:  # never given, or freed
@@ -45,9 +45,9 @@ def _emitter(index: int):
 
 @contextlib.contextmanager
 def evaluated_mode(on=True):
-    """Run loops, calls and branches of kernels one after the other, without recording them as a whole.
+    """Evaluate loops, calls and branches instead of recording them symbolically.
 
-    Calls of `timed_sunsky` need this.
+    Needed for calls of `timed_sunsky`.
     """
     flags = (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals)
     with contextlib.ExitStack() as stack:
@@ -60,9 +60,8 @@ def evaluated_mode(on=True):
 def gc_paused():
     """Pause Python's cycle collector.
 
-    A scene that only the collector would free, and that is freed while a kernel is being recorded, leaves
-    calls of its objects in the kernel beside those of the others, and Dr.Jit aborts the process ("invalid
-    redefinition of function").
+    If it frees a scene while a kernel is recorded, calls of the scene's objects stay in the kernel and
+    Dr.Jit aborts the process ("invalid redefinition of function").
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -74,10 +73,9 @@ def gc_paused():
 
 
 def make_parameters_opaque(owners):
-    """Move the numbers of ``owners`` that a kernel would hold as constants into memory.
+    """Make the parameters of ``owners`` opaque, except differentiated ones.
 
-    Calls of objects of one class then differ in data alone and are compiled once, not once per object. What
-    is differentiated stays.
+    Calls of objects of one class then differ in data alone and compile once, not once per object.
     """
     values = (value for owner in owners for value in own_parameters(owner).values())
     dr.make_opaque([value for value in values if not dr.grad_enabled(value)])

@@ -1,15 +1,14 @@
-"""Which LLVM library Dr.Jit shall load.
+"""Choice of the LLVM library that Dr.Jit loads.
 
-Dr.Jit compiles kernels with whatever libLLVM it finds, and reads ``DRJIT_LIBLLVM_PATH`` once, when
-it is first imported. With Mitsuba 3.9, LLVM 14 is refused and 15 and 16 abort the process on
-machines with AVX-512, so a library is chosen here before ``drjit`` is imported:
+Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once, on its first import. Mitsuba 3.9 rejects LLVM 14, and LLVM 15
+and 16 abort the process on machines with AVX-512, so this module chooses before ``drjit`` is imported:
 
-1. the one the user named in ``DRJIT_LIBLLVM_PATH``, as it is;
-2. the one the wheel ``karellen-llvm-core`` put into the Python environment;
-3. the newest on the system whose version is known to work;
-4. none where there is a driver of CUDA, whose variants need no LLVM: the import goes on.
+1. the library that the user named in ``DRJIT_LIBLLVM_PATH``, as it is;
+2. the library of the installed wheel ``karellen-llvm-core``;
+3. the newest library on the system whose version is known to work;
+4. none if there is a CUDA driver, whose variants need no LLVM.
 
-``choose`` is a function of a `Machine` record alone; only `prepare` touches the process.
+``choose`` is a pure function of a `Machine`; only `prepare` changes the process.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ _LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
 
 
 class LLVMNotFoundError(ImportError):
-    """No LLVM library that Dr.Jit can safely use; the message says what mends it."""
+    """No usable LLVM library; the message says how to install one."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The LLVM library in use. `version` is its major version, None where it is unknown."""
+    """The LLVM library in use; `version` is its major version, None if unknown."""
 
     path: Path | None
     origin: str
@@ -55,7 +54,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Machine:
-    """All that the choice depends on."""
+    """Everything that the choice depends on."""
 
     env: Mapping[str, str]
     wheel: tuple[Path, ...]
@@ -69,7 +68,7 @@ class Machine:
 
     @classmethod
     def here(cls) -> Machine:
-        """The machine this process runs on."""
+        """Describe the machine that this process runs on."""
         return cls(
             env=os.environ,
             wheel=tuple(wheel_libraries(Path(sys.prefix))),
@@ -98,7 +97,7 @@ def choose(machine: Machine) -> Choice:
             return Choice(path, "wheel", f"installed by {WHEEL}", major_version(path))
     usable = [path for path in machine.system if major_version(path) in KNOWN_GOOD]
     if usable:
-        # Ties keep the order of the search.
+        # max() keeps the search order on ties.
         path = max(usable, key=lambda path: major_version(path) or 0)
         return Choice(path, "system", "found on the system, known to work", major_version(path))
     found = _describe(machine.wheel + machine.system)
@@ -115,9 +114,9 @@ def _without_llvm(found: str) -> Choice:
 
 
 def check_loaded(version: tuple[int, ...], machine: Machine) -> Choice:
-    """Judge the LLVM `version` of a Dr.Jit that was imported before this package on `machine`.
+    """Check the LLVM `version` of a Dr.Jit that was imported before this package.
 
-    `version` is what ``drjit.detail.llvm_version()`` returns: negative numbers stand for none.
+    `version`: result of ``drjit.detail.llvm_version()``, negative if there is none.
     """
     how = (
         "Import mitsuba_bdpt before drjit and mitsuba (where an import sorter puts it below them: "
@@ -137,13 +136,13 @@ def check_loaded(version: tuple[int, ...], machine: Machine) -> Choice:
 
 
 def prepare() -> Choice:
-    """Choose for this process and tell Dr.Jit; check instead where Dr.Jit is already imported."""
+    """Choose a library and set ``DRJIT_LIBLLVM_PATH``, or check an imported Dr.Jit."""
     drjit = sys.modules.get("drjit")
     if drjit is None:
         machine = Machine.here()
         choice = choose(machine)
         if choice.path or machine.wheel or machine.system:
-            # Without a usable LLVM, Dr.Jit must not find the unusable ones by itself.
+            # Keeps Dr.Jit from loading an unusable library by itself.
             os.environ[VARIABLE] = str(choice.path or os.devnull)
         return choice
     mitsuba = sys.modules.get("mitsuba")
@@ -153,7 +152,7 @@ def prepare() -> Choice:
 
 
 def cuda_driver() -> bool:
-    """Whether the library of a CUDA driver can be loaded in this process."""
+    """Whether the CUDA driver library can be loaded."""
     try:
         ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1")
     except OSError:
@@ -162,7 +161,7 @@ def cuda_driver() -> bool:
 
 
 def _before_start(machine: Machine) -> str:
-    """What makes Dr.Jit load a usable library of `machine` by itself, to be done before Python starts."""
+    """Return what to do before Python starts so that Dr.Jit loads a usable LLVM."""
     try:
         path = choose(replace(machine, env={}, has_cuda=lambda: False)).path
     except LLVMNotFoundError:
@@ -171,7 +170,7 @@ def _before_start(machine: Machine) -> str:
 
 
 def major_version(path: Path) -> int | None:
-    """The major version that the name of an LLVM library, or of its directory, tells."""
+    """Read the major version from the name of a library or of its directory."""
     for name in dict.fromkeys((path, path.resolve())):
         match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d{2,})|libLLVM\.(\d{2,})", name.name)
         match = match or re.search(r"/llvm[@/-]?(\d{2,})", name.parent.as_posix())
@@ -181,18 +180,18 @@ def major_version(path: Path) -> int | None:
 
 
 def wheel_libraries(prefix: Path) -> list[Path]:
-    """The libLLVM files that the wheel lists as installed and that exist."""
+    """Return the wheel's existing libLLVM files."""
     try:
         files = importlib.metadata.distribution(WHEEL).files or []
     except importlib.metadata.PackageNotFoundError:
         return []
     listed = [Path(str(file.locate())) for file in files if _LIBRARY.fullmatch(file.name)]
-    # An installer may leave its list of files out; the library lies in lib/ all the same.
+    # Some installers omit the list of files.
     return _existing([*listed, *sorted((prefix / "lib").glob("libLLVM.so.*"))])
 
 
 def system_libraries(directories: Iterable[Path]) -> list[Path]:
-    """The libLLVM files in `directories`, every file once."""
+    """Return the libLLVM files in `directories`, without duplicates."""
     found: list[Path] = []
     for directory in directories:
         names = sorted(directory.glob("libLLVM*")) if directory.is_dir() else []
@@ -201,7 +200,7 @@ def system_libraries(directories: Iterable[Path]) -> list[Path]:
 
 
 def library_directories(prefix: Path) -> list[Path]:
-    """The places where Linux distributions, conda and Homebrew keep libLLVM."""
+    """Directories where Linux distributions, conda and Homebrew install libLLVM."""
     fixed = [prefix / "lib"]
     fixed += [Path(f"/usr/lib/{machine}-linux-gnu") for machine in ("x86_64", "aarch64")]
     fixed += [Path("/usr/lib64"), Path("/usr/lib"), Path("/usr/local/lib")]
@@ -212,7 +211,7 @@ def library_directories(prefix: Path) -> list[Path]:
 
 
 def remedy(machine: Machine) -> str:
-    """The one command that brings a usable LLVM to `machine`."""
+    """Return the command that installs a usable LLVM on `machine`."""
     if machine.system_name == "Linux" and machine.architecture == "x86_64":
         command = f"python -m pip install '{WHEEL}==23.1.*'"
     elif machine.system_name == "Darwin":
@@ -225,7 +224,7 @@ def remedy(machine: Machine) -> str:
 
 
 def _linker_directories() -> list[Path]:
-    """Directories where the dynamic linker knows an LLVM; none where ``ldconfig`` is missing."""
+    """Directories of the LLVM libraries that ``ldconfig`` lists; none without it."""
     for program in ("ldconfig", "/sbin/ldconfig"):
         try:
             done = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10)
@@ -237,7 +236,7 @@ def _linker_directories() -> list[Path]:
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:
-    """The files among `paths`, links to the same file once."""
+    """Return the existing files among `paths`, resolved and without duplicates."""
     return list(dict.fromkeys(path.resolve() for path in paths if path.is_file()))
 
 
@@ -246,7 +245,7 @@ def _versions() -> str:
 
 
 def _describe(paths: Iterable[Path]) -> str:
-    """Name the libraries that were found and why none of them is taken."""
+    """List the libraries found and the reason why each is rejected."""
     texts: list[str] = []
     for path in paths:
         version = major_version(path)

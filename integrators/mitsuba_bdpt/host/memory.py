@@ -1,4 +1,4 @@
-"""How much memory this process may take: of the machine, of its control groups, and by its own limits."""
+"""Memory limits of this process: machine, control groups and ulimits."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ _asked: list[float] = []
 
 @dataclass(frozen=True)
 class Available:
-    """Memory in ``bytes`` that this process may still take, and what limits it."""
+    """Memory (``bytes``) that this process may still take, and its ``limit``."""
 
     bytes: float
     limit: str
 
 
 def set_limit(most: float | None) -> None:
-    """Let this process take ``most`` bytes of memory, whatever the system allows; None for no such limit.
+    """Set a limit of ``most`` bytes for this process; None removes it.
 
-    Nothing is enforced: what is known to need more raises an error before it begins.
+    Not enforced: work that is known to need more raises an error before it begins.
     """
     _asked[:] = [] if most is None else [most]
 
 
 def available() -> Available:
-    """The least of all limits; infinite where none is known.
+    """Return the smallest of all limits; infinite if none is known.
 
-    Limits of the address space and of data (``ulimit -v`` and ``-d``) count what is in use already, those of
-    the machine and of control groups (containers, slots of a farm) do not.
+    ``ulimit -v`` and ``-d`` are reduced by the memory in use; limits of the machine and of control groups
+    (containers, batch slots) are not.
     """
     return min(_limits(), key=lambda found: found.bytes, default=Available(math.inf, "nothing"))
 
 
 def peak() -> int | None:
-    """Bytes of memory that this process has taken at most so far; None where the system has no count.
+    """Peak memory of this process in bytes; None if the system does not report it.
 
-    On Linux of this process alone: ``ru_maxrss`` there is at least what the process had that began this one.
+    ``ru_maxrss`` is avoided on Linux: it includes the parent process's memory before ``exec``.
     """
     if sys.platform == "win32":
         return None
@@ -69,7 +69,7 @@ def _limits() -> Iterator[Available]:
 
 
 def _control_groups() -> Iterator[Path]:
-    """Files with the memory limits of this process's control groups, version 1 and 2, and of those around."""
+    """Yield the memory limit files of this process's control groups and their parents."""
     memberships = ROOT / "proc/self/cgroup"
     lines = memberships.read_text().splitlines() if memberships.is_file() else []
     for line in lines:
@@ -80,14 +80,14 @@ def _control_groups() -> Iterator[Path]:
             mount, name = ROOT / "sys/fs/cgroup/memory", "memory.limit_in_bytes"
         else:
             continue
-        # In a container the path may be that of the machine, of which only the mount is seen.
+        # In a container the path may be the host's, while only the mount is visible.
         inner = Path(path.lstrip("/"))
         folders = [mount / folder for folder in (inner, *inner.parents)]
         yield from (file for folder in folders if (file := folder / name).is_file())
 
 
 def _own_limits() -> Iterator[Available]:
-    """Limits of the process, less what it takes already."""
+    """Yield the process's ulimits less the memory in use."""
     if sys.platform != "linux":
         return
     import resource
@@ -103,7 +103,7 @@ def _own_limits() -> Iterator[Available]:
 
 
 def _status(*names: str) -> dict[str, int]:
-    """The lines of these ``names`` in the process's status, in bytes; empty on other systems than Linux."""
+    """Fields ``names`` of ``/proc/self/status`` in bytes; empty if not on Linux."""
     file, found = ROOT / "proc/self/status", {}
     for line in file.read_text().splitlines() if file.is_file() else []:
         name, _, value = line.partition(":")

@@ -1,6 +1,7 @@
-"""State that is kept with a scene from render to render.
+"""State cached with a scene between renders.
 
-Warnings that were logged, what follows from the shapes, the results of pilots and of estimates of lost light.
+Warnings already logged, facts about shapes, and results of pilots and estimates of unsampled light
+transport.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from typing import Any, TypeVar
 
 import mitsuba as mi
 
-# So many scenes, the latest ones.
+# Maximum number of scenes; the oldest are dropped.
 REMEMBERED = 64
 
-# Findings of a kind that are remembered of each scene, the latest ones.
+# Maximum number of cached results of one kind per scene; the oldest are dropped.
 FINDINGS = 16
 
 _scenes: OrderedDict[int, tuple] = OrderedDict()
@@ -25,11 +26,11 @@ Found = TypeVar("Found")
 
 
 def notes(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, Any]:
-    """A dictionary that belongs to ``scene`` as long as it lives; ``sensor`` is one that it is rendered with.
+    """Return the cache of ``scene``, a dictionary that lives as long as the scene.
 
-    A scene cannot be referred to weakly, and one that is kept alive would take part in the virtual calls of
-    others. Another one may lie where it was: what tells them apart is the filter of its sensor's film, which
-    is small enough to be kept.
+    ``sensor`` is a sensor that it is rendered with. Scenes have no weak references, and a scene kept alive
+    would take part in other scenes' virtual calls. A new scene may have the same address: the reconstruction
+    filter of the sensor's film, small enough to be kept alive, identifies the scene.
     """
     for number in [n for n, held in _scenes.items() if _references(held) <= _alone()]:
         del _scenes[number]  # its scene is gone
@@ -44,13 +45,13 @@ def notes(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, Any]:
 
 
 def _references(held: tuple) -> int:
-    """How many there are to the filter in an entry of `_scenes`; a film counts as one."""
+    """Reference count of the filter in an entry of `_scenes`; a film adds one."""
     return sys.getrefcount(held[0])
 
 
 @cache
 def _alone() -> int:
-    """`_references` where no film is left."""
+    """`_references` of a filter without a film."""
     return _references((mi.load_dict({"type": "box"}), {}))
 
 
@@ -62,9 +63,9 @@ def remembered(
     find: Callable[[], Found],
     most: int = FINDINGS,
 ) -> tuple[Found, bool]:
-    """Return what ``find()`` returned for this ``key``, and whether it is remembered from an earlier call.
+    """Return the cached or computed result of ``find()``, and whether it was cached.
 
-    Of each ``kind`` the latest ``most`` are kept.
+    Caches the latest ``most`` results of each ``kind``.
     """
     known = notes(scene, sensor).setdefault(kind, {})
     is_known, found = key in known, known.pop(key, None)
@@ -75,10 +76,9 @@ def remembered(
 
 
 def warn_once(scene: mi.Scene, sensor: mi.Sensor, text: str, about: Hashable = None):
-    """Log a warning, unless it was logged for the ``scene`` before.
+    """Log a warning unless it was logged for ``scene`` before.
 
-    The same warning is one of the same ``text``, or one ``about`` the same where the text has numbers that
-    differ from render to render.
+    Warnings are equal if their ``text`` is, or their ``about`` where the text has varying numbers.
     """
     said = notes(scene, sensor).setdefault("said", set())
     about = about or text

@@ -1,10 +1,9 @@
-"""What Mitsuba 3.9 and 3.10 have under different names: meshes, hits, and ``to_world``.
+"""Names that differ between Mitsuba 3.9 and 3.10: meshes, hits and ``to_world``.
 
-No other module asks for it, so that both work. (Tested with 3.9; of 3.10, which is in development, the names
-are those of its release notes and of its branch ``motion_blur``, tested with parameters of that shape.)
+All version differences are handled here. (Tested with 3.9; names of 3.10, in development, are from its
+release notes and its branch ``motion_blur``, and tested with parameters of that form.)
 
-``to_world`` is a transformation in 3.9. In 3.10 it is an object, ``AnimatedTransform4f``, which holds a
-transformation for each key frame, within the shutter.
+``to_world`` is a transformation in 3.9, and an ``AnimatedTransform4f`` with key frames in 3.10.
 """
 
 from __future__ import annotations
@@ -17,32 +16,32 @@ import mitsuba as mi
 
 from ..errors import UnsupportedError
 
-# Names of 3.9, one number after the other, and of 3.10, tensors.
+# Names in 3.9 (flat arrays) and in 3.10 (tensors).
 POSITIONS = ("vertex_positions", "positions")
 NORMALS = ("vertex_normals", "normals")
 COORDINATES = ("vertex_texcoords", "texcoords")
 
-# In 3.10: which position, and which normal, a vertex has; empty where they are numbered like the vertices.
+# In 3.10: indices from vertices to positions and normals; empty if these are numbered like the vertices.
 _INDEX = {POSITIONS: "position_index", NORMALS: "normal_index"}
 
 Parameters = Mapping[str, Any]
 
 
 def is_transform(value: Any) -> bool:
-    """Whether ``value`` is the object that is a ``to_world`` of 3.10."""
+    """Whether ``value`` is an ``AnimatedTransform4f``, the ``to_world`` of 3.10."""
     kind = getattr(mi, "AnimatedTransform4f", None)
     return kind is not None and isinstance(value, kind)
 
 
 def may_be_animated() -> bool:
-    """Whether the installed Mitsuba has animated transformations."""
+    """Whether the installed Mitsuba supports animated transformations."""
     return hasattr(mi, "AnimatedTransform4f")
 
 
 def transform(value: Any, owner: str) -> Any:
-    """The transformation that ``value`` is in 3.9 and holds in 3.10.
+    """Return the transformation in ``value`` (itself in 3.9).
 
-    Raises ``UnsupportedError`` if it has several key frames; ``owner`` is whose it is, for the message.
+    Raises ``UnsupportedError``, which names ``owner``, if it has several key frames.
     """
     if not is_transform(value):
         return value
@@ -55,7 +54,7 @@ def transform(value: Any, owner: str) -> Any:
 
 
 def hit_flags() -> mi.RayFlags:
-    """For ``compute_surface_interaction``: frames and coordinates too."""
+    """Flags for ``compute_surface_interaction`` that include frames and coordinates."""
     return mi.RayFlags.Default if hasattr(mi.RayFlags, "Default") else mi.RayFlags.All
 
 
@@ -65,17 +64,17 @@ def holds_a_mesh(parameters: Parameters) -> bool:
 
 
 def faces(parameters: Parameters) -> mi.UInt32:
-    """Vertices of all faces, three numbers for each."""
+    """Vertex indices of all faces, flat (3 per face)."""
     return mi.UInt32(_flat(parameters["faces"]))
 
 
 def positions(parameters: Parameters) -> mi.Float:
-    """Positions of all vertices, three numbers for each."""
+    """Vertex positions, flat (3 per vertex)."""
     return _of_vertices(parameters, POSITIONS)
 
 
 def normals(parameters: Parameters) -> mi.Float:
-    """Normals of all vertices, three numbers for each; empty if it has none."""
+    """Vertex normals, flat (3 per vertex); empty if the mesh has none."""
     return _of_vertices(parameters, NORMALS)
 
 

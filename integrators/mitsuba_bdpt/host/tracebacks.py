@@ -1,8 +1,8 @@
-"""The last line of an uncaught exception's traceback.
+"""Prints a user's mistake once more below an uncaught exception's traceback.
 
-``mi.render`` makes a ``RuntimeError`` of every exception, whose text is "error while performing a custom
-differentiable operation (see above)". Where a `UsageError` or `UnsupportedError` is its cause, the text of
-the cause is printed once more, below the traceback.
+``mi.render`` turns every exception into a ``RuntimeError`` with the text "error while performing a custom
+differentiable operation (see above)". If its cause is a `UsageError` or `UnsupportedError`, the cause's
+text is printed below the traceback.
 """
 
 from __future__ import annotations
@@ -16,17 +16,16 @@ _installed: list[bool] = []
 
 
 def last_line(error: BaseException) -> str:
-    """The text of the user's mistake behind ``error``; empty if the text of ``error`` ends with it."""
+    """Text of the user's mistake behind ``error``; empty if ``error`` ends with it."""
     cause = behind(error, UsageError, UnsupportedError)
     text = "" if cause is None else str(cause)
     return "" if str(error).endswith(text) else text
 
 
 def install():
-    """Print `last_line` below the tracebacks of scripts and of IPython.
+    """Print `last_line` below tracebacks of scripts and of IPython.
 
-    Called for the first integrator: who imports the package, or lets Mitsuba find its entry point, keeps
-    ``sys.excepthook`` until then.
+    Called for the first integrator, so that importing the package leaves ``sys.excepthook`` alone.
     """
     if _installed:
         return
@@ -40,14 +39,14 @@ def install():
     sys.excepthook = hook
     ipython = sys.modules.get("IPython")
     shell = ipython and ipython.get_ipython()
-    if shell and not shell.custom_exceptions:  # a handler of the user's stays
+    if shell and not shell.custom_exceptions:  # a user's own handler stays
         shell.set_custom_exc((RuntimeError,), _show_in_ipython)
 
 
 def _show_in_ipython(
     shell: Any, kind: type[BaseException], error: BaseException, traceback: Any, **given: Any
 ):
-    """As IPython calls handlers of exceptions: with ``tb_offset`` among those ``given``."""
+    """Handle an exception in IPython, which passes ``tb_offset`` in ``given``."""
     shell.showtraceback((kind, error, traceback), **given)
     _print(error)
 

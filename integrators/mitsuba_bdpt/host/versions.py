@@ -1,4 +1,4 @@
-"""Versions of what makes an image."""
+"""Versions of the software that rendered an image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .._version import __version__
 
 
 def versions() -> dict[str, str]:
-    """Versions of what has made the image."""
+    """Return the versions of this package, Mitsuba, Dr.Jit and LLVM."""
     found = {"mitsuba-bdpt": __version__}
     found |= {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")}
     if "llvm" in mi.variant():
