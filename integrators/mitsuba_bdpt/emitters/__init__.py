@@ -1,25 +1,24 @@
-"""Light endpoints: how emitters are sampled, and with which densities.
+"""Light endpoints: sampling of emitters, and the densities of it.
 
-Why there are formulas here at all: Mitsuba has no densities of emission, or wrong ones. Its emitters offer no
-density of ``sample_ray``, ``pdf_position`` throws for all of them and ``eval_direction`` for some, a rotated
-``envmap`` emits from the wrong disk, and projectors, spots and directional emitters state no density of
-directions. A bidirectional weight needs all of these for points that other strategies have made. So emission
-is sampled here, by formulas on top of the calls that are right: ``sample_direction``, ``pdf_direction``,
-``eval`` and the shapes' ``sample_position``; where these are wrong too (small spheres, turned spheres, some
-textures), `geometry.mitsubas_choices` says what is done in their place.
+Mitsuba offers no or wrong densities of emission: no density of ``sample_ray``, ``pdf_position`` raises for
+all emitters and ``eval_direction`` for some, a rotated ``envmap`` emits from the wrong disk, and projectors,
+spots and directional emitters have no density of directions. Bidirectional weights need these densities for
+points made by other strategies. Emission is therefore sampled here, on top of the calls that are right:
+``sample_direction``, ``pdf_direction``, ``eval`` and the shapes' ``sample_position``.
+`geometry.mitsubas_choices` lists replacements where these are wrong too.
 
-`emitters.Emitters` selects an emitter and asks the group that it belongs to (`group.Group`: area, directional
-area, position, infinite, hit-only, third-party), one module each, all views of its density together. A new
-kind of emitter is one such module, or a line for an existing one, and a line in the table `kinds.KINDS`.
+`emitters.Emitters` selects an emitter and dispatches to its group (`group.Group`: area, directional area,
+position, infinite, hit-only, third-party), one module each. A new kind of emitter is such a module, or a line
+in an existing one, and a line in `kinds.KINDS`.
 
-Densities of an emission are two factors, in this order:
+The density of an emission has two factors:
 
 * ``pdf_first`` of y_0: area measure on a surface; 1 for a point light (times its selection); solid angle of
   the direction for an emitter at infinity (1 for a directional one).
 * ``pdf_second`` of y_1 given y_0: solid angle (1 for the fixed direction of a directional area); for an
   emitter at infinity the area density across the direction: 1 / (pi R^2) on the disk that covers the scene,
-  or a mixture of that and a disk that covers its details.
+  or a mixture of it and a disk that covers the scene's details.
 
-Names that end in ``_a`` are densities over area, in ``_w`` over solid angle. Next-event estimation has its
-own density of y_0, which depends on the vertex that is lit (cones of spheres, d^2 / cos, environments).
+Suffix ``_a``: density over area; ``_w``: over solid angle. Next-event estimation has its own density of y_0,
+which depends on the lit vertex (cones of spheres, d^2 / cos, environments).
 """

@@ -37,9 +37,8 @@ _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.val
 class _Sphere:
     """How next-event estimation samples a sphere at ``center``.
 
-    By area from within ``inner_radius`` (`quadrics.Sphere.inner_radius`); with the density of
-    `quadrics.cone_pdf_w` if it has a ``cone_radius``, the radius of one that may be so small that Mitsuba's
-    own is wrong. 0 where that does not concern an emitter.
+    By area from within ``inner_radius`` (`quadrics.Sphere.inner_radius`). ``cone_radius``: radius of a sphere
+    that may be so small that Mitsuba's density is wrong and `quadrics.cone_pdf_w` is used. 0: not applicable.
     """
 
     center: mi.Vector3f | tuple = (0, 0, 0)
@@ -48,7 +47,7 @@ class _Sphere:
 
     @staticmethod
     def of(emitter, sphere, extent) -> _Sphere:
-        """That of an emitter in a scene of the diameter ``extent``."""
+        """Parameters of an emitter in a scene of diameter ``extent``."""
         if sphere is None or not is_sampled_by_direction(emitter):
             return _Sphere()
         return _Sphere(
@@ -58,17 +57,17 @@ class _Sphere:
         )
 
 
-# Of emissions whose density is asked relative to the cosine.
+# Lower bound of the cosine that a density is divided by.
 _LEAST_COS = 1e-3
 
 
 @dataclass
 class _Table:
-    """What the table of an area light's emission means.
+    """Coordinates of the guiding table of an area light's emission.
 
-    Of a flat one (``flat`` 1) directions about its normal in the frame ``s``, ``t``, ``n``, which must not
-    depend on who asks: a frame made of a normal is mirrored by the sign of a zero. Of others axes in the
-    world, directions up to their sign.
+    Flat lights (``flat`` 1): directions about the normal in the frame ``s``, ``t``, ``n``, stored because a
+    frame built from a normal is mirrored by the sign of a zero. Curved lights: directions in world space, up
+    to their sign.
     """
 
     s: mi.Vector3f | tuple = (1, 0, 0)
@@ -89,10 +88,9 @@ class _Table:
 
 
 class _Sampled(Enum):
-    """How points of a lamp are chosen.
+    """How points of an area light are sampled.
 
-    ``BY_TEXTURE`` by Mitsuba; ``BY_MAP`` by the texture as well, in `TexturedPoints`; ``BY_SHAPE`` although
-    it is textured.
+    ``BY_TEXTURE`` by Mitsuba; ``BY_MAP`` by the texture in `TexturedPoints`; ``BY_SHAPE`` although textured.
     """
 
     UNIFORMLY = 0
@@ -115,9 +113,9 @@ class _Sampled(Enum):
 class AreaEmitters(Group):
     """Area lights.
 
-    Emission: y_0 uniform on the shape, or by the texture where its density is known (area measure),
-    the direction by the cosine with the shading normal (solid angle). Next-event estimation is Mitsuba's, but
-    for textured lights whose points are chosen here and for spheres.
+    Emission: y_0 uniform on the shape, or by the texture where its density is known (area measure); direction
+    by the cosine with the shading normal (solid angle). Next-event estimation is Mitsuba's, except for
+    spheres and for textured lights whose points are sampled here.
     """
 
     hittable = guidable = True
@@ -159,15 +157,15 @@ class AreaEmitters(Group):
     # -- densities of points ----------------------------------------------------------------
 
     def pdf_a(self, emitter, index, at, n, active):
-        """Density of y_0 in emission (area), without the selection.
+        """Density of y_0 in emission (area measure), without the selection.
 
         ``at`` has ``p`` and ``uv``; ``n`` is its normal.
         """
         density = self._own_pdf_a(index, at.uv, active)
         if not self._by_texture.any:
             return density
-        # Where Mitsuba samples the texture, it tells the area density only to a reference point at unit
-        # distance straight above.
+        # Where Mitsuba samples the texture, it returns the area density only at unit distance along the
+        # normal.
         textured = self._by_texture.at(index, active)
         it = dr.zeros(mi.Interaction3f)
         it.p = at.p + n
@@ -176,7 +174,7 @@ class AreaEmitters(Group):
         return dr.select(textured, emitter.pdf_direction(it, ds, textured), density)
 
     def _own_pdf_a(self, index, uv, active):
-        """`pdf_a` of a lamp whose texture Mitsuba does not sample."""
+        """`pdf_a` of a light whose texture Mitsuba does not sample."""
         density = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
         if not self._textured.mask.any:
             return density
@@ -188,10 +186,10 @@ class AreaEmitters(Group):
 
         Without the selection. Turns ``ds.n``, which callers build for this call alone.
 
-        A sphere with flipped normals samples as from inside up to its radius times 1 + RayEpsilon, but its
-        pdf_direction only up to the radius: wrong for points of the sphere itself.
+        Mitsuba samples a sphere with flipped normals as from inside up to radius (1 + RayEpsilon), but its
+        ``pdf_direction`` only up to the radius: wrong for points of the sphere itself.
         """
-        # Mitsuba masks by the sign of the normal, but which side emits is the shading frame's affair.
+        # Mitsuba masks by the sign of the normal, but the shading frame decides which side emits.
         ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
         by_area = mi.Bool(False)
         if self._redrawn.any:
@@ -202,7 +200,8 @@ class AreaEmitters(Group):
             inside = dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius)
             by_area |= active & (sphere.inner_radius > 0) & inside
             if self._seen_through:
-                # From outside the near half is sampled alone, of one that glows inwards the dark one.
+                # From outside Mitsuba samples only the near half, the dark one of a sphere that emits
+                # inwards.
                 beyond = dr.dot(ds.p - sphere.center, ds.d) > 0
                 pdf_w = dr.select((sphere.inner_radius > 0) & ~inside & beyond, 0, pdf_w)
         cos = dr.abs(dr.dot(ds.d, ds.n))
@@ -214,7 +213,7 @@ class AreaEmitters(Group):
         return pdf_w
 
     def _cone_pdf_w(self, index, p, active):
-        """`quadrics.cone_pdf_w` of the emitter ``index``; 0 for one that is no small sphere."""
+        """`quadrics.cone_pdf_w` of the emitter ``index``; 0 unless it is a small sphere."""
         sphere = look_up(self._spheres, index, active)
         return dr.select(active, cone_pdf_w(sphere.center, sphere.cone_radius, p), 0)
 
@@ -238,12 +237,11 @@ class AreaEmitters(Group):
 
     def factor(self, index, p, d, cos, side, active) -> Factor:
         flat = look_up(self._tables, index, active).flat > 0
-        # Over cos / pi.
         curved = (1 - PLAIN) / (2 * dr.maximum(cos, _LEAST_COS))
         return Factor(dr.select(flat, 1, curved), dr.select(flat, 0, mi.Float(PLAIN)))
 
     def _direction_pdf_w(self, index, cos, d, active):
-        """Density of the direction ``d`` of emission, of the cosine ``cos`` with the shading normal."""
+        """Density (solid angle) of emission along ``d``; ``cos`` with the shading normal."""
         own, guide = dr.maximum(cos, 0) * dr.inv_pi, self.guide
         if guide is None:
             return own
@@ -253,18 +251,18 @@ class AreaEmitters(Group):
         return dr.select(flat, own * density, curved)
 
     def _plain(self, guide: EmissionGuide, index, active):
-        """`PLAIN` of curved lamps with a table, 1 of those without."""
+        """`PLAIN` for curved lights with a table, 1 for those without."""
         return dr.select(guide.is_guided(index, active), PLAIN, 1)
 
     def _sample_direction(self, index, si, u, active):
-        """A direction of emission from ``si``, in the world and in its frame, and its density."""
+        """Sample a direction from ``si``: world, local, density (solid angle)."""
         guide = self.guide
         if guide is None:
             local = mi.warp.square_to_cosine_hemisphere(u)
             return si.to_world(local), local, mi.warp.square_to_cosine_hemisphere_pdf(local)
         known = look_up(self._tables, index, active)
         flat, plain = known.flat > 0, self._plain(guide, index, active)
-        # A curved lamp's table is of axes in the world, which are turned to the side of the normal.
+        # A curved light's table has directions up to their sign: they are turned to the side of the normal.
         by_table = u.x >= plain
         x = dr.select(by_table, (u.x - plain) / (1 - plain), u.x / plain)
         own = si.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, u.y)))
@@ -289,7 +287,7 @@ class AreaEmitters(Group):
         cos = dr.abs(dr.dot(n, d))
         radiance = chosen.emitter.eval(si, active)
         return Emission(
-            # A density that is NaN leaves the weight NaN, to be counted.
+            # A NaN density keeps the weight NaN, to be counted.
             weight=dr.select(pdf_a * pdf_w == 0, 0, radiance * (cos / (pdf_a * pdf_w))),
             d=d,
             anchor=self._surfaces.anchor(chosen, ps.p, n, active),
@@ -307,8 +305,7 @@ class AreaEmitters(Group):
         return self._direction_pdf_w(chosen.index, dr.dot(emission.si.sh_frame.n, d), d, active)
 
     def connection_density(self, chosen: Chosen, emission: Emission, si, active):
-        # Area measure times the squared distance: the solid-angle density at the hit times the geometric
-        # cosine at y_0.
+        # Area measure times squared distance = solid-angle density at the hit times geometric cosine at y_0.
         ds = dr.zeros(mi.DirectionSample3f)
         ds.p, ds.n, ds.uv = emission.si.p, emission.anchor.n, emission.si.uv
         ds.time, ds.d, ds.emitter = emission.si.time, -emission.d, chosen.emitter
@@ -346,9 +343,9 @@ class AreaEmitters(Group):
         )
 
     def _corrected(self, chosen, ds, weight, si, u, active):
-        """A sample of next-event estimation and its weight: Mitsuba's where these are right, else others.
+        """Replace Mitsuba's sample of next-event estimation where it is wrong.
 
-        The density is over solid angle, with the cosine of the shading normal in its denominator.
+        Returns sample, density (solid angle, with the shading normal's cosine in its denominator) and weight.
         """
         emitter, index = chosen.emitter, chosen.index
         if self._redrawn.any:
@@ -377,10 +374,9 @@ class AreaEmitters(Group):
 
 
 def _towards(emitter, ps, si, active):
-    """Sample of next-event estimation by the point ``ps`` of the emitter's shape, and its weight.
+    """Sample of next-event estimation at the emitter point ``ps``, and its weight.
 
-    In Mitsuba's conventions: the density is over the cosine with the shading normal, the weight is radiance
-    over density.
+    As in Mitsuba: the density divides by the shading normal's cosine, the weight is radiance / density.
     """
     ds = dr.zeros(mi.DirectionSample3f)
     ds.p, ds.n, ds.uv, ds.time, ds.emitter = ps.p, ps.n, ps.uv, si.time, emitter
@@ -393,7 +389,7 @@ def _towards(emitter, ps, si, active):
 
 
 def _radiance_over_density(emitter, ds, pdf_w, si, active):
-    """Radiance of the point ``ds`` of an emitter on a surface towards ``si``, over its density ``pdf_w``."""
+    """Radiance of the emitter point ``ds`` towards ``si``, over its density ``pdf_w``."""
     there = mi.SurfaceInteraction3f(ds, si.wavelengths)
     there.wi = there.to_local(-ds.d)
     return dr.select(pdf_w == 0, 0, emitter.eval(there, active) / pdf_w)
@@ -403,7 +399,7 @@ def _radiance_over_density(emitter, ds, pdf_w, si, active):
 
 
 def _tells_its_points(emitter) -> bool:
-    """Whether the points that the shape of an area light samples have a density and a radiance."""
+    """Whether the shape samples points with a density and a known radiance."""
     shape = emitter.get_shape()
     if shape is None:
         raise UnsupportedError(
@@ -424,7 +420,7 @@ def _tells_its_points(emitter) -> bool:
 
 
 def _reads_attributes(texture) -> bool:
-    """Whether a texture reads a mesh's attributes, which need the number of a face; a sample has none."""
+    """Whether a texture reads mesh attributes, which need a face index."""
     if texture.class_name() == "MeshAttribute":
         return True
     inner = (value for value in children(texture).values() if isinstance(value, mi.Texture))
@@ -432,9 +428,9 @@ def _reads_attributes(texture) -> bool:
 
 
 def _check_coordinates(emitter):
-    """Raise ``UsageError`` for a texture on a mesh that has no texture coordinates."""
+    """Raise ``UsageError`` for a texture on a mesh without texture coordinates."""
     shape = emitter.get_shape()
-    # Of the parameters: a shape that Python first met as an emitter's has no methods of meshes.
+    # By parameters: a shape that Python first met as an emitter's has no mesh methods.
     if shape.shape_type() == mi.ShapeType.Mesh.value and not renamed.has_coordinates(own_parameters(shape)):
         raise UsageError(
             f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "

@@ -1,4 +1,4 @@
-"""Directional area lights ("beams"): light that leaves a shape along its normals alone."""
+"""Directional area lights: light that leaves a shape along its normals only."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from .surfaces import Surfaces, spheres_of
 class DirectionalAreaEmitters(Group):
     """Directional area lights.
 
-    Emission: y_0 uniform on the shape (area measure), the direction is the shading normal. No other strategy
-    makes y_0: no point of the scene can be joined with it.
+    Emission: y_0 uniform on the shape (area measure), the direction is the shading normal. No connection
+    reaches y_0.
     """
 
     supports_next_event = connectible_to_sensor = False
@@ -23,7 +23,7 @@ class DirectionalAreaEmitters(Group):
 
     def __init__(self, emitters, context: Context):
         self._surfaces = Surfaces(emitters, context, spheres_of(emitters, context))
-        # Its radiance is told by its texture alone.
+        # Only the texture gives the radiance.
         self._radiances = [(i, children(e)["radiance"]) for i, e in enumerate(emitters) if e is not None]
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:

@@ -1,9 +1,8 @@
-"""Disks from which light subpaths of infinite emitters start, across their direction.
+"""Disks across the direction on which light subpaths from infinity start.
 
-One disk covers the scene. On a large ground few of its subpaths meet what matters, so where the scene has
-details, shapes that are small beside it and lie together, a part of the subpaths starts on a disk that covers
-these. The density is that of the mixture, wherever a strategy asks for it. Where emission is guided (see
-`emission_tables`), tables do the same for details that are not smaller than their cells.
+One disk covers the scene. If the scene has details, shapes that are small beside it and lie together, part of
+the subpaths starts on a second disk that covers these. Every density is that of the mixture. Where emission
+is guided (`emission_tables`), the tables replace the second disk unless the details are smaller than a cell.
 """
 
 from __future__ import annotations
@@ -19,58 +18,54 @@ import numpy as np
 from ..geometry.boxes import boxes
 from .emission_tables import Factor
 
-# A shape is a detail if the longest side of its box is not more than this part of the scene's.
+# Longest side of a detail's bounding box, relative to the scene's.
 DETAIL = 0.25
 
-# Details are aimed at if the radius of the sphere about them is not more than this part of the scene's: else
-# there is little to gain.
+# Largest radius of the details' bounding sphere relative to the scene's; above there is little to gain.
 LOCAL = 0.5
 
-# Details smaller than this, over the scene's size and distance from the origin, are not aimed at: which
-# disk's subpaths pass a point is known up to rounding (6e-8 of these).
+# Smallest radius of the details' sphere relative to the scene's size plus distance from the origin: whether a
+# subpath of a disk passes a point is known up to rounding (6e-8 of the same).
 TINY = 1e-4
 
-# What spheres are larger by, so that surfaces on them are not missed.
+# Relative enlargement of bounding spheres, so that surfaces on them are not missed.
 MARGIN = 1e-4
 
-# Share of the light subpaths that are aimed at details. What is elsewhere loses at most half of its subpaths.
+# Share of the light subpaths aimed at details; the rest of the scene loses at most this share.
 AIMED = 0.5
 
 
 @dataclass
 class BoundingSphere:
-    """A sphere whose outline is a disk: ``center`` and ``radius``.
-
-    Dr.Jit may exchange both without compiling anew.
-    """
+    """Bounding sphere whose outline is a disk; both fields are opaque."""
 
     center: mi.Point3f
     radius: mi.Float
 
     @staticmethod
     def about(sphere) -> BoundingSphere:
-        """A sphere of Mitsuba's, a little larger, as Mitsuba makes it."""
+        """Enlarge Mitsuba's bounding sphere by `MARGIN`, as Mitsuba does."""
         radius = max(float(sphere.radius) * (1 + MARGIN), 1e-30)
         made = BoundingSphere(mi.Point3f(sphere.center), mi.Float(radius))
         dr.make_opaque(made)
         return made
 
     def is_passed(self, p, d):
-        """Mask: the line through ``p`` along ``d`` meets it."""
+        """Mask: the line through ``p`` along ``d`` meets the sphere."""
         offset = p - self.center
         return dr.squared_norm(offset - dr.dot(offset, d) * d) <= dr.square(self.radius)
 
     def pdf_a(self):
-        """Density of a uniform point on its disk across any direction (area)."""
+        """Density (area) of a uniform point on the sphere's disk across any direction."""
         return dr.rcp(dr.pi * dr.square(self.radius))
 
 
 @dataclass
 class Guided:
-    """What guides where subpaths start on a scene's disk.
+    """Guides the start of subpaths on a scene's disk.
 
-    ``warp`` gives numbers for uniform ones, and their density; ``density``: that of a point. ``share`` of the
-    subpaths that are aimed at details.
+    ``share`` of the subpaths aimed at details; ``warp`` maps uniform numbers to guided ones and their
+    density; ``density`` returns that of a point.
     """
 
     share: mi.Float
@@ -79,10 +74,10 @@ class Guided:
 
 
 class Disks:
-    """Disks of a scene: outlines of ``scene`` and ``details``, as `BoundingSphere` objects.
+    """Disks of a scene: outlines of ``scene`` and ``details``.
 
-    ``scene`` is the sphere about all shapes (a unit sphere if no shape has a finite box), ``details`` that
-    about the scene's details, or None if it has none.
+    ``scene``: sphere about all shapes (a unit sphere if no shape has a finite box); ``details``: sphere about
+    the scene's details, or None.
     """
 
     def __init__(self, scene):
@@ -95,7 +90,7 @@ class Disks:
         self.details = BoundingSphere.about(found) if found is not None else None
 
     def share(self, side: int) -> float:
-        """The share of subpaths that are aimed at details beside tables of ``side`` x ``side`` cells.
+        """Share of subpaths aimed at details beside tables of ``side`` x ``side`` cells.
 
         0 if the details are not smaller than a cell, so that the tables can aim at them.
         """
@@ -104,7 +99,7 @@ class Disks:
         return AIMED if dr.slice(self.details.radius) * side < dr.slice(self.scene.radius) else 0.0
 
     def start(self, d, u, guided: Guided | None = None):
-        """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
+        """Sample a subpath's start along ``d`` and its density (area across ``d``)."""
         center, radius, aimed = self.scene.center, self.scene.radius, None
         share = AIMED if guided is None else guided.share
         if self.details is not None:
@@ -125,16 +120,16 @@ class Disks:
         return p, self._pdf_a(p, d, aimed, density, share)
 
     def place(self, p, d):
-        """The numbers for which a subpath along ``d`` that passes ``p`` starts on the scene's disk."""
+        """Primary numbers of a subpath along ``d`` that passes ``p``, on the scene's disk."""
         frame, offset = _frame(d), (p - self.scene.center) / self.scene.radius
         disk = mi.Point2f(dr.dot(frame.s, offset), dr.dot(frame.t, offset))
         return mi.warp.uniform_disk_to_square_concentric(disk)
 
     def pdf_a(self, p, d, density=None, share=AIMED):
-        """Density with which a subpath along ``d`` passes ``p`` (area across ``d``).
+        """Density (area across ``d``) with which a subpath along ``d`` passes ``p``.
 
-        Without details ``p`` is taken to be a point of the scene, else it may be anywhere. ``density``: how
-        many times as dense as uniform points are there on the scene's disk; ``share`` of the details' disk.
+        Without details ``p`` must be a point of the scene, else it may be anywhere. ``density`` on the
+        scene's disk relative to uniform; ``share`` of the details' disk.
         """
         return self._pdf_a(p, d, None, density, share)
 
@@ -145,14 +140,14 @@ class Disks:
         if self.details is None:
             return scene
         in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
-        if aimed is not None:  # on the rim of its disk a point may be outside by rounding
+        if aimed is not None:  # rounding may move a point of its disk's rim outside
             in_scene, in_details = in_scene | ~aimed, in_details | aimed
         return dr.select(in_scene, (1 - share) * scene, 0) + dr.select(
             in_details, share * self.details.pdf_a(), 0
         )
 
     def factor(self, p, d, share: float) -> Factor:
-        """What tables, with a ``share`` beside them, change of the density of subpaths past ``p``."""
+        """Effect of tables on the density of subpaths past ``p``; ``share``: see `share`."""
         if self.details is None:
             return Factor.whole()
         in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
@@ -163,22 +158,19 @@ class Disks:
         return Factor(dr.select(usual, 1, scaled / before), dr.select(usual, 0, kept / before))
 
     def covers(self, p, d):
-        """Mask: light from infinity along ``d`` passes ``p`` after a point where its subpaths start.
-
-        Points of a shape are all covered.
-        """
+        """Mask: light subpaths along ``d`` can pass ``p``; true for all points of shapes."""
         passed = self.scene.is_passed(p, d)
         if self.details is not None:
             passed |= self.details.is_passed(p, d)
         return passed & (dr.dot(p - self.scene.center, d) >= -self.scene.radius)
 
 
-# An odd rotation: frames are mirrored where directions have z = 0 in its axes, which those of users have not.
+# An arbitrary rotation: frames are mirrored where z = 0 in its axes, which scenes' directions avoid.
 _ODD = np.linalg.qr(np.array([[0.61, -0.34, 0.29], [0.17, 0.83, -0.41], [-0.53, 0.26, 0.71]]))[0].tolist()
 
 
 def _frame(d) -> mi.Frame3f:
-    """A frame about ``d`` that does not depend on rounding for directions along axes."""
+    """Frame about ``d``, independent of rounding for directions along axes."""
     x, y, z = (mi.Vector3f(*axis) for axis in _ODD)
     turned = mi.Frame3f(mi.Vector3f(dr.dot(x, d), dr.dot(y, d), dr.dot(z, d)))
     s, t = (v.x * x + v.y * y + v.z * z for v in (turned.s, turned.t))
@@ -186,10 +178,9 @@ def _frame(d) -> mi.Frame3f:
 
 
 def details(found: list, whole):
-    """Bounding sphere of those `boxes` that are small beside the box of the ``whole`` scene.
+    """Bounding sphere of the boxes ``found`` that are small beside ``whole``.
 
-    None if there are none, if they are spread over it (`LOCAL`), or if they are too small for rounding
-    (`TINY`).
+    None if there are none, if they are spread out (`LOCAL`), or too small for rounding (`TINY`).
     """
     size = max(whole.extents())
     small = mi.ScalarBoundingBox3f()

@@ -1,12 +1,12 @@
-"""Guided emission: tables of the densities with which emitters' light subpaths set out.
+"""Guided emission: tables of the densities of emitters' light subpaths.
 
-Emission draws its directions (light from infinity: its points on a disk) from two primary numbers. A table
-over their square says how many times as dense as the emitter itself one is in each cell; its mean is 1. What
-the square of an emitter means is known to the emitter's group, see `group.Group.place`. A sky has a table for
-each of `SKY_BINS` bins of directions. The choice of the emitter is not guided, nor are points on surfaces.
+Emission maps two primary numbers to a direction (light from infinity: to a point on a disk). A table over
+their unit square has in each cell the density relative to unguided emission; its mean is 1.
+`group.Group.place` defines the square of an emitter. An environment has a table for each of `SKY_BINS`^2 bins
+of directions. The choice of the emitter and points on surfaces are not guided.
 
-Everything that makes a path has to know the cell of its emission: one that lies within rounding of an edge of
-its cell may get the neighbour's density from one strategy (1e-6 to 1e-4 of all paths).
+Every strategy looks up the cell of a path's emission; within rounding of a cell's edge one strategy may get
+the neighbour's density (1e-6 to 1e-4 of all paths).
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Cells of a table in each direction, and of all tables together at most; else tables are smaller. (Those of a
-# sky and a sun, 17, still have 24 x 24.)
+# Candidate cells per side, and the most cells of all tables: 24 x 24 still fits an environment and a sun (17
+# tables).
 SIDES = (24, 16, 8, 4)
 MOST_CELLS = 9792
 
-# Bins of directions in each of two dimensions for which light from a sky has tables of its own.
+# Bins per dimension of an environment's directions.
 SKY_BINS = 4
 
-# Densities are kept to 1 / 16 of a power of two: how lanes are added up does not change them.
+# Densities are quantized to 1/16 of a power of two, so that the order of summation does not change them.
 _STEPS, _OFFSET = 16, 128
 
-# Share of the directions of a curved area light that are not by its table but by the cosine.
+# Share of a curved area light's directions sampled by the cosine instead of the table.
 PLAIN = 0.25
 
-# The largest number below 1.
+# Largest float below 1.
 _BELOW_ONE = 1 - 2**-24
 
 
 @dataclass(frozen=True)
 class EmissionTables:
-    """How many times as dense as by itself emission is in each cell of each table.
+    """Density of emission relative to unguided emission, per cell and table.
 
-    ``levels``: a byte for each cell, table by table, of ``side`` x ``side`` cells, packed as text; ``left``:
-    what is predicted to be left of the squared error of light subpaths.
+    ``side``: cells per side; ``levels``: one byte per cell, table by table, compressed to text; ``left``:
+    predicted share of the light subpaths' squared error that remains.
     """
 
     side: int
@@ -52,24 +52,24 @@ class EmissionTables:
 
     @staticmethod
     def of(densities: np.ndarray, left: float) -> EmissionTables:
-        """Those of ``densities``, shape (tables, side, side), all above 0."""
+        """Quantize ``densities``, shape (tables, side, side), all above 0."""
         levels = np.round(np.log2(densities) * _STEPS) + _OFFSET
         made = base64.b64encode(zlib.compress(np.clip(levels, 0, 255).astype(np.uint8).tobytes()))
         return EmissionTables(densities.shape[-1], float(f"{left:.3g}"), made.decode())
 
     def densities(self) -> np.ndarray:
-        """Shape (tables, side, side); the mean of each table is 1."""
+        """Densities, shape (tables, side, side); the mean of each table is 1."""
         levels = np.frombuffer(_unpacked(self.levels), np.uint8).reshape(-1, self.side, self.side)
         values = np.exp2((levels.astype(float) - _OFFSET) / _STEPS)
         return values / values.mean(axis=(1, 2), keepdims=True)
 
     def record(self) -> dict[str, int | float | str]:
-        """As JSON holds them."""
+        """Return a dictionary that JSON can hold."""
         return asdict(self)
 
     @staticmethod
     def read(record: Any) -> EmissionTables:
-        """What was `record`-ed; raises ``ValueError`` or ``TypeError`` for anything else."""
+        """Inverse of `record`; raises ``ValueError`` or ``TypeError`` for invalid input."""
         if not isinstance(record, dict) or set(record) != {"side", "left", "levels"}:
             raise TypeError(f"emission={record!r} is no table of emission")
         side, left, levels = (record[name] for name in ("side", "left", "levels"))
@@ -91,13 +91,13 @@ def _unpacked(levels: str) -> bytes:
 
 
 def side_of(tables: int) -> int:
-    """Cells in each direction of each of so many tables; 0 if these are too many."""
+    """Cells per side of ``tables`` tables; 0 if these are too many."""
     return next((side for side in SIDES if tables * side**2 <= MOST_CELLS), 0) if tables else 0
 
 
 @dataclass
 class Place:
-    """Where an emission lies: in which of its emitter's tables (``bin``), and where in the square (``u``)."""
+    """Table (``bin``) of an emission, and its point ``u`` of the unit square."""
 
     bin: mi.UInt32
     u: mi.Point2f
@@ -105,22 +105,22 @@ class Place:
 
 @dataclass
 class Factor:
-    """By what a table changes the density of an emission: to ``kept`` + ``scaled`` r times its own."""
+    """Effect of a table's density r on emission: factor ``kept`` + ``scaled`` r."""
 
     scaled: mi.Float
     kept: mi.Float
 
     @staticmethod
     def whole() -> Factor:
-        """All of it is by the table."""
+        """The table's density applies to all of the emission."""
         return Factor(mi.Float(1), mi.Float(0))
 
 
 @dataclass
 class Cell:
-    """Where an emission lies among all tables.
+    """Cell of an emission: its ``number`` in all tables, and the `Factor`.
 
-    ``number`` of its cell, whether its emitter has a table (``known``), and the `Factor`.
+    ``known``: its emitter has a table.
     """
 
     number: mi.UInt32
@@ -129,7 +129,7 @@ class Cell:
 
 
 def cell_at(u: mi.Point2f, side: int) -> mi.UInt32:
-    """The number of the cell at ``u`` in a table of ``side`` x ``side``."""
+    """Index of the cell at ``u`` in a table of ``side`` x ``side``."""
     at = mi.Point2u(dr.clip(u, 0, _BELOW_ONE) * side)
     return mi.UInt32(dr.minimum(at.y, side - 1) * side + dr.minimum(at.x, side - 1))
 
@@ -137,7 +137,7 @@ def cell_at(u: mi.Point2f, side: int) -> mi.UInt32:
 class EmissionGuide:
     """`EmissionTables` that a kernel can index.
 
-    ``first`` table of each emitter, from 1 on: table 0 is that of emitters that are not guided, uniform.
+    ``first``: index of each emitter's first table, from 1; table 0 is uniform, for unguided emitters.
     """
 
     def __init__(self, tables: EmissionTables, first: mi.UInt32):
@@ -153,7 +153,7 @@ class EmissionGuide:
         dr.make_opaque(self._densities, self._within, self._below)
 
     def is_guided(self, index: mi.UInt32, active) -> mi.Bool:
-        """Mask: the emitter of this ``index`` has tables."""
+        """Mask: the emitter with this ``index`` has tables."""
         return dr.gather(mi.UInt32, self._first, index, active) > 0
 
     def _table(self, index: mi.UInt32, which: mi.UInt32, active) -> mi.UInt32:
@@ -161,16 +161,17 @@ class EmissionGuide:
         return dr.select(first > 0, first + which, 0)
 
     def density(self, index: mi.UInt32, place: Place, active) -> mi.Float:
-        """How many times as dense as by itself the emission of the emitter ``index`` is at ``place``."""
+        """Density of emission at ``place`` relative to unguided emission."""
         table = self._table(index, place.bin, active)
         return dr.gather(
             mi.Float, self._densities, table * self.side**2 + cell_at(place.u, self.side), active
         )
 
     def warp(self, index: mi.UInt32, which: mi.UInt32, u: mi.Point2f, active) -> tuple[mi.Point2f, mi.Float]:
-        """Primary numbers as the table ``which`` of the emitter ``index`` distributes them, for uniform ones.
+        """Map uniform numbers to those of a table; also returns their relative density.
 
-        Also their density. Neighbours stay neighbours: points that are well distributed stay so.
+        ``which``: table of the emitter ``index``. The map is monotonic per dimension, which preserves
+        stratification.
         """
         table = self._table(index, which, active)
         row, y = _found(self._below, table * self.side, self.side, u.y, active)
@@ -181,9 +182,9 @@ class EmissionGuide:
 
 
 def _found(sums: mi.Float, begin: mi.UInt32, side: int, u: mi.Float, active) -> tuple[mi.UInt32, mi.Float]:
-    """The cell of a row of cells with these ``sums`` in which ``u`` lies, and the number there in [0, 1)."""
+    """Cell of a row with cumulative ``sums`` that contains ``u``; the warped number."""
     at = mi.UInt32(0)
-    cells = side  # in which it may lie, from ``at`` on
+    cells = side  # number of candidate cells from ``at`` on
     while cells > 1:
         step = cells // 2
         beyond = dr.gather(mi.Float, sums, begin + at + (step - 1), active) <= u

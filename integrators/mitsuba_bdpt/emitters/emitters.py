@@ -1,6 +1,6 @@
-"""The scene's emitters: which of them is chosen, and the group that is asked about it.
+"""The scene's emitters: selection, and dispatch to their groups.
 
-See the head of the room for the densities, `group.Group` for what a group answers.
+See the subpackage's docstring for densities, `group.Group` for the methods of a group.
 """
 
 from __future__ import annotations
@@ -30,23 +30,22 @@ from .tables import Mask, inverse_table
 class Emitters:
     """The scene's emitters as tables that a kernel can index.
 
-    Built anew for each render, so that edits of the scene count. Raises ``UsageError`` and
-    ``UnsupportedError`` for emitters of which Mitsuba's own calls contradict each other.
+    Built for each render, so that edits of the scene count. Raises ``UsageError`` and ``UnsupportedError``
+    for emitters for which Mitsuba's own sampling and evaluation disagree.
 
-    What the scene's ``count`` emitters can do, decided from all of them: ``hittable``, ``direct``,
-    ``traced``, ``connectible_to_sensor``: camera subpaths can hit one, next-event estimation can choose one,
-    light subpaths can start from one, one of these points can be joined with a sensor;
-    ``connectible_nearby``: one of the latter is not at infinity; ``unhittable``: one
-    cannot be hit; ``unhittable_connectible``: indices of those that cannot be hit and whose point can be
-    joined with a sensor; ``finite_hittable``: one that can be hit and joined is not at infinity;
-    ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity, ``far_share`` of
-    them do; ``beams``: one can be reached only by the light subpaths that it starts; ``evaluated``: one
-    that lives, be it in another scene, makes it necessary to record kernels without symbolic loops, calls
-    and branches.
-    ``left_out``: what single ones cannot take part in, and why. ``groups`` that the scene has; ``disks``
-    where light subpaths from infinity start, if any do; ``shape_errors`` of the scene, for rays.
-    ``table_count``: tables that guide emission (`emission_tables`), ``side`` of those that know the `cell` of
-    an emission (else 0).
+    Properties of the scene's ``count`` emitters:
+
+    * ``hittable``, ``unhittable``: camera subpaths can hit one; cannot hit one.
+    * ``direct``, ``traced``: next-event estimation, light subpaths can choose one.
+    * ``connectible_to_sensor``: y_0 of one can be connected to a sensor; ``connectible_nearby``: of one that
+      is not at infinity; ``unhittable_connectible``: indices of those that cannot be hit;
+      ``finite_hittable``: one can be hit and connected, and is not at infinity.
+    * ``on_shapes``: one is on a shape; ``at_infinity``, ``far_share``: light subpaths can start at infinity,
+      and the share that does; ``beams``: only its own light subpaths reach one.
+    * ``evaluated``: an emitter in the process, even of another scene, requires evaluated loops and calls.
+    * ``left_out``: strategies that single emitters lack, with reasons.
+    * ``groups`` of the scene; ``disks``: where light subpaths from infinity start, or None; ``shape_errors``.
+    * ``table_count``: tables of guided emission; ``side`` of the tables that `cell` refers to (else 0).
     """
 
     def __init__(self, scene: mi.Scene, facts: ShapeFacts | None = None):
@@ -66,7 +65,7 @@ class Emitters:
         self._pointers = scene.emitters_dr()
         sampling_weight = mi.Float(weights)
         self._pmf, self._inverse = sampling_weight / dr.sum(sampling_weight), inverse_table(self._pointers)
-        dr.schedule(self._pmf)  # so that groups' tables and it are one kernel
+        dr.schedule(self._pmf)  # one kernel with the groups' tables
         context = Context(scene, facts, self._cannot_be_asked(registered))
         present = [group for group in GROUPS if group in types]
         self.groups = tuple(
@@ -83,7 +82,7 @@ class Emitters:
         dr.make_opaque(self._group, self._pmf, self._inverse)
 
     def _summarize(self, emitters, types, weights):
-        """What the emitters of these groups (``types``) can do together."""
+        """Set the properties that depend on all emitters; ``types``: their groups."""
         hittable = [t.is_hittable(e) for e, t in zip(emitters, types, strict=True)]
         self._hittable_types = {t for t, h in zip(types, hittable, strict=True) if h}
         self.count = len(emitters)
@@ -111,9 +110,9 @@ class Emitters:
         ]
 
     def _cannot_be_asked(self, registered: list[str]) -> bool:
-        """Whether `sample_position` cannot be called on emitters, of these classes in the process.
+        """Whether the virtual call `sample_position` fails.
 
-        A call visits every living one, those of other scenes too, and classes of the user's need not have it.
+        It visits every emitter in the process (classes ``registered``), and user-defined classes may lack it.
         """
         if not any(map(is_third_party, registered)):
             return False
@@ -125,18 +124,18 @@ class Emitters:
 
     @cached_property
     def contrast(self) -> float:
-        """The largest `infinite.contrast`: infinite unless all light comes from environments."""
+        """Largest `infinite.contrast`; infinite unless all light comes from environments."""
         return max((contrast(emitter) for emitter in self.scene.emitters()), default=math.inf)
 
     # -- guided emission --------------------------------------------------------------------
 
     @property
     def table_count(self) -> int:
-        """How many tables guide the emission of all emitters."""
+        """Number of tables that guide the emission of all emitters."""
         return sum(self.tables)
 
     def placed(self, tables: EmissionTables | None = None) -> Emitters:
-        """A copy that knows the `cell` of an emission, and is guided by ``tables`` if there are some.
+        """Return a copy that has `cell`, guided by ``tables`` if given.
 
         Raises ``UsageError`` for tables of other emitters.
         """
@@ -163,9 +162,9 @@ class Emitters:
         return other
 
     def cell(self, index: mi.UInt32, p, d, cos, active: mi.Bool) -> Cell:
-        """Where emissions of the emitters ``index`` lie that pass ``p`` along ``d``.
+        """Cells of emissions of the emitters ``index`` that pass ``p`` along ``d``.
 
-        ``cos`` of the geometric normal. Asked of copies that `placed` has made.
+        ``cos`` with the geometric normal. Only for copies made by `placed`.
         """
         first = dr.gather(mi.UInt32, self.first, index, active)
 
@@ -186,7 +185,6 @@ class Emitters:
         return self._chosen(index, active), u
 
     def _chosen(self, index, active) -> Chosen:
-        """The emitters of these indices."""
         emitter = dr.gather(mi.EmitterPtr, self._pointers, index, active)
         pmf = dr.gather(mi.Float, self._pmf, index, active) if self.count > 1 else mi.Float(1)
         return Chosen(emitter, index, pmf)
@@ -199,12 +197,11 @@ class Emitters:
         active: mi.Bool,
         possible: Sequence[Group] | None = None,
     ):
-        """The answer of each lane's group to ``question(group, mask)``.
+        """Return the result of ``question(group, mask)`` for each lane's group.
 
-        ``answering``: groups that have one; for emitters of other groups the answer has no meaning.
-        ``possible``: those that the emitters ``index`` can be of, all if left out. What only one group can
-        answer is recorded without a choice, and nothing is recorded of groups that the scene has not. Raises
-        ``ValueError`` where no group has an answer.
+        ``answering``: groups that have a result; lanes of other groups are undefined. ``possible``: groups
+        that ``index`` may refer to (default: all). A single group is recorded without a branch. Raises
+        ``ValueError`` if ``answering`` is empty.
         """
         possible = self.groups if possible is None else possible
 
@@ -222,7 +219,7 @@ class Emitters:
         return found
 
     def _supporting(self, capability: str) -> list[Group]:
-        """The scene's groups with this attribute."""
+        """Return the scene's groups with this capability."""
         return [group for group in self.groups if getattr(group, capability)]
 
     def covers(self, p, d):
@@ -234,8 +231,8 @@ class Emitters:
     def sample_emission(self, u_point, u_direction, shared, active) -> Emission:
         """Sample y_0 and the direction to y_1.
 
-        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction; ``shared`` carries time
-        and wavelengths.
+        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction; ``shared`` carries time and
+        wavelengths.
         """
         chosen, u_x = self._select(u_point.x, active)
         u_point = mi.Point2f(u_x, u_point.y)
@@ -247,19 +244,19 @@ class Emitters:
         )
         e.pdf_first *= chosen.pmf
         e.weight = dr.select(chosen.pmf > 0, e.weight / chosen.pmf, 0)
-        if not self._starts.all:  # chosen with the probability of next-event estimation, and left
+        if not self._starts.all:  # selected with next-event estimation's probability, but emits nothing
             e.weight = dr.select(self._starts.at(chosen.index, active), e.weight, 0)
         return e
 
     def traces(self, index: mi.UInt32, active: mi.Bool) -> mi.Bool:
-        """Mask of those lanes where light subpaths start from the emitter ``index``."""
+        """Mask: light subpaths start from the emitter ``index``."""
         return self._starts.at(index, active)
 
     def connection_density(self, emission: Emission, si, active):
-        """Density of next-event estimation making y_0 of ``emission`` from its first hit ``si``.
+        """Density of sampling y_0 of ``emission`` by next-event estimation at ``si``.
 
-        In the measure of ``pdf_first``, times the squared length of the edge (1 at infinity): on
-        surfaces that is the solid-angle density at the hit times the geometric cosine at y_0.
+        From the first hit ``si``, in the measure of ``pdf_first``, times the squared length of the edge (1 at
+        infinity): on surfaces the solid-angle density at the hit times the geometric cosine at y_0.
         """
         chosen = self._chosen(emission.index, active)
         return self._ask(
@@ -270,7 +267,7 @@ class Emitters:
         )
 
     def direction_density(self, emission: Emission, p, d, active):
-        """Density with which emission from y_0 goes along ``d`` to ``p``, in ``pdf_second``'s measure."""
+        """Density of emission from y_0 along ``d`` to ``p``, in ``pdf_second``'s measure."""
         chosen = self._chosen(emission.index, active)
         return self._ask(
             lambda group, mask: group.direction_density(chosen, emission, p, d, mask),
@@ -280,10 +277,7 @@ class Emitters:
         )
 
     def radiance_towards(self, emission: Emission, d, active):
-        """What y_0 sends into direction ``d``, for joining it with the sensor.
-
-        Radiance, intensity (point) or irradiance (delta direction).
-        """
+        """Radiance, intensity (point) or irradiance (delta direction) of y_0 along ``d``."""
         chosen = self._chosen(emission.index, active)
         return self._ask(
             lambda group, mask: group.radiance_towards(chosen, emission, d, mask),
@@ -295,7 +289,7 @@ class Emitters:
     # -- next-event estimation --------------------------------------------------------------
 
     def sample_direct(self, si, u, active) -> Direct:
-        """Sample y_0 for the camera vertex ``si`` with ``u`` in [0, 1)^2 (reused for selection)."""
+        """Sample y_0 for the camera vertex ``si``; ``u`` in [0, 1)^2 also selects."""
         chosen, u_x = self._select(u.x, active)
         u = mi.Point2f(u_x, u.y)
         asked = active if self._asks.all else self._asks.at(chosen.index, active)
@@ -308,7 +302,7 @@ class Emitters:
         )
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
-        if self.side:  # branches would carry it along
+        if self.side:  # only then: branches would carry it along
             direct.index = chosen.index
         if self.shape_errors.small:
             direct.met = rounding.met(chosen.emitter.get_shape())
@@ -325,19 +319,19 @@ class Emitters:
         return dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)
 
     def hit_cell(self, si, previous, active) -> Cell:
-        """`cell` of the emitter point that was hit, see `hit_densities`."""
+        """`cell` of the emitter point hit; see `hit_densities`."""
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))
         d = dr.select(si.is_valid(), dr.normalize(previous - si.p), mi.Vector3f(si.wi))
         return self.cell(self._index_of(emitter, active), previous, d, dr.abs(dr.dot(si.n, d)), active)
 
     def hit_densities(self, si, previous, active):
-        """Densities with which light-side strategies make the hit emitter point.
+        """Densities of the light-side strategies at the emitter point hit.
 
-        ``previous`` is the position of the camera vertex before. Returns ``(connect, first, second)``:
-        next-event estimation from ``previous`` and ``pdf_first`` of emission (area measure on surfaces, solid
-        angle at infinity; selection included), and ``pdf_second`` towards ``previous`` (solid angle on
-        surfaces, area across the direction at infinity).
+        ``previous``: position of the camera vertex before. Returns ``(connect, first, second)``, selection
+        included: next-event estimation from ``previous`` and ``pdf_first`` of emission (area measure on
+        surfaces, solid angle at infinity), and ``pdf_second`` towards ``previous`` (solid angle on surfaces,
+        area across the direction at infinity).
         """
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))

@@ -1,4 +1,4 @@
-"""Area lights whose points cannot be sampled, or tell no radiance."""
+"""Area lights whose points cannot be sampled, or have unknown radiance."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from .records import Chosen, Hit
 
 
 class HitOnlyEmitters(Group):
-    """Area lights that camera subpaths can hit, and no more.
+    """Area lights that camera subpaths can hit, and no other strategy.
 
-    They are on shapes of which Mitsuba samples no points, or have a radiance that only a hit has (attributes
-    of a mesh). They may be chosen by emission and by next-event estimation, with the probability of their
-    sampling weight: the sample is black.
+    They are on shapes of which Mitsuba samples no points, or their radiance needs a hit (mesh attributes).
+    Emission and next-event estimation may select them, by their sampling weight: the sample is black.
     """
 
     hittable = True

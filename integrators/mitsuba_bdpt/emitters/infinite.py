@@ -17,16 +17,16 @@ from .group import Context, Group, emitting_point, free_emission, weight_over
 from .records import Chosen, Direct, Emission, Hit
 from .tables import Mask, rows
 
-# Numbers of an environment map that are looked at for its contrast, at most: 4 ms.
+# Largest environment map (values) whose contrast is computed.
 _QUICKLY_READ = 1 << 20
 
 
 class InfiniteEmitters(Group):
     """Environments and directional emitters.
 
-    Emission: the direction as Mitsuba's next-event estimation samples it (solid angle; fixed for a
-    directional one), then a point on `Disks` across it (area). So both densities of the direction are the
-    same, whatever the lit vertex. ``disks``: where light subpaths start.
+    Emission: the direction as in Mitsuba's next-event estimation (solid angle; fixed for a directional
+    emitter), then a point on `Disks` across it (area). Both densities of the direction are thus equal,
+    whatever the lit vertex. ``disks``: where light subpaths start.
     """
 
     hittable = at_infinity = guidable = True
@@ -52,7 +52,7 @@ class InfiniteEmitters(Group):
     # -- points of emission -----------------------------------------------------------------
 
     def _bin(self, index, d, active):
-        """In which table of an emitter light along ``d`` is."""
+        """Index of the emitter's table for light along ``d``."""
         directional = self._directional.at(index, active)
         return dr.select(directional, 0, cell_at(mi.warp.uniform_sphere_to_square(d), SKY_BINS))
 
@@ -63,18 +63,18 @@ class InfiniteEmitters(Group):
         return self.disks.factor(p, d, self.disks.share(side))
 
     def _share(self, guide, index, active):
-        """The share of subpaths that are aimed at details, of emitters with and without a table."""
+        """Share of subpaths aimed at details, for emitters with and without a table."""
         return dr.select(guide.is_guided(index, active), self.disks.share(guide.side), AIMED)
 
     def _point_pdf_a(self, index, p, d, active, sign=1):
-        """Density with which a subpath along ``d``, times ``sign``, passes ``p`` (area across ``d``)."""
+        """Density (area across ``d``) of a subpath along ``d * sign`` passing ``p``."""
         if self.guide is None:
             return self.disks.pdf_a(p, d)
         density = self.guide.density(index, self.place(index, p, d * sign, active), active)
         return self.disks.pdf_a(p, d, density, self._share(self.guide, index, active))
 
     def _sample_point(self, index, d, u, active):
-        """A point from which a subpath along ``d`` starts, and its density (area across ``d``)."""
+        """Sample the start of a subpath along ``d``, and its density (area across ``d``)."""
         guide = self.guide
         if guide is None:
             return self.disks.start(d, u)
@@ -119,7 +119,7 @@ class InfiniteEmitters(Group):
             si.t = mi.Float(dr.inf)
             value = chosen.emitter.eval(si, active & ~directional)
         if self._directional.any:
-            # weight = E / (pdf_first pdf_second) with the selection
+            # weight = E / (pdf_first pdf_second), selection included
             density = emission.pdf_first * emission.pdf_second
             value = dr.select(directional, emission.weight * density, value)
         return value
@@ -149,10 +149,10 @@ def _is_directional(emitter) -> bool:
 
 
 def contrast(emitter) -> float:
-    """The largest radiance of an environment over its mean; infinite where that is not known.
+    """Ratio of an environment's largest radiance to its mean; infinite if unknown.
 
-    Infinite, that is, for other emitters, where it would take long to find out, and where the numbers of an
-    ``envmap`` are not radiances or not finite. 1 for one that is black everywhere.
+    Infinite for other emitters, for large maps, and where the values of an ``envmap`` are not radiances or
+    not finite. 1 if it is black.
     """
     kind = emitter.class_name()
     if kind == "ConstantBackgroundEmitter":
@@ -165,6 +165,6 @@ def contrast(emitter) -> float:
     pixels = np.array(data).max(axis=-1)
     rings = np.sin(np.pi * (np.arange(len(pixels)) + 0.5) / len(pixels))
     mean = float((pixels.mean(axis=1) @ rings) / rings.sum())
-    if not pixels.any():  # black everywhere
+    if not pixels.any():
         return 1.0
     return float(pixels.max()) / mean if 0 < mean < math.inf else math.inf

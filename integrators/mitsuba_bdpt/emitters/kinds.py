@@ -1,4 +1,4 @@
-"""Which group of emitters each class belongs to, by what its ``class_name()`` returns."""
+"""Maps the ``class_name()`` of an emitter to its group."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ KINDS: dict[str, type[Group]] = {
     "TimedSunskyEmitter": InfiniteEmitters,
 }
 
-# Classes of Mitsuba's own, which have all calls. (Virtual calls visit every emitter in the process: one of
-# another class that has a group above still need not have ``sample_position``.)
+# Mitsuba's own classes, which have all calls. Virtual calls visit every emitter in the process, and a
+# user-defined class may lack ``sample_position``.
 MITSUBAS = frozenset(KINDS)
 
-# In the order in which a kernel asks them.
+# In the order of dispatch in a kernel.
 GROUPS: tuple[type[Group], ...] = (*dict.fromkeys(KINDS.values()), HitOnlyEmitters, ThirdPartyEmitters)
 
 
 def group_of(emitter) -> type[Group]:
-    """The group of an emitter; raises what `Group.of` does."""
+    """Return the group of an emitter; raises as `Group.of` does."""
     return KINDS.get(emitter.class_name(), ThirdPartyEmitters).of(emitter)
 
 
@@ -43,14 +43,11 @@ def is_third_party(class_name: str) -> bool:
 
 
 def third_party_elsewhere(scene) -> int:
-    """How many emitters outside of ``scene`` are of a class that is not Mitsuba's.
-
-    Virtual calls visit them too.
-    """
+    """Number of user-defined emitters outside ``scene``; virtual calls visit them."""
     own = sum(is_third_party(emitter.class_name()) for emitter in scene.emitters())
     return sum(map(is_third_party, registered_emitters())) - own
 
 
 def needs_evaluation(class_name: str) -> bool:
-    """Whether calls of such an emitter fail while a kernel is recorded: it asks for the value of a mask."""
+    """Whether calls of such an emitter cannot be recorded, since it evaluates a mask."""
     return class_name == "TimedSunskyEmitter"

@@ -20,11 +20,11 @@ from .tables import Mask, look_up, rows, table
 
 @dataclass
 class _Cone:
-    """Position of an emitter and the cone into which it shines, all directions for a point light.
+    """Position of an emitter and its cone of directions (all for a point light).
 
     ``position`` (world); the axes ``x``, ``y``, ``z`` of the cone (unit length), the cosine ``cos_cutoff`` of
-    its half angle, and the density ``pdf_w`` of a direction within (solid angle). Of a projector ``position``
-    alone counts.
+    its half angle, and the density ``pdf_w`` of a direction within (solid angle). Projectors use ``position``
+    alone.
     """
 
     position: mi.Vector3f | tuple = (0, 0, 0)
@@ -36,7 +36,7 @@ class _Cone:
 
 
 class PositionEmitters(Group):
-    """Emitters at a point: their intensity is asked of Mitsuba, their density of directions is known here.
+    """Emitters at a point: intensity by Mitsuba, density of directions by formulas.
 
     Emission: y_0 is the position; the direction is uniform in a cone, or a projector's own (solid angle).
     """
@@ -54,7 +54,7 @@ class PositionEmitters(Group):
         self._projectors = Projectors.of(emitters, projects)
 
     def _direction_pdf_w(self, index, d, active):
-        """Density of the emission into the direction ``d`` (solid angle)."""
+        """Density (solid angle) of emission along ``d``."""
         pdf_w = dr.gather(mi.Float, self._cones.pdf_w, index, active)
         if self.guide is not None:
             pdf_w *= self.guide.density(index, self.place(index, None, d, active), active)
@@ -114,7 +114,7 @@ class PositionEmitters(Group):
 
 
 def _intensity(emitter, p, d, shared, active):
-    """Intensity of an emitter at the point ``p`` into direction ``d``, by its own calls."""
+    """Intensity of an emitter at ``p`` along ``d``, from its ``sample_direction``."""
     far = 1 + dr.max(dr.abs(p))  # keeps the probe's relative rounding small away from 0
     it = dr.zeros(mi.Interaction3f)
     it.p, it.time, it.wavelengths = p + d * far, shared.time, shared.wavelengths

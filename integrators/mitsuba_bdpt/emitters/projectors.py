@@ -11,14 +11,14 @@ from ..host.introspection import children, matrix_of, own_parameters
 
 
 class Projectors:
-    """What the scene's projectors send into each direction, as densities: Mitsuba offers none.
+    """Densities of the directions of the scene's projectors, which Mitsuba lacks.
 
-    A projector's ``uv`` is an affine map of (x / z, y / z) about its axis, read off its own answers.
+    A projector's ``uv`` is an affine map of (x / z, y / z) about its axis, measured by probes.
     """
 
     @staticmethod
     def of(emitters, projects):
-        """Those of ``emitters`` for which ``projects`` is true, or None if there are none."""
+        """Return the projectors among ``emitters`` (flags ``projects``), or None."""
         found = [(i, e) for i, (e, p) in enumerate(zip(emitters, projects, strict=True)) if p]
         return Projectors(found) if found else None
 
@@ -26,7 +26,7 @@ class Projectors:
         self._rows = [(index, _Projector(emitter)) for index, emitter in projectors]
 
     def sample(self, index, u, active):
-        """Direction (world, unit length) and its density (solid angle) from the projector ``index``."""
+        """Sample a direction (world, unit length) and its density (solid angle)."""
         d, pdf_w = mi.Vector3f(0, 0, 1), mi.Float(1)
         for number, projector in self._rows:
             mask = active & (index == number)
@@ -35,7 +35,7 @@ class Projectors:
         return d, pdf_w
 
     def pdf_w(self, index, d, active):
-        """Density (solid angle) of the direction ``d`` from the projector ``index``; 0 for others."""
+        """Density (solid angle) of ``d`` from the projector ``index``; 0 for others."""
         pdf_w = mi.Float(0)
         for number, projector in self._rows:
             mask = active & (index == number)
@@ -44,16 +44,16 @@ class Projectors:
 
 
 class _Projector:
-    """One projector: its axes, the affine map to ``uv`` and back, and the texture it chooses directions by.
+    """One projector: unit axes, affine map to ``uv`` and back, sampled texture.
 
-    The axes ``x``, ``y``, ``z`` have unit length. The texture is None where it would miss some directions:
-    with ``to_uv`` Mitsuba's textures sample another image than they show.
+    The texture is None where it would miss directions: with ``to_uv`` Mitsuba's textures sample another image
+    than they show.
     """
 
     def __init__(self, emitter):
         check_angles(emitter)
         matrix = matrix_of(emitter)
-        # So far away that the rounding of the probes' coordinates does not count.
+        # Far enough for the rounding of the probes' coordinates not to matter.
         far = (1 + np.abs(matrix[:3, 3]).max()) / np.linalg.norm(matrix[:3, 2])
         probes = matrix @ np.array([[0, 0, far, 1], [far, 0, far, 1], [0, far, far, 1]], dtype=np.float64).T
         it = dr.zeros(mi.Interaction3f, 3)
@@ -71,7 +71,7 @@ class _Projector:
         self._texture = texture if texture.is_spatially_varying() and _is_as_it_was(texture) else None
 
     def sample(self, u, active):
-        """Direction and its density (solid angle)."""
+        """Sample a direction and its density (solid angle)."""
         uv, pdf = mi.Point2f(u), mi.Float(1)
         if self._texture is not None:
             uv, pdf = self._texture.sample_position(u, active)

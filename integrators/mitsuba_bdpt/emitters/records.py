@@ -1,4 +1,4 @@
-"""What every group of emitters tells a kernel: emissions and samples of next-event estimation."""
+"""Records that groups of emitters return to a kernel."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ..geometry import rays
 
 @dataclass
 class Chosen:
-    """The emitters that the lanes have chosen.
+    """The selected emitters.
 
-    ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` the probability of the selection.
+    ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` probability of the selection.
     """
 
     emitter: mi.EmitterPtr
@@ -24,14 +24,14 @@ class Chosen:
 
 @dataclass
 class Emission:
-    """Start of a light subpath; all fields have the width of the lanes.
+    """Start of a light subpath.
 
-    ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start
-    of the ray, with position and geometric normal of y_0 as a hit reports it (zero unless on a surface);
-    ``cos`` geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the room's head;
-    ``infinite`` and ``delta`` masks (delta: no camera subpath can hit it); ``beam`` mask: ``d`` is the only
-    direction that leaves y_0, so that nothing can be joined with y_0; ``index`` of the emitter; ``si`` the
-    emitting point for Mitsuba's calls.
+    ``weight`` emitted radiance x cosine / all densities; ``d`` direction of travel; ``anchor`` start of the
+    ray, with position and geometric normal of y_0 as a hit reports it (zero unless on a surface); ``cos``
+    geometric cosine at y_0 (1 off surfaces); ``pdf_first``, ``pdf_second`` see the subpackage's docstring;
+    ``infinite``, ``delta`` masks (delta: no camera subpath can hit it); ``beam`` mask: ``d`` is the only
+    direction that leaves y_0, so that y_0 cannot be connected; ``index`` of the emitter; ``si`` the emitting
+    point for Mitsuba's calls.
     """
 
     weight: mi.Spectrum
@@ -51,13 +51,13 @@ class Emission:
 class Direct:
     """A sample of next-event estimation: y_0 for a given camera vertex.
 
-    ``weight`` radiance / ``pdf_w``; ``pdf_w`` solid angle at the camera vertex with the selection, or
-    the selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of
-    the visibility ray (unused where ``infinite``), ``met`` the number of its shape (None if the scene has
-    none so small that the ray asks for it, see `rounding.SMALL`); ``emission_ratio`` is
-    pdf_first pdf_second / (density of y_0 in the measure of pdf_first, times the squared distance; 1 at
-    infinity), to be multiplied by the geometric cosine at the camera vertex: the ratio of the densities of
-    s = 2 and s = 1, but for that with which the camera subpath made the vertex; ``index`` of the emitter.
+    ``weight`` radiance / ``pdf_w``; ``pdf_w`` solid angle at the camera vertex with the selection, or the
+    selection alone where ``delta``; ``d`` unit direction to the emitter; ``anchor`` far end of the shadow ray
+    (unused where ``infinite``); ``met`` index of its shape (None unless the scene has shapes below
+    `rounding.SMALL`); ``emission_ratio``: pdf_first pdf_second / (density of y_0 in the measure of pdf_first,
+    times the squared distance; 1 at infinity), which times the geometric cosine at the camera vertex is the
+    ratio of the densities of s = 2 and s = 1, without the camera subpath's density of the vertex; ``index``
+    of the emitter.
     """
 
     weight: mi.Spectrum
@@ -73,9 +73,9 @@ class Direct:
 
 @dataclass
 class Hit:
-    """An emitter point ``si`` that a camera subpath has hit, or missed into, in the ``scene``.
+    """The emitter point ``si`` that a camera subpath has hit, or missed into.
 
-    ``previous`` is the vertex that it comes from; both are as Mitsuba's calls take them.
+    ``previous``: the vertex before; both as Mitsuba's calls take them.
     """
 
     scene: mi.Scene
@@ -89,5 +89,5 @@ class Hit:
         return ds
 
     def to_area(self, ds):
-        """What turns the density of ``ds`` from solid angle into area."""
+        """Factor that converts the density of ``ds`` from solid angle to area."""
         return dr.abs(dr.dot(self.si.n, ds.d)) / dr.square(ds.dist)

@@ -1,4 +1,4 @@
-"""Points on the shapes of emitters, and their normals, which Mitsuba does not give everywhere."""
+"""Points on the shapes of emitters, with the normals that hits report."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from .textured import TexturedPoints
 
 @dataclass
 class _Turned:
-    """A sphere whose sampled normals are turned with its points.
+    """A sphere whose sampled normals have to be turned with its points.
 
-    ``outward``: see `Sphere`; 0 where normals are right as they are.
+    ``outward``: see `Sphere`; 0 where normals are right.
     """
 
     center: mi.Vector3f | tuple = (0, 0, 0)
@@ -33,17 +33,16 @@ class _Turned:
 class Surfaces:
     """The shapes of a group of emitters.
 
-    Made of the group's ``emitters`` (None where one is of another group), the ``spheres`` that their shapes
-    are (`Sphere` or None), ``by_shape``: those that Mitsuba samples by their texture, but are sampled by
-    their shape here (a list of flags, None where no lamp is of the group), and the ``textured`` points of
-    others. ``own``: the `Mask` of both. ``inv_area`` of each shape, by its emitter's index; ``smooth``:
-    whether one has interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
+    ``emitters`` of the group (None for other groups), ``spheres`` their shapes (`Sphere` or None),
+    ``by_shape`` flags (None for other groups): sampled by shape here, by texture in Mitsuba; ``textured``
+    points of others. ``own``: the `Mask` of both. ``inv_area`` of each shape, by emitter index; ``smooth``:
+    one has interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
     """
 
     def __init__(self, emitters, context: Context, spheres, by_shape=None, textured=None):
         for emitter in filter(None, emitters):
             context.facts.about("to_world", emitter.get_shape(), partial(_check_to_world, emitter))
-        # Before areas are asked for: of a mesh whose faces have vertices that do not exist it is any number.
+        # First: the area of a mesh whose faces have invalid vertices is arbitrary.
         self._smooth_meshes = SmoothMeshes.of(emitters)
         self.smooth = self._smooth_meshes is not None
         areas = rows(emitters, 1.0, lambda emitter: dr.slice(emitter.get_shape().surface_area()))
@@ -73,10 +72,7 @@ class Surfaces:
         self._reversed = Mask([e and is_reversed(e.get_shape()) for e in emitters])
 
     def sample(self, chosen, u, shared, active):
-        """A point on the shape of each emitter, and its geometric normal, the one that a hit reports.
-
-        The point is a ``PositionSample3f``, its density over area.
-        """
+        """Sample a ``PositionSample3f`` (density over area) and its geometric normal."""
         index = chosen.index
         if self.own.all:
             ps = self._own_point(index, shared.time, u, active)
@@ -90,7 +86,7 @@ class Surfaces:
         return ps, self.geometric_normal(ps, index, u, active)
 
     def sample_own(self, index, time, u, active):
-        """Sample a point of the emitter ``index``, by the map of its texture if it has one, else by shape."""
+        """Sample a point of the emitter ``index``, by its mapped texture or else by shape."""
         return self._upright(self._own_point(index, time, u, active), index, active)
 
     def _own_point(self, index, time, u, active):
@@ -104,16 +100,16 @@ class Surfaces:
         return dr.select(mask, self._textured.sample(index, time, u, mask), ps)
 
     def _point(self, index, time, u, active):
-        """A point that the shape of the emitter ``index`` samples uniformly.
+        """Sample a point uniformly on the shape of the emitter ``index``.
 
-        Of these shapes alone: Mitsuba's call on shapes visits all of the process, and instances, curves and
+        Calls these shapes alone: a virtual call visits all shapes in the process, and instances, curves and
         grids have no ``sample_position``.
         """
         shapes = [emitter and emitter.get_shape() for emitter in self._emitters]
         return switch(shapes, "sample_position", index, time, u, active)
 
     def _upright(self, ps, index, active):
-        """A point that a shape has sampled, with its normal as it should be, see `Sphere`."""
+        """Turn the sampled normal of a turned sphere; see `Sphere`."""
         if self._turned is not None:
             sphere = look_up(self._turned, index, active)
             n = sphere_normal(ps.p, sphere.center, sphere.outward)
@@ -121,10 +117,9 @@ class Surfaces:
         return ps
 
     def geometric_normal(self, ps, index, u, active):
-        """Geometric normal, with the sign of ``si.n`` of a hit, at the point that a shape sampled from ``u``.
+        """Geometric normal (sign of a hit's ``si.n``) at the point sampled from ``u``.
 
-        Meshes sample the interpolated vertex normal there, mirrored rectangles the opposite of the geometric
-        normal; all other shapes the geometric normal.
+        Mitsuba samples the interpolated normal on meshes, and the opposite normal on mirrored rectangles.
         """
         n = ps.n
         if self._reversed.any:
@@ -132,13 +127,13 @@ class Surfaces:
         return n if self._smooth_meshes is None else self._smooth_meshes.normal(n, index, u.y, active)
 
     def anchor(self, chosen, p, n, active) -> rays.Anchor:
-        """Where rays start or end at the point ``p`` with the normal ``n``."""
+        """Anchor of the point ``p`` with the normal ``n``."""
         errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
         return rays.sampled_anchor(p, n, errors)
 
 
 def spheres_of(emitters, context: Context) -> list[Sphere | None]:
-    """The shapes of ``emitters`` that are spheres."""
+    """Return the `Sphere` of each emitter's shape, None for other shapes."""
 
     def sphere(emitter: mi.Emitter) -> Sphere | None:
         shape = emitter.get_shape()

@@ -1,7 +1,4 @@
-"""Tables of the scene's emitters that a kernel can index.
-
-All have one row for each emitter of the scene, be it of the group that asks or not.
-"""
+"""Tables that a kernel can index, with one row per emitter of the scene."""
 
 from __future__ import annotations
 
@@ -22,9 +19,9 @@ def rows(emitters, default, row) -> list:
 
 
 def table(records: list[Record]) -> Record:
-    """Dataclasses of scalars and points as one of opaque columns for `look_up`.
+    """Convert records of numbers and tuples to opaque columns for `look_up`.
 
-    So their fields are numbers and tuples, those of the table ``mi.Float`` and ``mi.Vector3f``.
+    Columns are ``mi.Float`` or ``mi.Vector3f``.
     """
 
     def column(name):
@@ -40,30 +37,29 @@ def table(records: list[Record]) -> Record:
 
 
 def look_up(columns: Record, index: mi.UInt32, active: mi.Bool) -> Record:
-    """The row ``index`` of a `table`."""
+    """Return the row ``index`` of a `table`."""
     return replace(columns, **{k: dr.gather(type(v), v, index, active) for k, v in vars(columns).items()})
 
 
 def switch(owners, method: str, index: mi.UInt32, *arguments):
-    """What ``method`` of the owner at ``index`` returns; the last of ``arguments`` is the mask of the lanes.
+    """Call ``method`` of the owner at ``index``; the last argument is the mask.
 
-    ``owners``: one for each emitter of the scene, None where there is none. Of these alone: Mitsuba's virtual
-    calls visit all objects in the process, some of which may not have the method.
+    ``owners``: one per emitter of the scene, or None. Calls these alone: Mitsuba's virtual calls visit all
+    objects in the process, some of which may lack the method.
     """
     methods = [getattr(owner, method) for owner in owners if owner is not None]
     if len(methods) == 1:
         return methods[0](*arguments)
-    # How many are before each; the last, of all, belongs to no emitter.
+    # Number of owners before each emitter; the last sum belongs to no emitter.
     numbers = accumulate((owner is not None for owner in owners), initial=0)
     number = dr.gather(mi.UInt32, mi.UInt32(list(numbers)), index, arguments[-1])
     return dr.switch(number, methods, *arguments)
 
 
 class Mask:
-    """Which emitters of a group have a property: ``any``, ``all`` of them, and each one's by its index.
+    """Property of a group's emitters: ``any``, ``all``, and a mask by index.
 
-    ``values``: one for each emitter of the scene, None where it is of another group. Nothing is recorded
-    where none or all of them have the property.
+    ``values``: one per emitter of the scene, None for other groups. Records nothing if none or all have it.
     """
 
     def __init__(self, values):
@@ -73,7 +69,7 @@ class Mask:
         dr.make_opaque(self._table)
 
     def at(self, index, active):
-        """Mask of those lanes whose emitter, of this group where they are ``active``, has the property."""
+        """Mask: the emitter has the property (``active`` lanes: those of this group)."""
         if not self.any:
             return mi.Bool(False)
         if self.all:
@@ -82,7 +78,7 @@ class Mask:
 
 
 def inverse_table(pointers):
-    """Emitter index by the number that Dr.Jit gives to a pointer."""
+    """Emitter index by the index of its pointer in Dr.Jit's registry."""
     ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()
     found = [0] * (int(ids.max()) + 1)
     for index, number in enumerate(ids):

@@ -1,9 +1,9 @@
-"""Points of textured disks, spheres and flipped rectangles, sampled by the texture.
+"""Points of disks, spheres and flipped rectangles, sampled by their texture.
 
-Mitsuba samples the texture as well, but finds the point by a ray from one unit of length above the surface.
-In a small scene the point is off the surface by more than the offsets of rays, or the ray misses a disk at
-its rim. Mitsuba also turns spheres wrongly and ignores ``flip_normals`` of rectangles. Here the point follows
-from its texture coordinates and ``to_world``.
+Mitsuba samples the texture too, but finds the point by a ray from one unit above the surface: in a small
+scene the point is off the surface by more than the ray offsets, or the ray misses a disk at its rim. It also
+turns spheres wrongly and ignores ``flip_normals`` of rectangles. Here the point is computed from its texture
+coordinates and ``to_world``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..geometry.quadrics import Sphere, sphere_normal
 from ..host.introspection import children, matrix_of
 from .tables import Mask, look_up, switch, table
 
-# Half a step of the random numbers. Texture coordinates of 0 are taken for it: there the density is infinite.
+# Half a step of the random numbers; replaces coordinates of 0, where the density is infinite.
 _LEAST = 2.0**-25
 
 _RECTANGLE, _DISK, _SPHERE = range(3)
@@ -34,9 +34,8 @@ _KINDS = {
 class _Map:
     """Map from texture coordinates to a surface.
 
-    ``x``, ``y``, ``z``, ``origin`` are the columns of ``to_world``, ``n`` the normal of a flat shape,
-    ``outward`` that of a `Sphere`, ``area`` the area of a unit square of a flat shape's own coordinates, the
-    squared radius of a sphere.
+    ``x``, ``y``, ``z``, ``origin``: columns of ``to_world``; ``n``: normal of a flat shape; ``outward``: see
+    `Sphere`; ``area``: of a unit square of a flat shape's own coordinates, or a sphere's squared radius.
     """
 
     kind: mi.Float | float = float(_RECTANGLE)
@@ -60,7 +59,7 @@ class _Map:
 
 
 class TexturedPoints:
-    """The lamps of a group that are sampled here, those of ``emitters`` that ``chosen`` marks.
+    """The lights of a group that are sampled here (flags ``chosen``).
 
     ``emitters`` and ``spheres`` as in `surfaces.Surfaces`; ``mask`` is the `tables.Mask` of ``chosen``.
     """
@@ -73,7 +72,7 @@ class TexturedPoints:
             self._maps = table([_Map.of(e.get_shape(), s) if c else _Map() for e, s, c in found])
 
     def sample(self, index, time, u, active):
-        """Sample a point of the lamp ``index``: a ``PositionSample3f``, its density over area."""
+        """Sample a ``PositionSample3f`` (density over area) of the light ``index``."""
         uv, pdf = switch(self._textures, "sample_position", index, u, active)
         known = look_up(self._maps, index, active)
         a, b, c, stretch = _local(known.kind, uv)
@@ -86,18 +85,18 @@ class TexturedPoints:
         return ps
 
     def pdf_a(self, index, uv, active):
-        """Density (area measure) of the point of the lamp ``index`` at ``uv``."""
+        """Density (area measure) of the point of the light ``index`` at ``uv``."""
         pdf = switch(self._textures, "pdf_position", index, uv, active)
         known = look_up(self._maps, index, active)
         return pdf / (known.area * _local(known.kind, uv)[-1])
 
 
 def _local(kind, uv):
-    """Return the point at ``uv`` in a shape's own coordinates, and its area per area of ``uv``."""
+    """Point at ``uv`` in the shape's own coordinates, and its area per area of ``uv``."""
     disk, sphere = kind == _DISK, kind == _SPHERE
     r = dr.maximum(uv.x, _LEAST)
     sin_phi, cos_phi = dr.sincos(dr.two_pi * dr.select(disk, uv.y, uv.x))
-    # Of the nearer pole: 1 - v is exact there.
+    # From the nearer pole: 1 - v is exact there.
     theta = dr.pi * dr.maximum(dr.minimum(uv.y, 1 - uv.y), _LEAST)
     sin_theta, cos_theta = dr.sincos(theta)
     across = dr.select(disk, r, sin_theta)
@@ -110,5 +109,5 @@ def _local(kind, uv):
 
 
 def is_mapped(shape: mi.Shape) -> bool:
-    """Whether `TexturedPoints` samples a ``shape`` that is sampled by a texture."""
+    """Whether `TexturedPoints` samples ``shape`` if it is sampled by a texture."""
     return shape.shape_type() != mi.ShapeType.Rectangle.value or shape.has_flipped_normals()

@@ -1,4 +1,4 @@
-"""Emitters whose class is not Mitsuba's."""
+"""Emitters of user-defined classes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from .records import Chosen, Direct, Hit
 
 
 class ThirdPartyEmitters(Group):
-    """Emitters of users' own classes: only the calls that camera subpaths need are used.
+    """Emitters of user-defined classes: only calls that camera subpaths need are used.
 
-    No light subpath starts from them. Their density has its own idea of a normal: it gets that of Mitsuba's
-    ``DirectionSample3f``, not the geometric one.
+    No light subpath starts from them. Their density gets the normal of Mitsuba's ``DirectionSample3f``, not
+    the geometric one.
     """
 
     supports_emission = connectible_to_sensor = False
