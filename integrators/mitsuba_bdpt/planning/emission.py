@@ -1,6 +1,3 @@
-# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 """Fits tables of guided emission, `emission_tables.EmissionTables`, to a pilot.
 
 A contribution of weighted size v lies on a path whose emission is in a cell of the tables, whichever strategy

@@ -1,7 +1,3 @@
-# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
-# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
-# pyright: reportUnknownVariableType=false
 """Estimates the share of an image's light on SDS paths that no strategy samples.
 
 Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
@@ -259,7 +255,7 @@ def called(emitter: mi.Emitter) -> str:
     kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
     if emitter.id():
         return f"{kind} '{emitter.id()}'"
-    on_shape = shape is not None and shape.id()  # pyright: ignore[reportUnnecessaryComparison]
+    on_shape = shape is not None and shape.id()
     return f"the {kind} on shape '{shape.id()}'" if on_shape else f"a {kind} without id"
 
 

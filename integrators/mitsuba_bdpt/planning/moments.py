@@ -1,7 +1,3 @@
-# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
-# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
-# pyright: reportUnknownVariableType=false
 """Statistics of a pilot: variances of all weightings, and stratification gains.
 
 NumPy arithmetic on the arrays of a `pilot.Pilot`, whose module has the equations. `SAMPLE` and `SPLAT` are

@@ -1,7 +1,3 @@
-# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
-# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
-# pyright: reportUnknownVariableType=false
 """A pilot: a few thousand bidirectional samples that estimate all variances.
 
 `choice.choose` decides per image whether light subpaths and inner connections pay, by cost times variance of

@@ -1,7 +1,3 @@
-# pyright: strict, reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
-# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportUnknownArgumentType=false
-# pyright: reportUnknownLambdaType=false, reportUnknownMemberType=false, reportUnknownParameterType=false
-# pyright: reportUnknownVariableType=false
 """Multiple importance sampling of all strategies (s, t) by recursive partial sums.
 
 Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland
