@@ -1,10 +1,9 @@
-"""Raw accumulators, and how they become the film.
+"""Raw sums of samples, and their conversion to the film.
 
-Camera samples go into one block with Mitsuba's filter weights W, splats (t <= 1) into another. The
-weight that a splat must be divided by is analytic, W' = spp * integral of the filter over the region
-that camera samples cover; it enters the film as W * splat / W', so that `Film.develop` does the
-right thing for every filter, crop window and border. Putting both kinds into one block, as Mitsuba's
-``ptracer`` does, is biased for every filter but the box: E[1/W] > 1/E[W].
+Camera samples and splats (t <= 1) have separate blocks. Camera samples carry the filter's weight W. A splat's
+weight is analytic: W' = spp * integral of the filter over the region that camera samples cover. Splats enter
+the film as W * splat / W', so that `Film.develop` is right for every filter, crop window and border. One
+block for both, as in Mitsuba's ``ptracer``, is biased for every filter but the box: E[1/W] > 1/E[W].
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from .replicates import Replicates, Spread
 
 
 def even(count: int) -> int:
-    """So many numbers and a last one of 0 if need be: Dr.Jit adds an even number as a packet."""
+    """Round up to an even number: Dr.Jit adds an even number of channels as a packet."""
     return count + count % 2
 
 
 @dataclass(frozen=True)
 class Channels:
-    """Order of a pixel's sums of camera samples.
+    """Order of the channels of a pixel's camera samples.
 
-    So many ``colours``, ``alpha`` (0 or 1 of it), the filter's weight W, so many ``features``, and numbers
-    of ``stokes`` vectors besides the colours. Splats have colours and Stokes vectors alone.
+    ``colours``, ``alpha`` (0 or 1 channels), the filter's weight W, ``features``, and ``stokes`` (channels
+    beside the colours). Splats have colours and Stokes channels only.
     """
 
     colours: int
@@ -43,61 +42,60 @@ class Channels:
 
     @classmethod
     def of(cls, film, colours: int, features: int, stokes: int) -> Channels:
-        """Those of a film that keeps so many colours, features, and numbers of Stokes vectors."""
+        """Return the channels of a film with these numbers of channels of each kind."""
         return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features, stokes)
 
     @property
     def of_colours(self) -> slice:
-        """Place of the colours, also among the sums of splats."""
+        """Slice of the colours, for camera samples and splats."""
         return slice(0, self.colours)
 
     @property
     def weight(self) -> int:
-        """Place of the filter's weight."""
+        """Index of the filter's weight."""
         return self.colours + self.alpha
 
     @property
     def of_features(self) -> slice:
-        """Place of the features."""
+        """Slice of the features."""
         return slice(self.weight + 1, self.weight + 1 + self.features)
 
     @property
     def of_stokes(self) -> slice:
-        """Place of the Stokes vectors."""
+        """Slice of the Stokes channels."""
         return slice(self.of_features.stop, self.of_features.stop + self.stokes)
 
     @property
     def of_stokes_light(self) -> slice:
-        """Place of the Stokes vectors among the sums of splats."""
+        """Slice of the Stokes channels of a splat."""
         return slice(self.colours, self.colours + self.stokes)
 
     @property
     def camera(self) -> int:
-        """Numbers of a pixel in the sums of camera samples."""
+        """Number of channels of camera samples, padded to an even number."""
         return even(self.of_stokes.stop)
 
     @property
     def light(self) -> int:
-        """Numbers of a pixel in the sums of splats."""
+        """Number of channels of splats, padded to an even number."""
         return even(self.of_stokes_light.stop)
 
     def sample(self, colours, alpha, features, stokes) -> list:
-        """A camera sample of filter weight 1, in the order of the sums."""
+        """Return the channels of a camera sample with filter weight 1."""
         return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes]
 
 
-# The blocks of sums, as `Snapshot.arrays` calls them.
+# Names of the blocks in `Snapshot.arrays`.
 _NAMES = ("camera", "light", "strategies")
 
 
 class Accumulator:
-    """Collects the samples of one render.
+    """Accumulates the samples of one render.
 
-    ``film`` Mitsuba's film; ``colour`` what it keeps of a spectrum, see `colour`; ``border`` how many
-    pixels camera samples reach beyond the crop window; ``depth`` the largest path length of the strategy
-    images, 0 for none, ``merges`` whether there is one of those too; ``variance`` whether the layers of the
-    variance are wanted, see `close_replicate`; ``features`` the `FeatureLayers` that camera samples bring
-    along, or ``None``.
+    ``film``: Mitsuba's film; ``colour``: converts spectra to the film's colours, see `colour`; ``border``:
+    pixels that camera samples reach beyond the crop window; ``depth``: largest path length of strategy
+    images, 0 for none; ``merges``: whether merges have one too; ``variance``: whether replicates are kept,
+    see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``.
     """
 
     def __init__(self, film, colour, border: int, depth: int, merges: bool, variance: bool, features):
@@ -118,9 +116,9 @@ class Accumulator:
             film, len(colour.names), features.count if features else 0, stokes.POLARIZED if self.stokes else 0
         )
         self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf)
-        # In single precision the 2^22 splats of a small lamp on its one pixel are off by 0.3 %.
+        # Double precision: one pixel may receive millions of splats of a small lamp.
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
-        # One strip of rows per strategy, far enough apart for the filter.
+        # One strip of rows per strategy, separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         rows = image_count(depth, merges) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if depth else None
@@ -139,16 +137,16 @@ class Accumulator:
     def put_camera(self, position, values, active):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1.
 
-        ``values``: colours, alpha, features, and what `Stokes` says, or nothing.
+        ``values``: colours, alpha, features, and the channels of `Stokes`, if kept.
         """
         self.camera.put(position, self._channels.sample(*values), active)
 
     def put_light(self, position, colours, polarized, active):
-        """Add a splat at a continuous film position; ``polarized``: what `Stokes` says of it, or nothing."""
+        """Add a splat at a continuous film position; ``polarized``: channels of `Stokes`."""
         self.light.put(position, [*colours, *polarized], active)
 
     def put_strategy(self, position, weighted, unweighted, c, active):
-        """Add to the technique images of the strategy of the contribution ``c``."""
+        """Add the contribution ``c`` to the image of its strategy."""
         if self.strategies is None:
             raise ValueError("an accumulator of depth 0 has no strategy images")
         values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
@@ -156,7 +154,7 @@ class Accumulator:
         self.strategies.put(position, values, active, index * self._stride)
 
     def evaluate(self, *others):
-        """Run what was recorded since the last call as one kernel, ``others`` with it."""
+        """Evaluate what was recorded since the last call, and ``others``, in one kernel."""
         dr.eval([b.data for b in self._blocks()], *others)
 
     def _blocks(self):
@@ -164,37 +162,37 @@ class Accumulator:
 
     @property
     def passes(self) -> tuple[int, ...]:
-        """Samples per pixel of each pass that is in the sums."""
+        """Samples per pixel of each pass in the sums."""
         return self._done[1]
 
     def close_pass(self, spp: int):
-        """Add the sums of a pass with ``spp`` samples per pixel to those of all, in double precision."""
+        """Add the sums of a pass of ``spp`` samples per pixel to the total."""
         blocks = self._blocks()
         sums = [mi.Float64(b.data) for b in blocks]
         before, passes = self._done
         if before:
             sums = [a + b for a, b in zip(before, sums, strict=True)]
         dr.eval(sums)
-        self._done = (sums, (*passes, spp))  # at once: Ctrl-C may come between any two steps
+        self._done = (sums, (*passes, spp))  # one assignment: Ctrl-C may come between any two steps
         for b in blocks:
             b.clear()
 
     def store(self) -> tuple[tuple[int, ...], dict]:
-        """Passes and raw sums for a `Snapshot`: arrays of Dr.Jit or NumPy, none of which changes any more."""
+        """Return passes and raw sums (arrays of Dr.Jit or NumPy, not changed later)."""
         sums, passes = self._done
         return passes, self.replicates.store() | dict(zip(_NAMES, sums, strict=False))
 
     @property
     def halves(self) -> tuple[Spread, Spread] | None:
-        """The `Spread` of either half of the replicates, ``None`` without the variance."""
+        """The `Spread` of each half of the replicates; ``None`` without the variance."""
         return self.replicates.halves if self.variance else None
 
     def ends_replicates(self) -> bool:
-        """Whether all passes belong to whole replicates."""
+        """Return whether all passes belong to complete replicates."""
         return self.variance and self.replicates.spp == sum(self.passes) > 0
 
     def restore(self, passes: tuple[int, ...], arrays: dict, halves: tuple[Spread, Spread] | None):
-        """Go on from what `store` and `halves` gave after these ``passes``."""
+        """Restore the state that `store` and `halves` returned after ``passes``."""
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
             if len(s) != len(block.data):
@@ -204,21 +202,21 @@ class Accumulator:
             self.replicates.restore(halves, arrays)
 
     def close_replicate(self):
-        """Count what was added since the last call as one independent replicate of the image."""
+        """Add what was accumulated since the last call as one independent replicate."""
         sums, passes = self._done
         self.replicates.add([np.array(s) for s in sums[:2]], sum(passes), self._image)
 
     def error(self) -> float:
-        """Estimated relMSE of the image, see `Replicates.error`."""
+        """Return the estimated relMSE of the image, see `Replicates.error`."""
         return self.replicates.error(sum(self.passes), np.array(self.colour.unit))
 
     def _image(self, camera, light, spp: int):
-        """Image (height, width, colours) of sums over ``spp`` samples per pixel."""
+        """Return the image (height, width, colours) of sums over ``spp`` samples."""
         pixels = self._pixels(camera, light)
         return pixels.colours / pixels.weight + pixels.light / self._splat_weight(spp)[..., None]
 
     def _pixels(self, camera, light) -> _Pixels:
-        """The sums of an image, ordered by pixels."""
+        """Reshape the sums of an image to (height, width, channels)."""
         w, h = self.size
         camera, light, channels = camera.reshape(h, w, -1), light.reshape(h, w, -1), self._channels
         return _Pixels(
@@ -231,9 +229,9 @@ class Accumulator:
         )
 
     def mean(self):
-        """Mean of the image so far, the scale of roulette: a ``Float64`` of width 1, not yet evaluated.
+        """Return the mean of the image so far, the scale of roulette.
 
-        Of the colours, each in its unit, the largest.
+        The largest mean of a colour in its unit; an unevaluated ``Float64`` of width 1.
         """
         channels, blocks = self._channels, zip(self._done[0][:2], (self.camera, self.light), strict=True)
         camera, light = (
@@ -246,14 +244,14 @@ class Accumulator:
         return reduce(dr.maximum, [(c / weight + y / splat_weight) / unit for c, y, unit in colours])
 
     def _splat_weight(self, spp: int):
-        """W', shape (height, width)."""
+        """Return W', shape (height, width)."""
         x, y = self._share
         return spp * y[:, None] * x[None, :]
 
     def _covered(self, n: int):
-        """Integral of the one-dimensional filter about each pixel over the camera samples' region."""
+        """Return each pixel's integral of the 1D filter over the camera samples' region."""
         if self.rfilter.is_box_filter():
-            return np.ones(n)  # camera samples are put at the pixel itself: each weighs 1
+            return np.ones(n)  # camera samples lie in the pixel itself
         radius, steps = self.rfilter.radius(), 4096
         edges = np.linspace(-radius, radius, 2 * steps + 1)
         middle = (edges[1:] + edges[:-1]) / 2
@@ -264,7 +262,7 @@ class Accumulator:
         return high - np.interp(-self.border - centre, edges, cumulative)
 
     def finish(self):
-        """Store the result of the passes so far in the film, in the place of what was stored before."""
+        """Store the image of all passes so far in the film."""
         sums, passes = self._done
         if not passes:
             return
@@ -287,20 +285,20 @@ class Accumulator:
         parts = self.colour.stored(colours, pixels.weight, layers)
         values = np.concatenate(parts, axis=-1).astype(np.float32)
         block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
-        self.film.clear()  # of what was stored before
+        self.film.clear()
         self.film.put_block(block)
 
     def _denoised(self, pixels: _Pixels, colours) -> list:
-        """The features that are layers of the film, and the image of these ``colours`` without noise."""
+        """Return the film's features and the denoised ``colours``."""
         shown, guides = np.split(pixels.features, [len(self.features.names)], axis=-1)
-        # A pixel without samples (of a filter that is negative somewhere) has nothing to be divided.
+        # A filter with negative lobes may leave a weight of 0.
         weight = np.where(pixels.weight == 0, 1, pixels.weight)
         image, guides = colours[..., : self._channels.colours] / weight, guides / weight
         found = denoising.denoised(image, guides[..., denoising.ALBEDO], guides[..., denoising.NORMAL])
         return [shown, found * pixels.weight]
 
     def _strategy_layers(self, sums, to_film) -> list:
-        """The strategy images in the order of their layers; ``to_film``: what splats are multiplied by."""
+        """Return the strategy images in film order; ``to_film``: factor of splats."""
         w, h = self.size
         tall = np.array(sums).reshape(-1, self._stride, w, 6)[:, :h]
         splats = [t <= 1 for _, _, t in strategies(self.depth)]
@@ -310,9 +308,9 @@ class Accumulator:
 
 @dataclass
 class _Pixels:
-    """Sums of an image, shape (height, width, numbers of each kind).
+    """Sums of an image, each of shape (height, width, channels).
 
-    Those of camera samples, and of ``light``, the splats; ``polarized`` of both.
+    ``light``: splats; ``polarized``: Stokes channels of camera samples and of splats.
     """
 
     colours: np.ndarray

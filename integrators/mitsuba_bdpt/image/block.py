@@ -9,16 +9,13 @@ import mitsuba as mi
 
 
 class Block:
-    """Sums of samples weighted by the film's filter, as in ``mi.ImageBlock``, but of a run-time size.
+    """Sums of samples weighted by the film's filter, like ``mi.ImageBlock``.
 
-    Sizes of Mitsuba's, and of Dr.Jit's copies of small targets for each thread, are literals in the kernel,
-    which would be compiled anew for every resolution.
+    The size is opaque: as a literal, it would compile a new kernel for every resolution.
 
-    ``size`` (width, height); ``channels`` an even number, so that Dr.Jit adds a pixel's as a packet; ``mode``
-    how neighbouring lanes are added: ``Local`` where they mostly meet in a pixel, else ``Direct`` (measured
-    for 2^20 samples of 4 channels on two cores: 3 and 9 ms if 64 lanes meet, 41 and 26 ms if they do not);
-    ``packet`` the type of a pixel's sums, in double precision where any number of samples may meet in a
-    pixel.
+    ``size``: (width, height). ``channels``: even, so that Dr.Jit adds them as a packet. ``mode``: ``Local``
+    where neighbouring lanes mostly share a pixel, else ``Direct``. ``packet``: array type of a pixel's sums,
+    in double precision where the number of samples of a pixel is unbounded.
     """
 
     def __init__(self, size, offset, channels: int, rfilter, mode, packet):
@@ -36,7 +33,7 @@ class Block:
     def put(self, position, values, active, row=0):
         """Add ``values`` at a continuous film position, ``row`` rows below.
 
-        One per channel; a last one of 0 may be left out.
+        One value per channel; a final 0 may be left out.
         """
         values = values + [mi.Float(0)] * (self.channels - len(values))
         down = mi.Point2i(0, mi.Int32(row))

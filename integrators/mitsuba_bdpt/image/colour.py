@@ -1,7 +1,7 @@
-"""What a film keeps of a spectrum, and where: linear sRGB, or the bands of a spectral film.
+"""Conversion of spectra to the film's colours: linear sRGB or bands.
 
-An object of these classes is made for one render. It is called with a spectrum and its wavelengths
-(drawn by the sensor, and multiplied by the weight that they came with) and returns the film's colours.
+An object of these classes belongs to one render. It is called with a spectrum (multiplied by the weight of
+its wavelengths) and the wavelengths that the sensor sampled.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from ..errors import UnsupportedError
 from ..host.introspection import children, named
 from .stokes import Stokes
 
-# Wavelengths at which a film is asked for its response to a spectrum of 1.
+# Wavelengths at which a film's response to a spectrum of 1 is evaluated.
 RESPONSE_SAMPLES = 4096
 
 
 def film_colours(sensor, stokes: bool = False):
-    """Return the kind of colours that the film of ``sensor`` keeps; ``stokes``: and Stokes vectors.
+    """Return the colours of the film of ``sensor``, with Stokes vectors if ``stokes``.
 
     Raises ``UnsupportedError`` for films other than Mitsuba's.
     """
@@ -35,7 +35,7 @@ def film_colours(sensor, stokes: bool = False):
 
 
 def srgb(value: mi.UnpolarizedSpectrum, wavelengths) -> mi.Color3f:
-    """Linear sRGB of a spectrum."""
+    """Convert a spectrum to linear sRGB."""
     if mi.is_spectral:
         return mi.spectrum_to_srgb(value, wavelengths)
     if mi.is_monochromatic:
@@ -44,10 +44,10 @@ def srgb(value: mi.UnpolarizedSpectrum, wavelengths) -> mi.Color3f:
 
 
 class Rgb:
-    """Linear sRGB, which ``hdrfilm`` keeps in every pixel format.
+    """Linear sRGB, which ``hdrfilm`` stores in every pixel format.
 
-    ``names`` of the colours; ``unit`` what a spectrum of 1 gives, roughly: the scale of a colour; ``stokes``
-    the `Stokes` that are kept besides, or None.
+    ``names``: of the colours; ``unit``: approximate colour of a spectrum of 1; ``stokes``: the `Stokes`, or
+    None.
     """
 
     names = ("R", "G", "B")
@@ -57,48 +57,48 @@ class Rgb:
         self._film, self.stokes = film, stokes
 
     def __call__(self, value, wavelengths):
-        """Linear sRGB of a spectrum's intensity."""
+        """Convert the intensity of a spectrum to linear sRGB."""
         return srgb(mi.unpolarized_spectrum(value), wavelengths)
 
     def prepare(self, layers):
-        """Make the film ready for its colours and these layers."""
+        """Prepare the film for its colours and ``layers``."""
         self._film.prepare(layers)
 
     def stored(self, colours, weight, layers) -> list:
-        """Parts of the film's storage in its order; alpha counts as a colour."""
+        """Return the parts of the film's storage in order; alpha counts as a colour."""
         return [colours, weight, *layers]
 
 
 class Bands:
-    """The bands of a ``specfilm``, each the integral of radiance times a sensor response, see `Rgb`."""
+    """Bands of ``specfilm``: integrals of radiance times a sensor response, see `Rgb`."""
 
     stokes = None
 
     def __init__(self, film, sensor):
         self._film, self._sensor = film, sensor
         self.names = tuple(_band_names(film))
-        self._channels, self.unit = None, None  # known from `prepare` on
+        self._channels, self.unit = None, None  # set by `prepare`
 
     def __call__(self, value, wavelengths):
-        """The bands' shares of a spectrum."""
+        """Return the contribution of a spectrum to each band."""
         value = mi.unpolarized_spectrum(value)
         channels = self._film.prepare_sample(value, wavelengths, self._channels)
         return mi.ArrayXf(channels[: len(self.names)])
 
     def prepare(self, layers):
-        """Make the film ready for its colours and these layers."""
+        """Prepare the film for its colours and ``layers``."""
         self._channels = self._film.prepare(layers)
         u = (dr.arange(mi.Float, RESPONSE_SAMPLES) + 0.5) / RESPONSE_SAMPLES
         wavelengths, weight = self._sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
         response = self(weight, wavelengths)
-        # A band without any response stays black, whatever it is divided by.
+        # A band without response stays black.
         self.unit = tuple(float(dr.slice(dr.mean(band))) or inf for band in response)
 
     def stored(self, colours, weight, layers) -> list:
-        """Parts of the film's storage in its order: the weight comes last."""
+        """Return the parts of the film's storage in order; the weight is last."""
         return [colours, *layers, weight]
 
 
 def _band_names(film) -> list[str]:
-    """Names of the bands in the order in which the film keeps them."""
+    """Return the names of the bands in the film's order."""
     return [name for name, value in children(film).items() if isinstance(value, mi.Texture)]

@@ -1,7 +1,6 @@
-"""Denoised images, by Intel's Open Image Denoise in the package mitsuba-oidn.
+"""Denoising by Intel's Open Image Denoise (package mitsuba-oidn).
 
-It is told what the first surfaces look like: their albedo and shading normals, which are made clean on their
-own first (so does its documentation, "prefiltering").
+Auxiliary images are albedo and shading normal of the first surface, both prefiltered (see its documentation).
 """
 
 from __future__ import annotations
@@ -13,18 +12,18 @@ import numpy as np
 
 from ..errors import UsageError
 
-# What `FeatureLayers` is asked for, beside what a user asks for: pairs as of Mitsuba's ``aov``, whose normals
-# of bump maps are not in the world's coordinates.
+# Features for the denoiser, as pairs like those of Mitsuba's ``aov``. Unlike in ``aov``, normals of bump maps
+# are in world space.
 WORLD_NORMAL = "world_normal"
 GUIDES = f"bdpt_albedo:albedo,bdpt_normal:{WORLD_NORMAL}"
 
-# Channels of these.
+# Their channels.
 ALBEDO, NORMAL = slice(0, 3), slice(3, 6)
 GUIDE_CHANNELS = 6
 
 
 def check_installed() -> None:
-    """Raise ``UsageError`` if mitsuba-oidn is not there."""
+    """Raise ``UsageError`` if mitsuba-oidn is not installed."""
     try:
         import mitsuba_oidn  # noqa: F401
     except ImportError as error:
@@ -34,16 +33,17 @@ def check_installed() -> None:
 
 
 def denoised(colours: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The image ``colours``, linear, without noise; all of shape (height, width, 3), in single precision.
+    """Denoise the linear image ``colours``.
 
-    ``normal`` in world space, of any length up to 1: where pixels see no surface it is 0, as ``albedo`` is.
+    All arrays have shape (height, width, 3), single precision. ``normal``: in world space, of length up to 1.
+    ``normal`` and ``albedo`` are 0 where pixels see no surface.
     """
     clean = {"albedo": _filtered({"albedo": albedo}), "normal": _filtered({"normal": normal})}
     return _filtered({"color": colours} | clean)
 
 
 def _filtered(images: dict[str, np.ndarray]) -> np.ndarray:
-    """The first of ``images`` without noise, by what the others tell."""
+    """Denoise the first of ``images``; the others are auxiliary."""
     first = next(iter(images.values()))
     images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
     found = np.empty(first.shape, np.float32)
@@ -59,7 +59,7 @@ def _filtered(images: dict[str, np.ndarray]) -> np.ndarray:
 
 @cache
 def _device() -> Any:
-    """The processor: what is denoised is in its memory, and no image depends on the machine's cards."""
+    """Return the CPU device, on every machine: images do not depend on its GPUs."""
     import mitsuba_oidn
 
     return mitsuba_oidn.Device(mitsuba_oidn.DeviceType.CPU)

@@ -1,13 +1,14 @@
-"""Feature layers: what the first surface on a camera ray is like, as in Mitsuba's plugin ``aov``.
+"""Feature layers (AOVs) of the first surface, as in Mitsuba's plugin ``aov``.
 
-Features are evaluated at each camera sample, with the ray that Mitsuba's sensor gives for the sample's film
-position. They are thus filtered and normalised exactly as the image is, after every number of passes, and
-mean what they mean in ``aov`` of Mitsuba 3.9.1: they show emitters under ``hide_emitters``, uv derivatives
-shrink with the square root of the samples per pixel, and shading normals of a bump map are in the shading
-frame. Two things differ. Albedo is RGB on every film: its wavelengths are drawn for that, where ``aov`` takes
-the sensor's and is wrong if these follow a response. And uv derivatives are 0 where there are none, as where
-a ray meets nothing; those of ``aov`` are NaN, which its sums keep or lose as the number of channels is even
-or odd. Other features that are not finite count as 0 too, and are counted.
+Features are evaluated at each camera sample, with the sensor's ray, and are thus filtered and normalised like
+the image. They agree with ``aov`` of Mitsuba 3.9.1: emitters are shown under ``hide_emitters``, uv
+derivatives scale with 1 / sqrt(spp), and shading normals of bump maps are in the shading frame. Two
+differences:
+
+* Albedo is RGB on every film: its wavelengths are sampled by `mi.sample_rgb_spectrum`. ``aov`` uses the
+  sensor's, which is wrong if these follow a response.
+* uv derivatives are 0 where they do not exist; those of ``aov`` are NaN. Other non-finite values count as 0
+  and are counted.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from .mapped_normals import MappedNormals
 
 @dataclass
 class _Hit:
-    """What a camera ray meets first: ``si`` there, its ``bsdf``, whether there is something (``active``)."""
+    """First hit of a camera ray: ``si`` and its ``bsdf``, valid where ``active``."""
 
     si: mi.SurfaceInteraction3f
     ray: mi.RayDifferential3f
@@ -41,7 +42,7 @@ class _Hit:
 
 
 def _albedo(hit: _Hit) -> mi.Color3f:
-    """Diffuse reflectance; in spectral variants of the wavelengths that `mi.sample_rgb_spectrum` samples."""
+    """Diffuse reflectance; spectral variants use `mi.sample_rgb_spectrum`."""
     value = mi.unpolarized_spectrum(hit.bsdf.eval_diffuse_reflectance(hit.si, hit.active))
     if mi.is_monochromatic:
         return mi.Color3f(value.x)
@@ -57,7 +58,7 @@ def _uv_partials(hit: _Hit) -> mi.SurfaceInteraction3f:
     return hit.si
 
 
-# The last parts of the names of a kind's layers, and their values.
+# Suffixes of a kind's layers, and its values.
 _KINDS: dict[str, tuple[str, Callable[[_Hit], Any]]] = {
     "albedo": ("RGB", _albedo),
     "depth": ("T", lambda hit: [hit.si.t]),
@@ -75,12 +76,12 @@ _KINDS: dict[str, tuple[str, Callable[[_Hit], Any]]] = {
 
 KINDS = tuple(_KINDS)
 
-# For denoisers, who are told normals in the world's coordinates.
+# For the denoiser, in world space.
 _KINDS[WORLD_NORMAL] = ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active, of_aov=False))
 
 
 def check_syntax(aovs: str):
-    """Raise ``UsageError`` unless ``aovs`` consists of pairs ``name:kind``, as ``aov`` has them."""
+    """Raise ``UsageError`` unless ``aovs`` consists of pairs ``name:kind``."""
     for pair in pairs(aovs):
         name, colon, kind = pair.partition(":")
         if not (name and colon and kind):
@@ -96,24 +97,25 @@ def check_syntax(aovs: str):
 
 
 def feature_names(aovs: str) -> list[str]:
-    """Names of the layers that the parameter ``aovs`` asks for."""
+    """Return the names of the layers of the parameter ``aovs``."""
     return [f"{name}.{part}" for name, kind in _asked(aovs) for part in _KINDS[kind][0]]
 
 
 def _asked(aovs: str) -> list[tuple[str, str]]:
-    """Name and kind of each feature."""
+    """Return name and kind of each feature."""
     return [(name, kind) for name, _, kind in (pair.partition(":") for pair in pairs(aovs))]
 
 
 def pairs(aovs: str) -> list[str]:
-    """The pairs ``name:kind`` of a parameter ``aovs``, also of Mitsuba's."""
+    """Return the pairs ``name:kind`` of a parameter ``aovs`` (ours or Mitsuba's)."""
     return [pair for pair in re.split("[, ]+", aovs) if pair]
 
 
 class FeatureLayers:
-    """The layers ``names`` of a render of ``spp`` samples per pixel, and a denoiser's ``guides`` after them.
+    """Feature layers ``names`` of a render of ``spp`` samples per pixel.
 
-    There must be some: ``aovs`` or `denoising.GUIDES`. ``count`` of all; guides are no layers of the film.
+    The denoiser's ``guides`` follow them and are no layers of the film; ``count``: of all. Needs ``aovs`` or
+    `denoising.GUIDES`.
     """
 
     def __init__(self, scene, sensor, aovs: str, spp: int, guides: bool = False):
@@ -125,13 +127,13 @@ class FeatureLayers:
         has_normals = {"sh_normal", WORLD_NORMAL}.intersection(self._kinds)
         self._normals = MappedNormals(bsdfs(scene) if has_normals else [])
         self._region = Region(sensor.film())
-        self._spread = dr.opaque(mi.Float, spp**-0.5)  # of ray differentials, as in Mitsuba
+        self._spread = dr.opaque(mi.Float, spp**-0.5)  # scale of ray differentials, as in Mitsuba
 
     def sample(self, points, stream, position, u_lens, time, active) -> tuple[list, object]:
-        """Return one number per layer for a camera sample, and whether all were finite.
+        """Return one value per layer for a camera sample, and whether all are finite.
 
-        The sample is at the film ``position`` (pixels), seen through the point of the lens that ``u_lens``
-        chooses. A number that is not finite is 0, and the mask false.
+        ``position``: on the film, in pixels; ``u_lens``: sample of the aperture. Non-finite values are
+        replaced by 0.
         """
         uv = self._region.to_uv(position)
         ray, _ = self._sensor.sample_ray_differential(time, 0.5, uv, u_lens, active)

@@ -1,4 +1,4 @@
-"""Limits of what a film's sums may take."""
+"""Limits on the memory of a film's sums."""
 
 from __future__ import annotations
 
@@ -12,31 +12,30 @@ from .layers import image_count
 # Of one array.
 MOST_NUMBERS = 1 << 32
 
-# What strategy images may take, in bytes, before the render is refused.
+# Bytes that strategy images may take.
 STRATEGY_MEMORY = 2 << 30
 
-# Bytes of a number in the sums of a pass, in single or in double precision; and in those of all passes, of
-# which there are two while the former are added, in double precision.
+# Bytes per number in the sums of a pass (single, double), and in the total (double, held twice while adding).
 SINGLE, DOUBLE, ALL = 4, 8, 2 * 8
 
-# Bytes of a number of the film while the image is made of the sums: two in double, three in single precision.
+# Bytes per number of the film while it is developed: two in double, three in single precision.
 OF_IMAGE = 2 * DOUBLE + 3 * SINGLE
 
-# Images in double precision while the variance is computed: two of two halves, and six of both.
+# Images in double precision for the variance: two in each half, and six while it is computed.
 OF_VARIANCE = 2 * 2 + 6
 
 
 def check_film(film, channels: Channels, variance: bool):
-    """Raise `UsageError` if the film takes more memory than there is, or more numbers than Dr.Jit counts."""
+    """Raise `UsageError` if the film exceeds the memory or Dr.Jit's array size."""
     width, height = (int(x) for x in film.crop_size())
     numbers = width * height * max(channels.camera, channels.light)
     per_pixel = channels.camera * (SINGLE + ALL) + channels.light * (DOUBLE + ALL)
     of_film = channels.camera + channels.stokes
-    if variance:  # and sums at the last replicate
+    if variance:  # and the sums at the last replicate
         of_film += channels.colours
         per_pixel += DOUBLE * (channels.camera + channels.light + OF_VARIANCE * channels.colours)
     needed, there = width * height * (per_pixel + OF_IMAGE * of_film), memory.available()
-    # What a GPU has is not known here.
+    # The memory of a GPU is not known here.
     on_gpu = (mi.variant() or "").startswith("cuda")
     if needed > there.bytes and not on_gpu:
         raise UsageError(
@@ -54,10 +53,10 @@ def check_film(film, channels: Channels, variance: bool):
 def check_strategies(film, depth: int, merges: bool):
     """Raise `UsageError` if strategy images take more than `STRATEGY_MEMORY`.
 
-    They are those of paths of up to ``depth`` edges, and of ``merges`` if there are some.
+    Images of paths of up to ``depth`` edges, and of ``merges`` if true.
     """
     width, height = (int(x) for x in film.crop_size())
-    # Six channels of each: three weighted, three not.
+    # Six channels of each: three weighted, three unweighted.
     needed = image_count(depth, merges) * width * height * 6 * (DOUBLE + ALL)
     if needed > STRATEGY_MEMORY:
         raise UsageError(

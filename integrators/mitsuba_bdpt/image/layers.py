@@ -1,30 +1,33 @@
-"""The numbering of strategies: which (s, t) exist, and the film's layers."""
+"""Numbering of strategies (s, t), and the film's layers."""
 
 from __future__ import annotations
 
 from . import stokes as stokes_layers
 
-# Names of the layers of a denoised image.
+# Layers of the denoised image.
 DENOISED = ("denoised.R", "denoised.G", "denoised.B")
 
 
 def strategies(depth: int):
-    """All ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, in order: k + 2 of each length."""
+    """Return all ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, in order.
+
+    There are k + 2 of each length k.
+    """
     return [(k, s, k + 1 - s) for k in range(1, depth + 1) for s in range(k + 2)]
 
 
 def strategy_count(depth: int) -> int:
-    """How many strategies make the paths of up to ``depth`` edges."""
+    """Return the number of strategies for paths of up to ``depth`` edges."""
     return depth * (depth + 5) // 2
 
 
 def image_count(depth: int, merges: bool) -> int:
-    """How many strategies have images: those of `strategies`, and where there are ``merges`` all of these."""
+    """Return the number of strategy images: `strategies`, and one of all ``merges``."""
     return strategy_count(depth) + merges
 
 
 def strategy_index(s, t):
-    """Place of the strategy (s, t) in `strategies`; integers or arrays of them."""
+    """Return the index of (s, t) in `strategies`; integers or arrays."""
     k = s + t - 1
     return (k - 1) * (k + 4) // 2 + s
 
@@ -38,11 +41,10 @@ def layer_names(
     denoise: bool = False,
     stokes: bool = False,
 ) -> list[str]:
-    """Names of the film's layers, in the order in which `Accumulator` keeps them.
+    """Return the names of the film's layers, in the order of `Accumulator`.
 
-    Those of ``stokes``, ``features``, those of ``denoise``, the variance of the pixels in the film's
-    ``colours``, and technique images of paths of up to ``depth`` edges, with one of all ``merges`` if there
-    are some.
+    Layers of ``stokes``, ``features``, ``denoise``, the variance of ``colours``, and strategy images of paths
+    of up to ``depth`` edges, with one of all ``merges`` if true.
     """
     names = [*(stokes_layers.NAMES if stokes else ()), *features, *(DENOISED if denoise else ())]
     names += [f"variance.{colour}" for colour in colours if variance]

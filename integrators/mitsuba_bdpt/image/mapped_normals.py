@@ -1,7 +1,7 @@
-"""Shading normals of bump and normal maps, which Mitsuba's BSDFs do not return to Python.
+"""Shading normals of bump and normal maps.
 
-Where the map is the shape's own BSDF, as in ``aov`` of Mitsuba 3.9.1; one that is nested in another BSDF is
-not looked for.
+Mitsuba does not expose them to Python. Only maps that are a shape's outermost BSDF, as in ``aov`` of Mitsuba
+3.9.1.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from ..host.introspection import children, own_parameters
 
 _CLASSES = {"BumpMap": "bumpmap", "NormalMap": "normalmap"}
 
-# Directions by which a map is compared with another one, see `_flips`.
+# Directions compared in `_flips`.
 _COMPARED = 1 << 12
 
 
 class MappedNormals:
-    """The shading normals of hits of a scene whose shapes have these ``bsdfs``."""
+    """Shading normals at hits of a scene whose shapes have these ``bsdfs``."""
 
     def __init__(self, bsdfs: Iterable[mi.BSDF]):
         found = {id(b): b for b in bsdfs if b.class_name() in _CLASSES}
         self._maps = [_Map(bsdf) for bsdf in found.values()]
 
     def at(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, of_aov: bool) -> mi.Normal3f:
-        """The shading normal at ``si``, whose shape has this ``bsdf``.
+        """Return the shading normal at ``si``, in world space.
 
-        In the world's coordinates; as ``of_aov`` those of bump maps are in the coordinates of the frame.
+        With ``of_aov``, normals of bump maps are in the shading frame, as in ``aov``.
         """
         normal = mi.Normal3f(si.sh_frame.n)
         for one in self._maps:
@@ -51,15 +51,15 @@ class _Map:
         self._scale = own_parameters(bsdf)["scale"] if self.bumps else 1
 
     def normal(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
-        """The normal at ``si``, in the shading frame."""
+        """Return the normal at ``si``, in the shading frame."""
         local = self._bumped(si, active) if self.bumps else self._read(si, active)
-        if self._flips:  # to the side from which the surface is seen
+        if self._flips:  # to the side of `si.wi`
             away = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.wi, local) <= 0
             local = dr.select(away, mi.Normal3f(-local.x, -local.y, local.z), local)
         return dr.normalize(local)
 
     def _bumped(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
-        """The normal of the displaced surface."""
+        """Return the normal of the displaced surface."""
         slope, n = self._scale * self._texture.eval_1_grad(si, active), si.sh_frame.n
         along_u = si.dp_du + n * (slope.x - dr.dot(n, si.dp_du))
         along_v = si.dp_dv + n * (slope.y - dr.dot(n, si.dp_dv))
@@ -67,15 +67,14 @@ class _Map:
         return mi.Normal3f(si.to_local(dr.select(dr.dot(si.n, normal) < 0, -normal, normal)))
 
     def _read(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Normal3f:
-        """The normal that the texture holds."""
+        """Return the normal stored in the texture."""
         return mi.Normal3f(self._texture.eval_3(si, active) * 2 - 1)
 
 
 def _flips(bsdf: mi.BSDF) -> bool:
-    """Whether ``flip_invalid_normals`` is set, which Mitsuba keeps to itself.
+    """Return whether ``flip_invalid_normals`` is set, which Mitsuba does not expose.
 
-    A copy of the map that does is compared with it, by the directions that they sample at grazing incidence,
-    where normals are flipped.
+    Compares the sampled directions of the map with those of a copy that flips, at grazing incidence.
     """
     rng = np.random.default_rng(1)
     u, turn = rng.random((3, _COMPARED)), 2 * np.pi * rng.random(_COMPARED)

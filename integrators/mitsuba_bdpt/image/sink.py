@@ -1,8 +1,8 @@
-"""Where a kernel puts its contributions: into the image. (A pilot has another sink, see `pilot`.)
+"""Sink of the kernel's contributions: the image. (`planning.pilot` has another.)
 
-A sink has ``alpha``, whether the last event of a camera subpath matters, and the methods of `Image`:
-``begin`` and ``add`` for what a camera subpath finds, ``connect`` for its inner connections, ``end`` when it
-is done, ``splat`` for contributions with t <= 1. The last three return `Counters`.
+A sink has ``alpha`` (whether the last event of a camera subpath matters) and the methods of `Image`:
+``begin``, ``add`` (a contribution of a camera subpath), ``connect`` (its inner connections), ``end`` (the
+camera sample is complete) and ``splat`` (t <= 1). The last three return `Counters`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from ..transport.contribution import Counters, one
 class Image:
     """Adds contributions to a film's raw sums (an `Accumulator`).
 
-    What a camera subpath finds goes through a running ``total``, which begins as `begin` says; splats go to
-    the film at once.
+    Contributions with t >= 2 are summed in ``total``; splats are added at once.
     """
 
     def __init__(self, film):
@@ -27,7 +26,7 @@ class Image:
         self.alpha = film.alpha
 
     def begin(self):
-        """Nothing found yet."""
+        """Return the initial ``total``."""
         return dr.zeros(mi.Spectrum)
 
     def add(self, kernel, c, total, start, shared):
@@ -37,7 +36,10 @@ class Image:
         return total + c.weighted()
 
     def connect(self, kernel, z, lane, stream, total, start):
-        """Join the camera vertex ``z`` with the light vertices of its lane: the ``total``, and `Counters`."""
+        """Connect the camera vertex ``z`` to light vertices of its lane.
+
+        Returns the ``total`` and `Counters`.
+        """
         if kernel.plan.connections == "all":
 
             def add(_, seen, total):
@@ -50,8 +52,8 @@ class Image:
     def splat(self, kernel, c, shared) -> Counters:
         """Add a contribution with t <= 1.
 
-        Colours that are not finite (`contribution.drop_non_finite` has seen the contribution, not what the
-        film makes of it) count as zero.
+        Non-finite colours count as zero (`contribution.drop_non_finite` tests the contribution, not its
+        colours).
         """
         whole = polarization.scaled(c.weighted(), shared.weight)
         value = self._film.colour(whole, shared.wavelengths)
@@ -63,7 +65,7 @@ class Image:
         return Counters(non_finite=one(c.active & ~finite))
 
     def end(self, kernel, lane, sample, total, seen) -> Counters:
-        """Add a camera sample; colours that are not finite, sums of finite ones, count as zero."""
+        """Add a camera sample; non-finite colours (sums of finite ones) count as zero."""
         film, shared, start = self._film, lane.shared, sample.start
         features, finite = [], mi.Bool(True)
         if film.features is not None:
@@ -81,7 +83,7 @@ class Image:
         return Counters(non_finite=one(sample.covered & ~finite) + one(sample.covered & ~shown))
 
     def _polarized(self, value, shared, towards) -> list:
-        """What the film keeps of a Stokes vector besides the intensity, of light that travels ``towards``."""
+        """Return the Stokes channels, beside the intensity, of light along ``towards``."""
         stokes = self._film.stokes
         return [] if stokes is None else stokes(value, shared.wavelengths, towards)
 
@@ -93,12 +95,12 @@ class Image:
 
 
 def _all_finite(values):
-    """Whether all are; recorded where there are some."""
+    """Return whether all are finite; records nothing for an empty list."""
     return dr.isfinite(sum(values)) if values else True
 
 
 def _alpha(kernel, seen):
-    """Alpha of a camera sample, as in `path`: a visible environment covers the image."""
+    """Return alpha of a camera sample, as in `path`: a visible environment is opaque."""
     opaque = seen
     if not kernel.plan.hide_emitters and kernel.scene.environment() is not None:
         opaque = kernel.max_depth >= 1

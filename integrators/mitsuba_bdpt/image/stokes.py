@@ -1,4 +1,4 @@
-"""Layers of the Stokes vector, as Mitsuba's integrator ``stokes`` writes them."""
+"""Layers of the Stokes vector, as in Mitsuba's integrator ``stokes``."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ POLARIZED = 9
 
 
 class Stokes:
-    """The Stokes vectors of samples, in the frame of a ``sensor`` whose x axis is horizontal.
+    """Stokes vectors of samples, in the frame of a ``sensor`` with horizontal x axis.
 
-    S1 > 0: more horizontal than vertical light; S2 > 0: more of it at +45 than at -45 degrees; S3 > 0: more
-    right than left circular.
+    S1 > 0: horizontal; S2 > 0: +45 degrees; S3 > 0: right circular polarization.
     """
 
     def __init__(self, sensor: mi.Sensor, rgb):
@@ -28,10 +27,10 @@ class Stokes:
         self._rgb = rgb
 
     def __call__(self, value: mi.Spectrum, wavelengths, towards: mi.Vector3f) -> list[mi.Float]:
-        """S1, S2 and S3 of light that travels along ``towards`` to the sensor.
+        """Return S1, S2 and S3 of light that travels along ``towards`` to the sensor.
 
-        The first column of the matrix ``value`` is its Stokes vector in the frame that follows from that
-        direction.
+        The first column of the Mueller matrix ``value`` is the Stokes vector in the frame
+        `polarization.basis`.
         """
         target = dr.cross(-towards, self._vertical)
         turned = mi.mueller.rotate_stokes_basis(towards, basis(towards), target)
