@@ -1,4 +1,4 @@
-"""The arguments of a render, checked."""
+"""Checks of the arguments of a render."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .snapshot import Snapshot
 
 
 def check_made_for(integrator, scene):
-    """Raise ``UsageTypeError`` if ``integrator`` or ``scene`` belongs to another variant than the present."""
+    """Raise ``UsageTypeError`` if ``integrator`` or ``scene`` is of another variant."""
     for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):
         if not isinstance(thing, kind):
             raise UsageTypeError(
@@ -22,7 +22,7 @@ def check_made_for(integrator, scene):
 
 
 def check_resumable(start):
-    """Raise `UsageError` or `UsageTypeError` if a render cannot go on from ``start``."""
+    """Raise `UsageError` or `UsageTypeError` if ``start`` cannot be continued."""
     if not isinstance(start, Snapshot):
         raise UsageTypeError(f"start={type(start).__name__} must be a snapshot from a PassReport")
     if not start.progress.whole:
@@ -30,7 +30,7 @@ def check_resumable(start):
 
 
 def resolve_sensor(scene, sensor):
-    """The sensor that the argument ``sensor`` means, an index or the sensor itself.
+    """Return the sensor for ``sensor``, an index or the sensor itself.
 
     Raises `UsageError` and `UsageTypeError`.
     """
@@ -47,7 +47,7 @@ def resolve_sensor(scene, sensor):
 
 
 def samples_per_pixel(sensor, spp, settings) -> int:
-    """Samples per pixel of a render that was asked for ``spp``."""
+    """Return the samples per pixel for the argument ``spp``; 0 is the sampler's count."""
     spp = integer(spp, "spp", 0) or int(sensor.sampler().sample_count())
     if not spp:
         raise UsageError(

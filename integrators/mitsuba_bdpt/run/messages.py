@@ -1,4 +1,4 @@
-"""What is logged of a render: its statistics, and warnings about parameters that spoil images."""
+"""Log messages of a render: statistics, and warnings about scene parameters."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
 from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
 
-# Culprits that a message names, at most.
+# Largest number of causes that a message lists.
 NAMED = 5
 
 
 def log(statistics: dict):
-    """Log what a render did, and warn if its error is not known."""
+    """Log the statistics of a render, and warn if its error is unknown."""
     seconds = statistics["seconds"]
     mi.Log(
         mi.LogLevel.Info,
@@ -42,7 +42,7 @@ def log(statistics: dict):
 
 
 def warn_of_parameters(scene, sensor):
-    """Say once what in the ``scene`` spoils images."""
+    """Warn once about scene parameters that spoil images."""
     bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
     narrow = narrow_spots(scene)
     if bright:
@@ -62,7 +62,7 @@ def warn_of_parameters(scene, sensor):
 
 
 def warn_of_media(prepared, sensor):
-    """Say once what in the media of a prepared scene makes an image other than expected."""
+    """Warn once about media of a prepared scene that are ignored or contradictory."""
     media = prepared.light_media
     if media is None:
         return
@@ -87,25 +87,25 @@ def warn_of_media(prepared, sensor):
 
 
 def warn_of_lost_light(prepared, plan, text: str):
-    """Warn once, for a scene and ``plan``, of light that is not sampled, unless the ``text`` is empty."""
+    """Warn once per scene and ``plan`` of unsampled light, unless ``text`` is empty."""
     if text:
         warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
 
 
 def warn_of_missed_direct(prepared, texts: list[str]):
-    """Warn once of light on the sensor that is not sampled; an empty text is no warning."""
+    """Warn once of unsampled light on the sensor; empty ``texts`` are skipped."""
     for text in filter(None, texts):
         warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
 def _some(found: list[str]) -> str:
-    """The first `NAMED` of them, and how many more there are."""
+    """Return the first `NAMED` entries, and the number of the others."""
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     return ", ".join(found[:NAMED]) + more
 
 
 def warn_of_late_decisions(decisions, passes: int):
-    """Warn of ``decisions`` for passes that the render of so many did not have."""
+    """Warn of ``decisions`` for passes beyond the render's ``passes``."""
     late = [decision.first_pass for decision in decisions or () if decision.first_pass >= passes]
     if late:
         mi.Log(
@@ -116,10 +116,7 @@ def warn_of_late_decisions(decisions, passes: int):
 
 
 def warn_of_non_finite(statistics: dict, scene):
-    """Warn of values that were not finite, and name the parameters in which to look for the cause.
-
-    Of each render, since it is about its image.
-    """
+    """Warn of non-finite values in a render, and name scene parameters that hold some."""
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return

@@ -1,4 +1,4 @@
-"""One render from its first sample to the film."""
+"""One render, from its first sample to the film."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from .statistics import Meter, rays
 class PassReport:
     """Progress after a pass.
 
-    ``snapshot`` and ``image`` may be called until the next pass has been reported.
+    ``snapshot`` and ``image`` are valid until the report of the next pass.
     """
 
     spp_done: int
@@ -67,10 +67,11 @@ class PassReport:
 
 
 class Render:
-    """One render of ``spp`` samples per pixel; lives for one call.
+    """One render of ``spp`` samples per pixel, used for a single call.
 
-    ``prepared`` scene; ``planner``, which decides the plan of the ``kernel``; ``points`` of the passes;
-    ``accumulator`` of the image; ``meter`` of what is done."""
+    ``prepared``: the scene; ``planner``: decides the ``plan`` of the ``kernel``; ``points``: random numbers
+    of the passes; ``accumulator``: sums of the image; ``meter``: counts of work and times.
+    """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
         check_variant()
@@ -99,32 +100,32 @@ class Render:
             sensor.film(), colour, border, *strategies, settings.variance, features
         )
         self.kernel = self._kernel()
-        # What `_guide` has made.
+        # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None
-        # Whether the first pass, of one sample, gives the scale of the image, to roulette and to the share of
-        # light that is not sampled; see `_steps`.
+        # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette and
+        # for the share of unsampled light; see `_steps`.
         self._small_first: bool | None = None
         self._error: float | None = None
-        # Of the newest report, see `_freeze`.
+        # State of the newest report, see `_freeze`.
         self._state: tuple[tuple[int, ...], Progress, dict] | None = None
 
     @property
     def passes(self) -> tuple[int, ...]:
-        """Samples per pixel of each pass that is done."""
+        """Samples per pixel of each finished pass."""
         return self.accumulator.passes
 
     @property
     def plan(self) -> Plan:
-        """What is traced, as decided so far."""
+        """The strategies in use, as decided so far."""
         return self.planner.plan
 
     def run(
         self, on_pass: Callable[[PassReport], object] | None, cancelled: Callable[[], bool] = lambda: False
     ):
-        """Trace the samples.
+        """Trace the samples, and store the image in the film.
 
-        Fewer under ``timeout``, when ``cancelled()`` after a pass, or when interrupted. ``on_pass``, or
-        ``None``, gets a `PassReport` after each pass.
+        Ends early at ``timeout``, ``target_error``, when ``cancelled()`` after a pass, or by an interruption.
+        ``on_pass`` is called with a `PassReport` after each pass.
         """
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
@@ -132,7 +133,7 @@ class Render:
             if not self.passes:
                 self.decide()
             for number, step in enumerate(self._steps()):
-                if not number and self._is_exact_enough():  # the one that it goes on from was
+                if not number and self._is_exact_enough():  # the snapshot is exact enough already
                     break
                 self._decide_again()
                 if not number:
@@ -144,7 +145,7 @@ class Render:
                 self._pass(step)
                 if not number:
                     self.lost_light()
-                # The second pass is recorded while the first, a short one, runs.
+                # Records the second pass while the first, a short one, runs.
                 if watched or number > 0:
                     self.meter.wait()
                 if step.last and self.settings.variance:
@@ -158,7 +159,7 @@ class Render:
 
     @contextmanager
     def _finished(self):
-        """At its end, whatever ends it, the passes that are done are in the film."""
+        """At exit, also by an exception, store the finished passes in the film."""
         try:
             yield
         except RuntimeError as error:
@@ -171,10 +172,10 @@ class Render:
                 self.accumulator.finish()
 
     def decide(self) -> list[Prediction]:
-        """Adopt what the scene alone or a pilot decides about the rest of the render.
+        """Apply the decision of the scene or of a pilot to the rest of the render.
 
-        Only if there is a choice and the render is long enough to pay for a pilot. Returns all predictions of
-        the pilot, the best first.
+        Does nothing without alternatives, or if the render is too short for a pilot. Returns all predictions
+        of the pilot, the best first.
         """
         table = []
         if self.planner.begin(self.passes):
@@ -184,31 +185,34 @@ class Render:
         return table
 
     def replay(self):
-        """Adopt the decision that the parameters give for the next pass, if there is one."""
+        """Apply the decision for the next pass that the parameters give, if any."""
         self.planner.replay(self.passes)
         self._use_plan()
 
     def _decide_again(self):
-        """Replay the decision for the next pass; or, early in a long render, ask another pilot."""
+        """Replay the decision for the next pass, or run another pilot early in a render."""
         if self.settings.decisions:
             self.replay()
         elif self.planner.is_repeat_due(self.passes):
             self.decide()
 
     def _use_plan(self):
-        """Trace by the present plan from now on."""
+        """Use the present plan from now on."""
         if self.kernel.plan is not self.plan:
             self.kernel = self._kernel()
 
     def _kernel(self) -> Kernel:
-        """The kernel of the present plan."""
+        """Return the kernel of the present plan."""
         kernel = Kernel(self.prepared, self.plan, self.settings, mis.Heuristic(self.settings.heuristic))
         if self.planner.threshold and self.plan.roulette:
             kernel.set_threshold(dr.opaque(mi.Float64, self.planner.threshold))
         return kernel
 
     def _steps(self) -> Iterator[Step]:
-        """The passes of `schedule` that are not done; under ``timeout`` cut to about a tenth of it."""
+        """Yield the remaining passes of `schedule`.
+
+        Under ``timeout``, a pass takes at most about a tenth of it.
+        """
         if self._small_first is None:
             plan, decisions = self.plan, self.settings.decisions
             known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
@@ -226,14 +230,14 @@ class Render:
                 done += size
 
     def _affordable(self, size: int) -> int:
-        """Samples per pixel of a pass of ``size`` under ``timeout``."""
+        """Return the samples per pixel of a pass of ``size`` that fit into ``timeout``."""
         if not 0 <= self.settings.timeout < math.inf:
             return size
         rate = self.meter.rate(sum(self.passes))
         return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
 
     def _pass(self, step: Step):
-        """Trace one pass, a launch for each of its batches."""
+        """Trace one pass, with a launch for each batch."""
         first = not self.passes and self.planner.threshold is None
         if self.plan.guided:
             self.kernel.guide = self._guide()
@@ -253,11 +257,14 @@ class Render:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
 
     def _radius_in_pixels(self, done: int) -> float:
-        """Of the pass after ``done`` others of the same image, or replicate."""
+        """Return the merging radius after ``done`` passes of the same image or replicate."""
         return self.settings.internals.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
 
     def _photons(self, step: Step, footprints: Footprints) -> Merging:
-        """The photons of a pass, whose radius follows from the passes done of the same image or replicate."""
+        """Trace the photons of a pass.
+
+        Their merging radius follows from the number of passes done of the same image or replicate.
+        """
         done = passes_since(self.passes, step.done)
         factor = self._radius_in_pixels(done)
         pixels = int(self.prepared.camera.region.size.prod())
@@ -277,7 +284,7 @@ class Render:
         return merging
 
     def _guide(self) -> Guide | None:
-        """What guides s = 0 in all passes, traced before the first; None if there are no photons."""
+        """Return the photon guide, traced before the first pass; None without photons."""
         if self._guides is None:
             count = photon_pass.photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
             with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
@@ -287,7 +294,7 @@ class Render:
         return self._guides[0]
 
     def _is_exact_enough(self) -> bool:
-        """Whether a group of replicates is whole and its error is what ``target_error`` asks for."""
+        """Return whether a full group of replicates reaches ``target_error``."""
         if not self.settings.target_error or not self.accumulator.ends_replicates():
             return False
         if self.accumulator.replicates.count % REPLICATES:
@@ -296,25 +303,25 @@ class Render:
         return self._error <= self.settings.target_error
 
     def report(self) -> PassReport:
-        """Progress so far, for ``on_pass``."""
+        """Return the progress so far, for ``on_pass``."""
         self._state = self._freeze()
         done, counts = len(self.passes), sum(rays(self).values())
         made = partial(self._snapshot, done), partial(self._image, done)
         return PassReport(sum(self.passes), self.spp, self.meter.work.seconds, counts, self._error, *made)
 
     def _freeze(self) -> tuple[tuple[int, ...], Progress, dict]:
-        """Passes, progress and arrays of a snapshot of now, also when the next pass has begun.
+        """Return passes, progress and arrays of a snapshot, without copies.
 
-        An interruption may come between any two of its steps. Nothing is copied yet.
+        The state is consistent even if an interruption comes while the next pass is recorded.
         """
         passes, arrays = self.accumulator.store()
         progress = Progress(self.planner.decided, self.meter.work, self.accumulator.halves, self._small_first)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
-        """The snapshot of the report after so many passes.
+        """Return the snapshot of the report after ``reported`` passes.
 
-        Raises `UsageError` if a later report was made: each would keep the sums of its time.
+        Raises `UsageError` after a later report: every report would keep its own sums.
         """
         state = self._state
         if state is None or len(state[0]) != reported:
@@ -327,7 +334,7 @@ class Render:
         return Snapshot(self._identity(), passes, progress, arrays)
 
     def _image(self, reported: int):
-        """The image of the report after so many passes; raises `UsageError` as `_snapshot` does."""
+        """Return the image of the report after ``reported`` passes; raises as `_snapshot`."""
         if len(self.passes) != reported:
             raise UsageError(
                 f"image() of the report after {reported} passes came too late; only the newest report has one"
@@ -338,11 +345,11 @@ class Render:
         return image
 
     def _identity(self) -> dict:
-        """See `snapshot.identity`."""
+        """Return `snapshot.identity` of this render."""
         return identity(self.settings, self.accumulator, int(self.points.seed[0]), self.spp)
 
     def resume(self, snapshot: Snapshot, apart_from=()):
-        """Go on after the passes of a snapshot.
+        """Continue after the passes of a snapshot.
 
         Raises `UsageError` if it is of another render, see `Snapshot.check`.
         """
@@ -356,9 +363,9 @@ class Render:
         self._small_first = progress.small_first
 
     def lost_light(self) -> dict[int, float]:
-        """Shares of the image's light that no strategy in use samples, by the index of the emitter.
+        """Return shares of the image's light that are not sampled, by emitter index.
 
-        A warning says so, once for a scene and plan, where they are large.
+        Warns of large shares, once per scene and plan.
         """
         lost = self._lost() if self.passes else None
         if lost is None:
@@ -369,9 +376,9 @@ class Render:
         return shares
 
     def _lost(self) -> LostLight | None:
-        """Light that no strategy in use samples; None if there is none.
+        """Return the unsampled light transport; None if there is none.
 
-        Estimated once for a scene and plan, until an edit.
+        Estimated once per scene and plan, and again after edits.
         """
         prepared, plan, max_depth = self.prepared, self.plan, self.settings.max_depth
         if not lost_light.is_possible(prepared, plan, self.settings):
@@ -381,9 +388,9 @@ class Render:
         return lost if lost.colours else None
 
     def predicted_loss(self) -> str:
-        """The warning about light that is not sampled, before the first pass; empty if there is none.
+        """Return the warning about unsampled light before the first pass.
 
-        Empty too where no decision knows the image's mean.
+        Empty if there is none, or if no decision has estimated the image's mean.
         """
         made = self.planner.decided.decisions
         lost = self._lost() if made and made[-1].mean > 0 else None
@@ -394,9 +401,9 @@ class Render:
 
 
 def raise_interrupt(error: BaseException):
-    """Raise the ``KeyboardInterrupt`` that is behind ``error``, if one is.
+    """Raise the ``KeyboardInterrupt`` that ``error`` wraps, if any.
 
-    Dr.Jit makes a ``RuntimeError`` of all that comes while it records a loop or a call.
+    Dr.Jit converts exceptions within a recorded loop or call to ``RuntimeError``.
     """
     cause = behind(error, KeyboardInterrupt)
     if cause is not None:

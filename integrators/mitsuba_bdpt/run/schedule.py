@@ -1,4 +1,4 @@
-"""Schedules a render as passes and kernel launches, and gives passes their random numbers."""
+"""Splits a render into passes and kernel launches, and seeds their random numbers."""
 
 from __future__ import annotations
 
@@ -14,37 +14,34 @@ from ..settings import Settings
 from ..transport.batch import Batch
 from ..transport.photons.wavelength_sets import WavelengthSets
 
-# Samples in one kernel launch, but for launches of one row, which may have four times as many (see
-# `batches`). Nothing per sample is kept in memory, so this only bounds how long a launch runs (seconds on a
-# few cores) and with it the delay of Ctrl-C, timeout and progress.
+# Samples per kernel launch (four times as many in a launch of one row, see `batches`). Bounds the duration of
+# a launch (seconds on a few cores), and thus the delay of Ctrl-C, timeout and progress; it needs no memory.
 LAUNCH_SAMPLES = 1 << 21
 
-# The same on a GPU, which traces 2^21 camera subpaths in less time than Python needs to record the pass
-# (docs/development/experiments.md, "CUDA").
+# The same on a GPU: smaller launches take less time than recording a pass (see experiments, section CUDA).
 LAUNCH_SAMPLES_CUDA = 1 << 24
 
-# Samples that one pixel's sum takes in single precision: the rounding grows with them, is the same in
-# every pass and does not average out (constant radiance, 2^12: 4e-6; 2^16: 5e-5; 2^20: 1e-3).
+# Samples per pixel summed in single precision. Bounds the rounding error, which is systematic (relative error
+# 4e-6 at 2^12, 5e-5 at 2^16).
 MOST_SPP = 1 << 12
 
-# Independent images whose spread gives the variance: as few as the contract allows, since each has a
-# point sequence of its own and short sequences are worse.
+# Independent images for the variance. Few, since each has its own, shorter sequence of points.
 REPLICATES = 8
 
-# Samples per pixel of each of the first `REPLICATES` under ``target_error``.
+# Samples per pixel of each of the first `REPLICATES` images under ``target_error``.
 FIRST_REPLICATE = 4
 
 
 def _most_samples() -> int:
-    """Samples in one launch."""
+    """Return the maximum number of samples per launch."""
     return LAUNCH_SAMPLES_CUDA if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else LAUNCH_SAMPLES
 
 
 def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
-    """Samples per pixel of each pass, in order, ``spp`` in all; the first is 1 if ``small_first``."""
+    """Return the samples per pixel of each pass; the first has 1 if ``small_first``."""
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
-    # One row of pixels fits into four launches' worth, see `batches`.
+    # One row of pixels has to fit into four launches, see `batches`.
     most = min(MOST_SPP, max(4 * limit // width, 1))
     size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
     sizes = []
@@ -55,10 +52,10 @@ def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) 
 
 @dataclass(frozen=True)
 class Step:
-    """A pass: ``size`` samples per pixel after ``done`` of the ``of`` of its replicate.
+    """A pass: ``size`` samples per pixel, after ``done`` of its replicate's ``of``.
 
-    ``last``: whether it ends the replicate; ``replicate`` counts the independent images that `variance`
-    needs, else 0.
+    ``last``: whether it ends the replicate; ``replicate``: index of the independent image, 0 without
+    `variance`.
     """
 
     replicate: int
@@ -69,7 +66,7 @@ class Step:
 
 
 def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[Step]:
-    """All passes of a render of ``spp`` samples per pixel; ``small_first`` see `pass_sizes`."""
+    """Return all passes of a render; ``small_first``: see `pass_sizes`."""
     parts = [spp]
     if settings.variance:
         parts = _replicates(spp, bool(settings.target_error))
@@ -83,10 +80,10 @@ def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) ->
 
 
 def _replicates(spp: int, growing: bool) -> list[int]:
-    """Samples per pixel of the replicates: `REPLICATES` of them.
+    """Return the samples per pixel of the replicates: `REPLICATES` of them.
 
-    Or, if ``growing``, groups of so many, each group as large as all before it, so that half of the samples
-    lie in few long sequences.
+    If ``growing``, groups of `REPLICATES`, each with as many samples as all groups before it, so that half of
+    the samples have long sequences.
     """
     sizes = []
     while (left := spp - sum(sizes)) > 0:
@@ -96,7 +93,7 @@ def _replicates(spp: int, growing: bool) -> list[int]:
 
 
 def passes_since(passes: tuple[int, ...], done: int) -> int:
-    """How many of the ``passes`` done, the last ones, make up ``done`` samples per pixel."""
+    """Return how many of the last ``passes`` add up to ``done`` samples per pixel."""
     count = 0
     while done > 0:
         count += 1
@@ -105,7 +102,7 @@ def passes_since(passes: tuple[int, ...], done: int) -> int:
 
 
 def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings):
-    """Cut a pass into bands of rows that one kernel launch can take."""
+    """Split a pass into bands of rows, one kernel launch each."""
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     rows = (
@@ -119,18 +116,15 @@ def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings)
 
 
 class PassPoints:
-    """Gives each pass of one render its random numbers.
-
-    They are sequences of the render's ``seed`` (``UInt32``).
-    """
+    """Random numbers of each pass of a render, from its ``seed`` (``UInt32``)."""
 
     def __init__(self, settings: Settings, seed):
         self._kind, self.seed = settings.points, seed
 
     def of(self, step: Step, changes: int) -> Points:
-        """The points of the pass ``step``.
+        """Return the points of the pass ``step``.
 
-        ``changes``: how often the plan changed before, see `Planner.adopt`.
+        ``changes``: number of changes of the plan before, see `Planner.adopt`.
         """
         seed = self.seed
         number = step.replicate + (CHANGED + changes if changes else 0)
@@ -139,23 +133,23 @@ class PassPoints:
         return Points(self._kind, seed)
 
     def wavelengths(self, step: Step, done: int, changes: int) -> WavelengthSets:
-        """The wavelengths of a pass after ``done`` others of the same image, or replicate, with merging."""
+        """Return the wavelengths of a merging pass, after ``done`` passes of its image."""
         start, _ = sequential(self._seed_beside(WAVELENGTHS, step, changes))
         return WavelengthSets.of(start, done)
 
     def _seed_beside(self, sequence: int, step: Step, changes: int) -> mi.UInt32:
-        """The seed of a ``sequence`` of ours: others for each replicate and after changes of the plan."""
+        """Return the seed of a ``sequence``, distinct by replicate and change of plan."""
         seed = sequence_seed(self.seed, sequence)
         if number := step.replicate + (CHANGED + changes if changes else 0):
             seed = sequence_seed(seed, number)
         return seed
 
     def of_photons(self, step: Step, done: int, changes: int) -> Points:
-        """The points of the photons of a pass after ``done`` others of the same image, or replicate."""
+        """Return the points of the photons of a pass, after ``done`` passes of its image."""
         seed = self._seed_beside(PHOTONS + done, step, changes)
         return Points(self._kind, seed)
 
     def of_guide(self) -> Points:
-        """The points of the photons that guide s = 0."""
+        """Return the points of the photons that guide BSDF sampling."""
         seed = sequence_seed(self.seed, GUIDE)
         return Points(self._kind, seed)

@@ -1,4 +1,4 @@
-"""A render between two passes, as plain numbers: to go on later, or to be joined with others elsewhere."""
+"""The state of a render between passes, as plain numbers, to continue or to merge."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ from .statistics import Work
 class Progress:
     """Progress of a render after a pass.
 
-    What was ``decided``, the ``work`` that was done, the two ``halves`` of the replicates, ``None`` without
-    `variance` (see `image.replicates`); ``small_first``: whether the first pass is one of a single sample,
-    ``None`` before it is known; ``whole``: whether a render can go on from it, and not only be joined;
-    ``scene``: a digest of the scene's files, if whoever keeps it has made one."""
+    ``decided``: decisions so far; ``work``: counts; ``halves``: those of the replicates, ``None`` without
+    `variance` (see `image.replicates`); ``small_first``: whether the first pass has one sample per pixel,
+    ``None`` if not yet known; ``whole``: whether a render can continue from it; ``scene``: optional digest of
+    the scene's files.
+    """
 
     decided: Decided = Decided()
     work: Work = Work()
@@ -39,7 +40,7 @@ class Progress:
     scene: str | None = None
 
     def joined(self, other: Progress) -> Progress:
-        """Of two renders that are joined; what was decided is that of the first."""
+        """Return the progress of two merged renders, with the decisions of the first."""
         halves = None
         if self.halves is not None:
             pairs = zip(self.halves, other.halves, strict=True)
@@ -48,11 +49,11 @@ class Progress:
         return joined.image_only()
 
     def image_only(self) -> Progress:
-        """Without what only a render that goes on needs."""
+        """Return a copy without the state that only a continued render needs."""
         return replace(self, whole=False, decided=replace(self.decided, moments=None))
 
     def stored(self) -> tuple[dict, dict]:
-        """Plain values, as JSON holds them, and arrays by name: the fields of all parts side by side."""
+        """Return the fields of all parts: JSON values, and arrays by name."""
         values, arrays = {}, {}
         for part in (self, self.decided, self.work):
             values |= {f.name: getattr(part, f.name) for f in fields(part)}
@@ -69,7 +70,7 @@ class Progress:
 
     @classmethod
     def restored(cls, values: dict, arrays: dict) -> Progress:
-        """What was `stored`; takes its arrays out of ``arrays``."""
+        """Inverse of `stored`; removes its arrays from ``arrays``."""
         values = dict(values)
         decisions = read_decisions(json.dumps(values["decisions"]))
         moments = _arrays(arrays, "moments")
@@ -89,7 +90,7 @@ class Progress:
 
 
 def _split(record, name: str) -> tuple[dict, dict]:
-    """The plain values of a dataclass, and its arrays by name after that of the record."""
+    """Split a dataclass into plain values and arrays, named after the record."""
     values, arrays = {}, {}
     for f in fields(record):
         value = getattr(record, f.name)
@@ -101,23 +102,23 @@ def _split(record, name: str) -> tuple[dict, dict]:
 
 
 def _arrays(arrays: dict, name: str) -> dict:
-    """The arrays of the record of that name, taken out of ``arrays``."""
+    """Remove the arrays of the record ``name`` from ``arrays`` and return them."""
     names = [other for other in arrays if other.startswith(f"{name}.")]
     return {other.removeprefix(f"{name}."): arrays.pop(other) for other in names}
 
 
-# Of what a snapshot holds; another number with every change of that.
+# Version of the stored format; increase with every change.
 FORMAT = 6
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:
-    """What two renders have to have in common for one to go on from the other, as JSON holds it.
+    """Return the values, as JSON, that a render and its continuation must share.
 
-    The scene is not in it.
+    The scene is not included.
     """
     film, values = accumulator.film, asdict(settings)
     del values["timeout"]
-    values["target_error"] = bool(settings.target_error)  # the passes depend on whether there is one
+    values["target_error"] = bool(settings.target_error)  # the passes depend on whether it is set
     values |= {
         "version": __version__,
         "format": FORMAT,
@@ -133,9 +134,9 @@ def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The raw sums of the passes that are done, and everything on which the next pass depends.
+    """Raw sums of the finished passes, and the state on which the next pass depends.
 
-    The scene is not part of it.
+    The scene is not included.
     """
 
     identity: dict
@@ -151,12 +152,12 @@ class Snapshot:
 
     @property
     def spp(self) -> int:
-        """Samples per pixel that are done."""
+        """Finished samples per pixel."""
         return sum(self.passes)
 
     def check(self, identity: dict, apart_from=()):
-        """Raise ``UsageError`` that names the first entry in which ``identity`` differs."""
-        # The version first: parameters of another one may differ in name only.
+        """Raise ``UsageError`` naming the first entry in which ``identity`` differs."""
+        # The version first: parameters may be renamed between versions.
         names = sorted(set(identity) | set(self.identity), key=lambda name: (name != "version", name))
         for name in names:
             mine, given = self.identity.get(name), identity.get(name)
@@ -167,9 +168,9 @@ class Snapshot:
                 )
 
     def joined(self, other: Snapshot) -> Snapshot:
-        """Return both as one render, whose sums and counts are those of both.
+        """Merge two renders: sums and counts are added.
 
-        Raises `UsageError` if they differ in more than seed and samples per pixel, or have a seed in common.
+        Raises `UsageError` if they differ in more than seed and samples per pixel, or share a seed.
         """
         self.check(other.identity, ("seed", "spp"))
         seeds, others = _seeds(self), _seeds(other)
@@ -191,12 +192,12 @@ class Snapshot:
         )
 
     def image_only(self) -> Snapshot:
-        """Return what an image needs, to be sent and joined; a render cannot continue from it."""
+        """Return a smaller snapshot from which a render cannot continue."""
         kept = {n: a for n, a in self.arrays.items() if not n.startswith("replicates.last.")}
         return replace(self, progress=self.progress.image_only(), arrays=kept)
 
     def to_bytes(self) -> bytes:
-        """Return the bytes of a file of NumPy's ``npz`` format, without pickled objects."""
+        """Return the bytes of an ``npz`` file (NumPy), without pickled objects."""
         progress, arrays = self.progress.stored()
         text = json.dumps({"identity": self.identity, "passes": self.passes, "progress": progress})
         file = io.BytesIO()
@@ -205,7 +206,7 @@ class Snapshot:
 
     @staticmethod
     def from_bytes(data: bytes) -> Snapshot:
-        """Return the snapshot that `to_bytes` wrote; raises ``UsageError`` for other bytes."""
+        """Inverse of `to_bytes`; raises ``UsageError`` for other bytes."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
@@ -223,7 +224,7 @@ class Snapshot:
 
 
 def read(path: Path) -> Snapshot:
-    """The snapshot in a file; raises ``UsageError`` naming it if it holds none, ``OSError``."""
+    """Read a snapshot file; raises ``UsageError`` naming the file, or ``OSError``."""
     try:
         return Snapshot.from_bytes(path.read_bytes())
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""A render in numbers: what it has done, how long that took, and the statistics made of it."""
+"""Counts and times of a render, and the statistics computed from them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ..transport.contribution import COUNTERS, MEDIA, MERGING
 
 @dataclass(frozen=True)
 class Work:
-    """What is counted; a part of a render's progress.
+    """Counted work of a render, part of its progress.
 
-    ``counts``: sums of `COUNTERS` by name; kernels ``compiled``, and found ``cached``; ``seconds``
-    in all, of which ``compile_seconds`` compile kernels and ``pilot_seconds`` are those of pilots (apart from
-    their compiling)."""
+    ``counts``: sums of `COUNTERS` by name; ``compiled`` and ``cached`` kernels; ``seconds`` in total, of
+    which ``compile_seconds`` compile kernels and ``pilot_seconds`` run pilots (without compilation).
+    """
 
     counts: dict = field(default_factory=lambda: dict.fromkeys(COUNTERS, 0))
     compiled: int = 0
@@ -30,11 +30,11 @@ class Work:
 
     @property
     def idle_seconds(self) -> float:
-        """In which no samples of the image were traced."""
+        """Seconds without samples of the image."""
         return self.compile_seconds + self.pilot_seconds
 
     def joined(self, other: Work) -> Work:
-        """Of two renders together."""
+        """Return the work of two merged renders."""
         counts = {name: n + other.counts[name] for name, n in self.counts.items()}
         names = [f.name for f in fields(self) if f.name != "counts"]
         sums = {name: getattr(self, name) + getattr(other, name) for name in names}
@@ -42,7 +42,7 @@ class Work:
 
 
 class Meter:
-    """Waits for what one render launches, and notes what it did."""
+    """Waits for the launches of one render, and measures them."""
 
     def __init__(self):
         self._started, self._running = time.perf_counter(), []
@@ -50,32 +50,32 @@ class Meter:
         self._earlier_spp = 0
 
     def resume(self, work: Work, spp: int):
-        """Go on from the ``work`` of an earlier part of the render, of so many samples per pixel."""
+        """Continue from the ``work`` of an earlier part with ``spp`` samples per pixel."""
         self._noted, self._earlier, self._earlier_spp = work, work, spp
 
     @property
     def work(self) -> Work:
-        """All work so far, that of earlier parts of the render included."""
+        """All work so far, including earlier parts of the render."""
         return replace(self._noted, seconds=self._earlier.seconds + self.elapsed())
 
     def elapsed(self) -> float:
-        """Seconds since this part of the render began."""
+        """Return the seconds since this part of the render began."""
         return time.perf_counter() - self._started
 
     def rate(self, spp: int) -> float:
-        """Samples per pixel and second of this part of the render, at ``spp`` in all.
+        """Return samples per pixel and second of this part, at ``spp`` in total.
 
-        Compiling and pilots do not count.
+        Excludes compilation and pilots.
         """
         busy = self.elapsed() - (self._noted.idle_seconds - self._earlier.idle_seconds)
         return (spp - self._earlier_spp) / max(busy, 1e-3)
 
     def launched(self, counts):
-        """A batch runs; its ``counts`` are those of `kernel.trace`."""
+        """Add a launched batch; ``counts`` are those of `kernel.trace`."""
         self._running.append(counts)
 
     def wait(self):
-        """Wait for what was launched, and note what it did and how it was compiled."""
+        """Wait for what was launched, and add its counts and compile times."""
         dr.sync_thread()
         while self._running:
             batch = self._running.pop().numpy().tolist()
@@ -87,9 +87,9 @@ class Meter:
                 self._note_kernel(entry)
 
     def _note_kernel(self, entry: dict):
-        """Note an entry of Dr.Jit's history.
+        """Add an entry of Dr.Jit's kernel history.
 
-        What is in the cache is still assembled, which is not compiling.
+        Kernels from the cache are still assembled; that is not counted as compilation.
         """
         work = self._noted
         if entry["cache_hit"]:
@@ -102,10 +102,7 @@ class Meter:
 
     @contextmanager
     def pilot(self):
-        """Measures what is done inside of it as a pilot.
-
-        Passes before it are waited for: their time is not the pilot's.
-        """
+        """Measures the body as a pilot, after waiting for earlier passes."""
         self.wait()
         started, compiled = time.perf_counter(), self._noted.compile_seconds
         yield
@@ -114,12 +111,12 @@ class Meter:
         self._noted = replace(self._noted, pilot_seconds=self._noted.pilot_seconds + spent)
 
 
-# Kinds of rays in the statistics, of what the kernel counts.
+# Kinds of rays in the statistics that the kernel counts.
 RAYS = ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")
 
 
 class Statistics(TypedDict):
-    """A render in numbers, after it has ended or was interrupted: plain values, which JSON can hold."""
+    """Statistics of a finished or interrupted render: plain values, JSON-serialisable."""
 
     seconds: dict[str, float]
     """``compile``, ``pilot``, ``render`` and ``total``."""
@@ -161,7 +158,7 @@ class Statistics(TypedDict):
 
 
 def rays(render) -> dict[str, int]:
-    """Rays of a `Render` so far, by kind."""
+    """Return the rays of a `Render` so far, by kind."""
     counts = render.meter.work.counts
     found = {name: counts[name] for name in RAYS}
     if render.settings.merging or render.plan.guided:
