@@ -1,14 +1,13 @@
 """Perspective and thin-lens cameras, one or a batch of them.
 
-Mitsuba's ``sample_direction`` drops 28-45 % of the points under a principal point offset and is
-zero for a thin lens at its default focus distance, so the importance is evaluated here. The map
-from directions to the film is read off Mitsuba's own camera rays, once per render: film positions
-of splats and of camera samples agree by construction, crop window, field-of-view axis and principal
-point offset included.
+Mitsuba's ``sample_direction`` drops 28-45 % of the points under a principal point offset and is zero for a
+thin lens at its default focus distance, so the importance is evaluated here. The map from directions to the
+film is measured once per render from Mitsuba's own camera rays: film positions of splats and of camera
+samples agree by construction, including crop window, field-of-view axis and principal point offset.
 
-With the solid-angle density p_w = 1 / (A cos^3) of camera rays (A: area at z = 1 of the film region
-that camera samples cover, cos about the optical axis), the importance of a sensor point is
-W_e = p_A p_w / cos with the lens density p_A, so that camera subpaths start with weight 1.
+With the solid-angle density p_w = 1 / (A cos^3) of camera rays (A: area at z = 1 of the film region that
+camera samples cover, cos about the optical axis), the importance of a sensor point is W_e = p_A p_w / cos
+with the lens density p_A, so that camera subpaths start with weight 1.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ KINDS = ("PerspectiveCamera", "ThinLensCamera")
 class _View:
     """One camera, or a table of them.
 
-    Rows of the transforms (``Vector4f``), the affine map from (x/z, y/z) to the unit square and back (four
-    numbers each) and where it maps (0, 0), ``area`` at z = 1 of the region, clip planes, ``radius`` of the
-    lens, distance of the plane in ``focus``.
+    Rows of the transforms (``Vector4f``); affine map from (x/z, y/z) to the unit square and back (four
+    numbers each) and its image of (0, 0); ``area`` of the region at z = 1; clip planes; lens ``radius``;
+    distance of the plane in ``focus``.
     """
 
     to_camera: list
@@ -49,7 +48,7 @@ class _View:
 
     @staticmethod
     def of(values) -> _View:
-        """From 39 numbers or arrays, in the order of `_numbers`."""
+        """Construct from 39 numbers or arrays, in the order of `_numbers`."""
         return _View(
             [mi.Vector4f(*values[i : i + 4]) for i in (0, 4, 8)],
             [mi.Vector4f(*values[i : i + 4]) for i in (12, 16, 20)],
@@ -108,7 +107,7 @@ class Camera(Sensor):
         uv = uv - view.origin
         a = view.from_film
         lens = view.lens_point(u_lens) if self.lens else mi.Point3f(0)
-        # Through the point of the plane in focus that the lens centre sees at this film position.
+        # Through the point in the focal plane that the lens centre sees at this film position.
         in_focus = mi.Point3f(a[0] * uv.x + a[1] * uv.y, a[2] * uv.x + a[3] * uv.y, 1) * view.focus
         local = dr.normalize(in_focus - lens)
         cos = local.z
@@ -136,7 +135,7 @@ class Camera(Sensor):
         return self._join(which, -d, mi.Vector3f(d), mi.Float(1), (0, dr.inf))
 
     def _lens_point(self, u_lens, u_film):
-        """Index of a view, the view, a point of its lens in the world and in camera coordinates."""
+        """View index, view, and a point of its lens in world and in camera coordinates."""
         index = mi.UInt32(0)
         if self._count > 1:
             index, _ = view_at(u_film.x, self._count)
@@ -165,15 +164,15 @@ class Camera(Sensor):
         )
 
     def _project(self, index, view, outward, lens):
-        """Return the film position of a direction, its depth along the axis, and whether it is in the region.
+        """Return film position and depth along the axis, and whether the film sees it.
 
-        ``outward`` is the direction (world) from the point ``lens`` of the lens (camera coordinates: in the
-        world's, far from the origin, rounding would move it).
+        ``outward``: direction (world) from the point ``lens`` of the lens (camera coordinates: world
+        coordinates would be rounded far from the origin).
         """
         local = _transform(view.to_camera, outward, 0)
         depth = local.z
         x, y = local.x / depth, local.y / depth
-        if self.lens:  # where the line crosses the plane in focus, seen from the lens centre
+        if self.lens:  # intersection with the focal plane, as seen from the lens centre
             x, y = x + lens.x / view.focus, y + lens.y / view.focus
         a = view.to_film
         uv = mi.Point2f(a[0] * x + a[1] * y, a[2] * x + a[3] * y) + view.origin
@@ -185,9 +184,9 @@ class Camera(Sensor):
         return self.region.to_position(uv), depth, inside
 
     def hit(self, walk, vertex, distant) -> SensorHit:
-        """Intersect the walk's ray with the lens, which is no shape of the scene.
+        """Intersect the walk's ray with the lens, which is not a shape of the scene.
 
-        What lies between the lens and the near plane does not hide it: camera rays start there too.
+        Surfaces between the lens and the near plane do not block it: camera rays start at the near plane.
         """
         view = self._view(mi.UInt32(0))
         centre = _transform(view.to_world, mi.Point3f(0), 1)
@@ -210,7 +209,7 @@ class Camera(Sensor):
             importance=pdf_a * pdf_w / slope,
             position=position,
             active=towards & on_lens & unhidden & within & inside,
-            # Camera rays see the surroundings behind the far plane, and whatever is there does not hide them.
+            # Camera rays see the environment behind the far plane, even if a surface there blocks it.
             surroundings=mi.Ray3f(
                 z0 - walk.d * (view.near / slope),
                 -walk.d,
@@ -223,11 +222,11 @@ class Camera(Sensor):
 
 
 def _numbers(sensor, share: float):
-    """What `_View.of` takes; ``share`` see `Region`."""
+    """Return the numbers for `_View.of`; ``share`` see `Region`."""
     lens = sensor.class_name() == KINDS[1]
     to_world = world_matrix(sensor)
     to_film, origin = _film_map(sensor, to_world)
-    # Area at z = 1 that one crop window covers, times the share that a border adds.
+    # Area at z = 1 of one crop window, times the share that a border adds.
     area = 1 / abs(np.linalg.det(to_film)) * share
     values = [
         *np.linalg.inv(to_world)[:3].ravel(),

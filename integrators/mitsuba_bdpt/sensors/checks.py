@@ -1,6 +1,6 @@
-"""What sensors need to have camera rays, checked before a render.
+"""Checks of sensors' parameters before a render.
 
-Mitsuba loads sensors that lack it, and renders black or NaN, or ends the process.
+Mitsuba loads invalid sensors, and renders black or NaN, or ends the process.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _NAMES = {
     "BatchSensor": "batch sensor",
 }
 
-# Rays by which sensors are tried of which only Mitsuba knows the rays.
+# Test rays of sensors for which only Mitsuba generates rays.
 _TRIED = 64
 
 
@@ -35,7 +35,7 @@ def called(sensor: mi.Sensor) -> str:
 
 
 def check_sensor(sensor: mi.Sensor, of_scene: Sequence[mi.Sensor]):
-    """Raise an error if ``sensor``, or a view of a batch, lacks what its camera rays need.
+    """Raise an error if ``sensor``, or a view of a batch, cannot generate camera rays.
 
     ``of_scene``: the scene's sensors. Raises ``UsageError`` and ``UnsupportedError``.
     """
@@ -55,7 +55,7 @@ def check_sensor(sensor: mi.Sensor, of_scene: Sequence[mi.Sensor]):
 
 
 def views(sensor: mi.Sensor) -> list[mi.Sensor]:
-    """The views of a batch sensor, from left to right."""
+    """Return the views of a batch sensor, from left to right."""
     return [view for view in children(sensor).values() if isinstance(view, mi.Sensor)]
 
 
@@ -78,7 +78,7 @@ def _check_meter(sensor: mi.Sensor):
 
 
 def _check_numbers(sensor: mi.Sensor):
-    """Parameters that are not finite, and those that leave no direction to camera rays."""
+    """Raise ``UsageError`` for non-finite parameters and singular transformations."""
     for name, value in _numbers(sensor).items():
         if not math.isfinite(value):
             raise UsageError(f"{name}={value} of {called(sensor)} must be finite; give another number")
@@ -97,7 +97,7 @@ def _check_numbers(sensor: mi.Sensor):
 
 
 def _numbers(sensor: mi.Sensor) -> dict[str, float]:
-    """The sensor's own parameters that are numbers."""
+    """Return the sensor's own numeric parameters."""
     found = own_parameters(sensor)
     return {k: number(v) for k, v in found.items() if isinstance(v, float) or type(v) is mi.Float}
 
@@ -107,7 +107,7 @@ def _rows(matrix: np.ndarray) -> str:
 
 
 def rays_of(sensor: mi.Sensor, film: mi.Point2f, lens: mi.Point2f) -> tuple[np.ndarray, np.ndarray, mi.Ray3f]:
-    """Origins and directions, (3, n) in double precision, of camera rays; and the rays.
+    """Return origins and directions, (3, n) in double precision, and the camera rays.
 
     Raises ``UsageError`` if one is not finite.
     """
@@ -119,7 +119,7 @@ def rays_of(sensor: mi.Sensor, film: mi.Point2f, lens: mi.Point2f) -> tuple[np.n
 
 
 def inverse(matrix: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
-    """The inverse of a matrix of camera rays; raises ``UsageError`` if there is none."""
+    """Inverse of a matrix of camera rays; raises ``UsageError`` if it is singular."""
     if np.linalg.matrix_rank(matrix) < len(matrix):
         raise UsageError(
             f"all camera rays of {called(sensor)} are the same in single precision; look at "
@@ -135,7 +135,7 @@ def _parameters(sensor: mi.Sensor) -> str:
 
 
 def check_rays(sensor: mi.Sensor):
-    """Raise an error if a sensor of which only Mitsuba knows the rays makes none."""
+    """Raise an error if Mitsuba generates no finite camera rays for ``sensor``."""
     u = mi.Point2f(*(mi.Float((np.arange(_TRIED) * step + 0.5) % 1) for step in (0.5698403, 0.7548777)))
     try:
         ray, weight = sensor.sample_ray_differential(0, 0.5, u, mi.Point2f(u.y, u.x))

@@ -1,4 +1,4 @@
-"""Camera endpoints: which treatment each kind of sensor gets."""
+"""Camera endpoints: the implementation for each kind of sensor."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ UNTARGETED = "target = none"
 def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
     """Return the sensor for one render of ``scene``.
 
-    Kinds that light vertices cannot be connected to take
-    part by camera subpaths alone, and say why. Raises ``UnsupportedError`` for what Mitsuba itself cannot
-    render.
+    Kinds to which light vertices cannot be connected use camera subpaths alone, with a reason. Raises
+    ``UnsupportedError`` for sensors that Mitsuba cannot render.
     """
     kind = sensor.class_name()
     if kind in cameras.KINDS:
@@ -35,7 +34,7 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Se
             sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
         )
     if kind == "DistantSensorImpl":
-        # Only its text tells the three kinds apart.
+        # Only the text of a distant sensor distinguishes its three kinds.
         if UNTARGETED in str(sensor):
             return Distant(sensor) if scene.shapes() else RayOnlySensor(sensor, "the scene has no surface")
         return _by_rays(sensor, "the target of a distant sensor is out of a plugin's reach")
@@ -43,7 +42,7 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Se
 
 
 def _by_rays(sensor: mi.Sensor, reason: str, views: list[mi.Sensor] | None = None) -> Sensor:
-    """A sensor that takes part by its camera rays alone, which are tried first."""
+    """Return a sensor that uses its camera rays alone, after checking them."""
     for view in views or [sensor]:
         checks.check_rays(view)
     return RayOnlySensor(sensor, reason, views)

@@ -1,4 +1,4 @@
-"""Sensors that are no pinhole and no lens: parallel ones, meters, and those that only Mitsuba knows."""
+"""Parallel sensors, irradiance meters, and sensors that only Mitsuba samples."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
 
 
 class _Parallel(Sensor):
-    """Sensors all of whose rays have one direction ``axis``: a join is a projection along it.
+    """Sensors whose rays have one direction ``axis``; connections project along it.
 
-    z_0 has the density ``density`` (over the area across the axis), and W_e = density: camera subpaths start
+    z_0 has the density ``density`` (over the area across the axis) and W_e = density: camera subpaths start
     with weight 1.
     """
 
@@ -50,7 +50,7 @@ class _Parallel(Sensor):
 
 
 class Orthographic(_Parallel):
-    """An orthographic camera. Mitsuba's has no ``sample_direction``; everything follows from its rays."""
+    """An orthographic camera, which has no ``sample_direction``: its rays define it."""
 
     def __init__(self, sensor):
         super().__init__(sensor)
@@ -82,7 +82,7 @@ class Orthographic(_Parallel):
 class Distant(_Parallel):
     """A distant sensor without target: its rays cover a disk about the scene.
 
-    Its film has one pixel, and a position on the film means nothing.
+    Its film has one pixel; positions on the film have no meaning.
     """
 
     needs_aperture_sample = True
@@ -125,7 +125,7 @@ class _Face:
         self._sphere = sphere if sphere is not None and sphere.turned else None
 
     def sample(self, u, shared):
-        """A point, its shading normal, and its anchor."""
+        """Sample a point, its shading normal, and its anchor."""
         ps = self.shape.sample_position(shared.time, u)
         if self._sphere is not None:
             ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
@@ -141,8 +141,8 @@ class IrradianceMeter(Sensor):
     """An irradiance meter, or several side by side (the views of a batch).
 
     z_0 is uniform on its shape (area measure), directions are distributed by the cosine with the shading
-    normal, W_e = 1 / area * (cosine with the shading normal over that with the geometric normal). The film
-    position chooses the view, and z_0, as in Mitsuba.
+    normal, W_e = 1 / area * (cosine with the shading normal / cosine with the geometric normal). As in
+    Mitsuba, the film position chooses the view and z_0.
     """
 
     needs_aperture_sample = True
@@ -156,13 +156,13 @@ class IrradianceMeter(Sensor):
         self._find_area(in_scene)
 
     def _find_area(self, in_scene: bool):
-        """Set ``area``; ``in_scene``: whether the shape is one of the scene, which rays can hit."""
+        """Set ``area``; ``in_scene``: the shape is in the scene, so that rays can hit it."""
         if len(self._faces) > 1:
             self.no_area = "which of the batch's meters light hits is not looked for"
         elif not in_scene:
             self.no_area = "the meter's shape is not in the scene"
         elif not self.region.box or tuple(self.region.crop_size) != (1, 1):
-            # A light subpath tells its point of the shape, but not the film position that chooses it.
+            # A light subpath determines the point on the shape, but not the film position that maps to it.
             self.no_area = (
                 "with more than one pixel, or a filter other than box, the film position of a point of its "
                 "shape is unknown"
@@ -171,7 +171,7 @@ class IrradianceMeter(Sensor):
             self.area = True
 
     def _sample(self, u, shared):
-        """As `_Face.sample`, of the view that ``u`` chooses."""
+        """Like `_Face.sample`, for the view that ``u`` chooses."""
         if len(self._faces) == 1:
             return self._faces[0].sample(u, shared)
         index, x = view_at(u.x, len(self._faces))
@@ -228,7 +228,7 @@ class IrradianceMeter(Sensor):
         cos = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0)
         return SensorHit(
             dist2=dr.squared_norm(si.p - walk.previous),
-            cos=cos,  # as in `start` and `join`: weights of all strategies have the same idea of it
+            cos=cos,  # as in `start` and `join`, so that all strategies have the same weights
             pdf_a=self._density,
             pdf_w=cos * dr.inv_pi,
             importance=self._density * cos / vertex.cos,
@@ -238,7 +238,7 @@ class IrradianceMeter(Sensor):
 
 
 class RayOnlySensor(Sensor):
-    """A sensor, or several side by side, of which only Mitsuba's own camera rays are used."""
+    """Sensors, one or several side by side, that use Mitsuba's camera rays alone."""
 
     needs_aperture_sample = True
     connectible = False
@@ -257,7 +257,7 @@ class RayOnlySensor(Sensor):
             chosen = index == i
             other, other_weight = _sampled(view, uv, u_lens, shared)
             ray, weight = dr.select(chosen, other, ray), dr.select(chosen, other_weight, weight)
-        # The share of the wavelengths joins when the sample is added to the film.
+        # The weight of the wavelengths is applied when the sample is added to the film.
         weight = dr.select(shared.weight != 0, weight / shared.weight, 0)
         return CameraStart(
             ray=ray,
@@ -269,11 +269,11 @@ class RayOnlySensor(Sensor):
 
 
 def _has_area(sensor: mi.Sensor) -> bool:
-    """Whether light of a delta emitter arrives at a sensor directly, as far as that is known."""
+    """Whether direct light of a delta emitter reaches the sensor, as far as known."""
     return sensor.class_name() == "ThinLensCamera" or sensor.get_shape() is not None
 
 
 def _sampled(view, uv, u_lens, shared):
-    """Ray and weight of a sensor of which only these are known."""
+    """Sample a ray and its weight with Mitsuba."""
     ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
     return mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.unpolarized_spectrum(weight)

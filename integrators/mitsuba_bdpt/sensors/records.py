@@ -1,4 +1,4 @@
-"""What every kind of sensor tells a kernel: starts of camera subpaths, joins, arrivals of light."""
+"""Interface of sensors: camera subpath starts, connections, light subpath hits."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from ..geometry import rays
 class CameraStart:
     """Start of a camera subpath.
 
-    ``ray`` (for cameras on the near plane), ``p`` of z_0, ``pdf_w`` density of the direction given z_0 (solid
-    angle; of a parallel sensor, whose direction is fixed, the density of z_0 over the area across it),
-    ``weight`` W_e cos / all densities, ``arrival`` cos / (density of z_0 * ``pdf_w``), what t = 0 begins with
-    (0 without area), ``position`` on the film in pixels, ``counted`` where the filter counts it (a box
-    filter: at the pixel's corner, as Mitsuba does).
+    ``ray`` (for cameras on the near plane); ``p`` of z_0; ``pdf_w`` density of the direction given z_0 (solid
+    angle; for a parallel sensor, whose direction is fixed, the density of z_0 over the area across it);
+    ``weight`` W_e cos / all densities; ``arrival`` cos / (density of z_0 * ``pdf_w``), the start of t = 0 (0
+    without area); ``position`` on the film in pixels; ``counted`` position that the filter uses (a box
+    filter: the pixel's corner, as in Mitsuba).
     """
 
     ray: mi.Ray3f
@@ -33,15 +33,14 @@ class CameraStart:
 
 @dataclass
 class CameraJoin:
-    """z_0 joined with a point of the scene.
+    """A connection of a scene point with z_0.
 
-    ``p`` of z_0; ``anchor`` where visibility ends (for cameras on the near plane); ``d`` unit direction from
-    the point to z_0; ``dist2`` squared distance to z_0 (1 to a parallel sensor); ``importance``
-    W_e cos / density of z_0 (of a parallel sensor, whose z_0 follows from the point, W_e alone);
-    ``pdf_w`` as in `CameraStart`, towards the point; ``arrival`` cos / (dist2 * density of z_0), which makes
-    a density of directions at the point the ratio of t = 0 and t = 1 (0 without area); ``position`` on the
-    film in pixels; ``reach`` length of camera rays along ``-d``; ``valid``: seen by the film, and within the
-    clip planes.
+    ``p`` of z_0; ``anchor`` end of the shadow ray (for cameras on the near plane); ``d`` unit direction from
+    the point to z_0; ``dist2`` squared distance to z_0 (1 to a parallel sensor); ``importance`` W_e cos /
+    density of z_0 (for a parallel sensor, whose z_0 follows from the point, W_e alone); ``pdf_w`` as in
+    `CameraStart`, towards the point; ``arrival`` cos / (dist2 * density of z_0), which times a density of
+    directions at the point is the ratio of t = 0 and t = 1 (0 without area); ``position`` on the film in
+    pixels; ``reach`` length of camera rays along ``-d``; ``valid``: on the film, and within the clip planes.
     """
 
     p: mi.Point3f
@@ -60,11 +59,11 @@ class CameraJoin:
 class SensorHit:
     """A light subpath that hits the sensor at z_0.
 
-    ``dist2`` of its last edge, ``cos`` at z_0, ``pdf_a`` density of z_0 (area measure) and ``pdf_w`` (solid
-    angle) of the way back in camera subpaths, ``importance`` W_e, ``position`` on the film in pixels,
-    ``active``. ``surroundings`` see `CameraJoin.reach`: a ray from z_0 that has to find nothing if the light
-    comes from infinity, None where the subpath's own ray has shown it; ``near`` distance from z_0 at which
-    camera rays along its last edge start.
+    ``dist2`` of its last edge; ``cos`` at z_0; ``pdf_a`` density of z_0 (area measure) and ``pdf_w`` (solid
+    angle) of the reverse direction in camera subpaths; ``importance`` W_e; ``position`` on the film in
+    pixels; ``active``; ``surroundings``: ray from z_0 that must be unoccluded if the light comes from
+    infinity (None where the subpath's own ray has shown it), see `CameraJoin.reach`; ``near`` distance from
+    z_0 at which camera rays along its last edge start.
     """
 
     dist2: mi.Float
@@ -79,10 +78,10 @@ class SensorHit:
 
 
 class Region:
-    """The film region that camera samples cover: the crop window, with ``sample_border`` and its border.
+    """The film region that camera samples cover: crop window and ``sample_border``.
 
-    ``crop_size``, ``crop_offset``, ``size`` (width, height) in pixels; ``border`` in pixels; ``box``: whether
-    the filter is one; ``share``: area over that of the crop window.
+    ``crop_size``, ``crop_offset``, ``size`` (width, height) and ``border`` in pixels; ``box``: whether it is
+    a box filter; ``share``: area relative to the crop window's.
     """
 
     def __init__(self, film: mi.Film):
@@ -101,7 +100,7 @@ class Region:
         self._offset = dr.opaque(mi.Point2f, self.crop_offset.astype(float).tolist())
 
     def pixel(self, index: mi.UInt32) -> mi.Point2i:
-        """Film pixel of the ``index``-th pixel of the region (row by row), as ``mi.Point2i``."""
+        """Film pixel of the ``index``-th pixel of the region (row by row)."""
         y = index // self._width
         x = index - y * self._width
         return mi.Point2i(mi.Int32(x), mi.Int32(y)) + self._first
@@ -111,7 +110,7 @@ class Region:
         return (position - self._offset) / self._size
 
     def to_position(self, uv: mi.Point2f) -> mi.Point2f:
-        """The reverse of `to_uv`."""
+        """Inverse of `to_uv`."""
         return mi.Point2f(uv) * self._size + self._offset
 
     def anywhere(self, u: mi.Point2f) -> mi.Point2f:
@@ -124,19 +123,19 @@ class Region:
 
 
 def view_at(x: mi.Float, count: int) -> tuple[mi.UInt32, mi.Float]:
-    """Which of ``count`` views side by side ``x`` in [0, 1) is in, and its place within that view."""
+    """Index of the view among ``count`` side by side, and the position ``x`` in it."""
     index = dr.minimum(mi.UInt32(x * count), count - 1)
     return index, x * count - mi.Float(index)
 
 
 class Sensor:
-    """What the kernel may ask of a sensor; made anew for each render.
+    """Interface of a sensor; made for each render.
 
-    ``region`` of the film; ``needs_aperture_sample``: whether z_0 needs a random point; ``delta``: a join
-    with a delta emitter has measure zero; ``parallel``: all camera rays have one direction; ``connectible``:
-    whether vertices of light subpaths can be joined with it, if not ``reason`` says why; ``area``: whether a
-    light subpath can hit it (t = 0), if not ``no_area`` says why; ``needs_film_sample``: whether a join needs
-    a second random point.
+    * ``region`` of the film; ``parallel``: all camera rays have one direction.
+    * ``needs_aperture_sample``: z_0 needs a random point; ``needs_film_sample``: a connection a second one.
+    * ``delta``: a connection with a delta emitter has measure zero.
+    * ``connectible``: vertices of light subpaths can be connected to it, else ``reason`` says why.
+    * ``area``: light subpaths can hit it (t = 0), else ``no_area`` says why.
     """
 
     needs_aperture_sample = False
@@ -153,24 +152,24 @@ class Sensor:
         self.region = Region(sensor.film())
 
     def start(self, pixel: mi.Point2i, u_film: mi.Point2f, u_lens: mi.Point2f, shared) -> CameraStart:
-        """Start of a camera subpath through ``pixel``; ``shared`` carries time and wavelengths."""
+        """Start a camera subpath through ``pixel``; ``shared``: time and wavelengths."""
         position = mi.Point2f(pixel) + u_film
         start = self._start(self.region.to_uv(position), u_lens, shared)
         counted = mi.Point2f(pixel) if self.region.box else position
         return replace(start, position=position, counted=counted)
 
     def _start(self, uv, u_lens, shared) -> CameraStart:
-        """`start` at a point of the crop window's unit square, without ``position`` and ``counted``."""
+        """Like `start`, from the unit square, without ``position`` and ``counted``."""
         raise NotImplementedError
 
     def join(self, p: mi.Point3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraJoin:
-        """Join the scene point ``p`` with z_0, chosen by ``u_lens`` and, if it is needed, ``u_film``."""
+        """Connect the scene point ``p`` with z_0, chosen by ``u_lens`` and ``u_film``."""
         raise NotImplementedError
 
     def join_direction(self, d: mi.Vector3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraJoin:
-        """As `join`, with light that travels along ``d`` from infinity; ``dist2`` is 1."""
+        """Like `join`, for light from infinity along ``d``; ``dist2`` is 1."""
         raise NotImplementedError
 
     def hit(self, walk, vertex, distant) -> SensorHit:
-        """Where the last edge of a light subpath hits the sensor; ``distant``: it comes from infinity."""
+        """Hit of a light subpath's last edge; ``distant``: it comes from infinity."""
         raise NotImplementedError
