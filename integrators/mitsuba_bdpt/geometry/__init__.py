@@ -1,6 +1,5 @@
-"""Shapes: where rays start and end on them, how hits round, and what Mitsuba's samplers do on them.
+"""Shapes: origins and ends of rays, rounding of hits, Mitsuba's sampling choices.
 
-`rays` is the one place where rays start and end, by the errors that `rounding` states. `quadrics`,
-`smooth_meshes` and `to_world` know how Mitsuba samples points of shapes; `mitsubas_choices` lists these
-choices and checks them.
+Rays start and end in `rays` alone, by the errors in `rounding`. `quadrics`, `smooth_meshes` and `to_world`
+replicate how Mitsuba samples points of shapes; `mitsubas_choices` lists and checks these choices.
 """

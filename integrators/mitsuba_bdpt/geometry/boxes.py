@@ -1,8 +1,8 @@
 """Bounding boxes of shapes and scenes, also where Mitsuba's own are invalid.
 
-Mitsuba merges rectangles and meshes of one BSDF into a mesh when it loads a scene. ``bbox`` of that mesh, and
-the scene's, lack the rectangles; it is invalid if there is nothing else. A mesh with a vertex that is not
-finite has an invalid box too, though rays meet its other triangles.
+Mitsuba merges rectangles and meshes of one BSDF into a mesh at loading. The ``bbox`` of that mesh and of the
+scene lack the rectangles, and are invalid if there is nothing else. A mesh with a non-finite vertex has an
+invalid box too, though rays hit its other triangles.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..host.introspection import own_parameters
 
 
 def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
-    """The bounding box of a shape, of a mesh that of its finite vertices; None if there is none."""
+    """Bounding box of a shape, for a mesh that of its finite vertices; or None."""
     box = mi.ScalarBoundingBox3f(shape.bbox())
     params = own_parameters(shape) if shape.is_mesh() else {}
     if renamed.holds_a_mesh(params):
@@ -30,13 +30,13 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
 
 
 def boxes(scene: mi.Scene) -> list[mi.ScalarBoundingBox3f]:
-    """The bounding boxes of all shapes that have one."""
+    """Return the bounding boxes of all shapes that have one."""
     found = (box_of(shape) for shape in scene.shapes())
     return [box for box in found if box is not None]
 
 
 def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """The bounding box of a scene, those of shapes included that Mitsuba leaves out of its own."""
+    """Bounding box of a scene, including shapes that Mitsuba leaves out."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
     for shape in scene.shapes():
         partial = shape.class_name() == "Mesh" or not is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
@@ -46,7 +46,7 @@ def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
 
 
 def corners(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and upper corners (n, 3) of the boxes with the indices ``which``, in double precision."""
+    """Lower and upper corners (n, 3), double precision, of the boxes ``which``."""
     low, high = (
         np.array([np.array(corner, dtype=np.float64).ravel() for corner in of_all])
         for of_all in ([box.min for box in boxes], [box.max for box in boxes])
@@ -55,11 +55,11 @@ def corners(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray) -> tuple
 
 
 def points_in(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray, u: np.ndarray) -> mi.Point3f:
-    """Points of the boxes with the indices ``which``, at the places ``u`` (n, 3) of the unit cube."""
+    """Points in the boxes ``which`` at the positions ``u`` (n, 3) of the unit cube."""
     low, high = corners(boxes, which)
     return mi.Point3f((low + u * (high - low)).T)
 
 
 def is_finite(box: mi.ScalarBoundingBox3f) -> bool:
-    """Whether there is something in a box, and its corners are finite."""
+    """Whether a box is not empty and has finite corners."""
     return box.valid() and bool(np.isfinite([box.min, box.max]).all())

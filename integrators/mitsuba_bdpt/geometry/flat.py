@@ -1,4 +1,4 @@
-"""Which shapes have one normal."""
+"""Detects shapes with a single normal."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 from ..host import renamed
 from ..host.introspection import own_parameters
 
-# Of unit normals: 1 - cos up to which they are one. (Rounding of vertices is some 1e-14.)
+# Largest 1 - cos between unit normals that count as one; rounding of vertices causes about 1e-14.
 _SAME = 1e-10
 
 
 def is_flat(shape: mi.Shape) -> bool:
-    """Whether a shape has one normal, shading normals included; false where that is not known."""
+    """Whether a shape has one normal, shading normals included; false if unknown."""
     if shape.shape_type() in (mi.ShapeType.Rectangle.value, mi.ShapeType.Disk.value):
         return True
     if shape.shape_type() != mi.ShapeType.Mesh.value:
         return False
-    # Of parameters: a shape that Python first met as an emitter's has no methods of meshes.
+    # By parameters: a shape that Python first met as an emitter's has no mesh methods.
     params = own_parameters(shape)
     faces = np.array(renamed.faces(params), dtype=np.int64).reshape(-1, 3)
     vertices, normals = (

@@ -1,7 +1,6 @@
-"""Spheres and cylinders: their curvature and sides, and spheres that emit or measure.
+"""Spheres and cylinders: curvature, orientation, emitting and measuring spheres.
 
-Where Mitsuba's own calls are wrong about spheres, what stands here repeats the choice that its samplers make;
-`mitsubas_choices` says which tests show that it does.
+Where Mitsuba's calls are wrong about spheres, its samplers' choices are replicated; see `mitsubas_choices`.
 """
 
 from __future__ import annotations
@@ -14,24 +13,23 @@ import numpy as np
 
 from ..host.introspection import matrix_of, number
 
-# Square of the sine of the half angle of cones below which `cone_pdf_w` is asked. Above, the rounding of
-# the cosine, 2^-24, puts Mitsuba's own density off by 1.2e-4 at most.
+# sin^2 of the half angle below which `cone_pdf_w` is used; above, rounding of the cosine (2^-24) changes
+# Mitsuba's density by at most 1.2e-4.
 NARROW_SIN2 = 1e-3
 
-# As in ``Sphere::sample_direction``: from points up to the radius times 1 + this, a sphere is sampled by
-# area, as from inside.
+# As in ``Sphere::sample_direction``, which samples by area from up to radius (1 + RAY_EPSILON).
 RAY_EPSILON = 1500 * 2.0**-24
 
-# Spheres and cylinders, with the height of their middle in their own coordinates.
+# Spheres and cylinders, with the local z coordinate of their middle.
 ROUND = {mi.ShapeType.Sphere.value: 0.0, mi.ShapeType.Cylinder.value: 0.5}
 
 
 @dataclass
 class Sphere:
-    """A sphere: ``center``, ``radius``, and ``outward``, 1 or -1, whether its normals point outwards.
+    """A sphere: ``center``, ``radius``, ``outward`` (1 or -1: orientation of normals).
 
-    ``turned``: Mitsuba's ``sample_position`` rotates the point, but not its normal (and
-    ``eval_parameterization``, by which it samples a texture, does not rotate the point).
+    ``turned``: Mitsuba's ``sample_position`` rotates the point but not its normal (and
+    ``eval_parameterization``, which samples a texture, does not rotate the point).
     """
 
     center: mi.ScalarPoint3f
@@ -41,22 +39,21 @@ class Sphere:
 
     @property
     def inner_radius(self) -> float:
-        """Distance from the center up to which Mitsuba samples the sphere by area, as from inside.
+        """Distance from the center up to which Mitsuba samples the sphere by area.
 
-        0 for one whose normals point outwards: from its inside it lights nothing. (Its ``pdf_direction``
-        knows nothing of `RAY_EPSILON`.)
+        0 if normals point outwards: nothing inside is lit. (Mitsuba's ``pdf_direction`` lacks `RAY_EPSILON`.)
         """
         return self.radius * (1 + RAY_EPSILON) if self.outward < 0 else 0.0
 
     @staticmethod
     def of(shape: mi.Shape) -> Sphere | None:
-        """Of a shape of Mitsuba's; None if it is not a sphere."""
+        """Return the sphere of a shape; None if it is not a sphere."""
         if shape.shape_type() != mi.ShapeType.Sphere.value:
             return None
         matrix = matrix_of(shape)
         radius = float(np.sqrt(number(shape.surface_area()) / (4 * np.pi)))
-        # The point may be rounded to the center, and Mitsuba's normal is not turned with it: it is the local
-        # one, or its opposite.
+        # The point may be rounded to the center, but Mitsuba's normal is the unrotated local one or its
+        # opposite.
         u = mi.Point2f(0.3, 0.2)
         local = dr.dot(shape.sample_position(0, u).n, mi.warp.square_to_uniform_sphere(u))
         off = np.abs(matrix[:3, :3] - radius * np.eye(3)).max()
@@ -71,9 +68,9 @@ def sphere_normal(p, center, outward):
 
 
 def may_light_itself(shape: mi.Shape, sphere: Sphere | None) -> bool:
-    """Whether ``shape``, which is this ``sphere`` or none, shines outwards and lets light through.
+    """Whether ``shape``, with this ``sphere`` or None, emits outwards and transmits.
 
-    No point of it lights another, but rounding puts some outside, and Mitsuba samples the cone from there
+    None of its points lights another, but rounding puts some outside, from where Mitsuba samples the cone
     into the sphere.
     """
     if sphere is None or sphere.outward < 0:
@@ -84,19 +81,18 @@ def may_light_itself(shape: mi.Shape, sphere: Sphere | None) -> bool:
 
 
 def is_small(sphere: Sphere, extent: float) -> bool:
-    """Whether a sphere may be narrow (`NARROW_SIN2`) as seen from a point at most ``extent`` away."""
+    """Whether a sphere may be narrow (`NARROW_SIN2`) from up to ``extent`` away."""
     # Not `<`: the extent of a scene with a vertex at infinity is NaN.
     return sphere.outward > 0 and not sphere.radius**2 >= NARROW_SIN2 * extent**2
 
 
 def cone_pdf_w(center, radius, p):
-    """Density (solid angle) of a uniform direction in the narrow cone from ``p`` to a sphere.
+    """Density (solid angle) of a uniform direction in the narrow cone to a sphere.
 
-    0 where the cone is not narrow (`NARROW_SIN2`) or ``radius`` is 0.
+    0 where the cone from ``p`` is not narrow (`NARROW_SIN2`) or ``radius`` is 0.
 
-    Mitsuba has 1 / (2 pi (1 - cos)) for it, which cancels: off by up to 0.4 % where the distance is 200 times
-    the radius, 5.8 % at 800, by factors of 2 to 4 from 4096 times on, infinite from 5793 = 2^12.5 times on. 1
-    - cos = sin^2 / (1 + cos) does not.
+    Mitsuba's 1 / (2 pi (1 - cos)) cancels (off by 0.4 % at 200 radii, infinite from 2^12.5 radii on);
+    1 - cos = sin^2 / (1 + cos) does not.
     """
     sin_2 = dr.square(radius) / dr.squared_norm(p - center)
     narrow = (sin_2 > 0) & (sin_2 < NARROW_SIN2)
@@ -104,7 +100,7 @@ def cone_pdf_w(center, radius, p):
 
 
 def outward_sign(shape: mi.Shape, matrix: np.ndarray) -> float:
-    """1 if the normals of a sphere or cylinder point outwards, else -1: of a hit from its middle."""
+    """1 if the normals of a sphere or cylinder point outwards, else -1."""
     middle = matrix[:3] @ [0, 0, ROUND[shape.shape_type()], 1]
     radius = float(np.linalg.norm(matrix[:3, 0]))
     pi = dr.zeros(mi.PreliminaryIntersection3f)

@@ -1,4 +1,4 @@
-"""What rounding does to hits."""
+"""Rounding errors of hits."""
 
 from __future__ import annotations
 
@@ -13,33 +13,32 @@ from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_par
 from .boxes import scene_box
 from .quadrics import ROUND, outward_sign
 
-# Measured: from 21 on, no hit on any of Mitsuba's shapes finds its own start (4 fails on up to 1 % of hits on
-# cylinders), whether they are as large as the distances to them or 10^6 times larger.
+# Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
 OFFSET_ULPS = 32
 
 
-# Mitsuba solves for hits on spheres and cylinders in single precision: measured error of t up to
-# 8 * 2^-24 * t^2 / radius (with 4, one visibility ray in a thousand is blocked by its own target).
+# Bound of the error of t on spheres and cylinders, which Mitsuba intersects in single precision, in units of
+# 2^-24 t^2 / radius; see experiments, section Rounding.
 QUADRIC_ULPS = 8
 
 
-# Seen from afar, one point of a sphere in a hundred is closer to its outline than this cosine. A ray may
-# still meet the sphere before such a point: measured, 1e-5 of the light of a radius of 0.05 at distance 7.
+# Cosine at a sphere's point below which that error is taken not to grow (1 % of the points seen from afar);
+# rays to these may still hit the sphere too early; see experiments, section Rounding.
 LEAST_COSINE = 0.1
 
 
-# Diameters of a scene, in radii of its smallest sphere or cylinder, from which on rays ask what they meet:
-# those that end early would do so by more than two radii (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
+# Diameter of a scene in radii of its smallest sphere or cylinder, above which shadow rays test what they hit:
+# they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
 
 
-# Distance, in radii of a sphere or cylinder, from which on rays to its back that end early would end before
-# its front: the chord is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).
+# Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
+# is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).
 FAR = 200
 
 
 def rounding_offset(p, o, t, reach):
-    """Offset that clears the rounding error of a hit ``p`` on a shape of this ``reach``.
+    """Offset that covers the rounding error of a hit ``p`` on a shape of ``reach``.
 
     The hit was found from ``o`` at distance ``t``.
     """
@@ -48,18 +47,17 @@ def rounding_offset(p, o, t, reach):
 
 
 def offset_at(magnitude):
-    """Offset that clears the rounding error of a hit which follows from numbers of this ``magnitude``."""
+    """Offset that covers the rounding error of a hit computed from such numbers."""
     return (OFFSET_ULPS * 2.0**-24) * magnitude
 
 
 @dataclass
 class Errors:
-    """What rounding does to hits on a shape.
+    """Rounding errors of hits on a shape.
 
-    ``ends``, the curvature 1 / radius on spheres and cylinders, which visibility rays that end there meet too
-    early (negative if normals point inwards, as far as that is asked, see `FAR`); ``starts``, that of shapes
-    whose hits lie off their surface for the same reason: cylinders, and all that is round within instances;
-    ``reach``, the largest of `reaches`.
+    ``ends``: curvature 1 / radius of spheres and cylinders, which shadow rays that end there hit too early
+    (negative if normals point inwards, where needed, see `FAR`); ``starts``: the same for shapes whose hits
+    lie off their surface, cylinders and all round shapes within instances; ``reach``: largest of `reaches`.
     """
 
     ends: mi.Float | float
@@ -70,15 +68,15 @@ class Errors:
 class ShapeErrors:
     """`Errors` of the scene's shapes, by pointer.
 
-    ``any``: one of them is a sphere or cylinder, or an instance of a group that has one; ``small``: one of
-    these is so small that rays ask what they meet, see `SMALL`.
+    ``any``: one of them is a sphere or cylinder, or an instance of a group with one; ``small``: one of these
+    is so small that shadow rays test what they hit, see `SMALL`.
     """
 
     def __init__(self, scene: mi.Scene):
         shapes = scene.shapes()
         extent = 2 * scene_box(scene).bounding_sphere().radius
-        with np.errstate(all="ignore"):  # numbers that are not finite are somebody else's business
-            # An instance does not tell of which group it is: it has the largest curvature of all of them.
+        with np.errstate(all="ignore"):  # non-finite values are checked elsewhere
+            # An instance does not expose its group: it gets the largest curvature of all groups.
             within = (_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene))
             grouped = max(within, key=abs, default=0.0)
             rows = [Errors(*_curvatures(s, grouped, extent), 0.0) for s in shapes]
@@ -89,7 +87,7 @@ class ShapeErrors:
         ids = dr.reinterpret_array(mi.UInt32, scene.shapes_dr()).numpy().tolist()
         self._size = max(ids, default=0) + 1
         table, first = [Errors(0.0, 0.0, 0.0)] * self._size, [0] * self._size
-        triangles, count = [np.zeros(1)], 1  # entry 0 stands for shapes without
+        triangles, count = [np.zeros(1)], 1  # entry 0: shapes without triangles
         for index, row, reach in zip(ids, rows, all_reaches, strict=True):
             row.reach = float(reach.max(initial=0))
             if len(reach) > 1 and reach.min() < row.reach:
@@ -103,10 +101,7 @@ class ShapeErrors:
         dr.make_opaque(self._table, self._triangles)
 
     def at(self, shape, active=True, instance=None, triangle=None) -> Errors:
-        """The `Errors` of hits on ``shape``, or on the ``instance`` in which it was met.
-
-        Of all its surface, or of one ``triangle``.
-        """
+        """`Errors` of hits on ``shape`` or ``instance``; on one ``triangle`` if given."""
         index = met(shape, instance)
         known = mi.Bool(active) & (index < self._size)
         found = Errors(mi.Float(0), mi.Float(0), dr.gather(mi.Float, self._table.reach, index, known))
@@ -115,14 +110,14 @@ class ShapeErrors:
             place = dr.gather(mi.UInt32, first, index, known)
             apart = known & (place > 0)
             found.reach = dr.select(apart, dr.gather(mi.Float, reach, place + triangle, apart), found.reach)
-        if self.any:  # else nothing of what follows from curvatures is recorded
+        if self.any:  # else nothing that depends on curvature is recorded
             found.ends = dr.gather(mi.Float, self._table.ends, index, known)
             found.starts = dr.gather(mi.Float, self._table.starts, index, known)
         return found
 
 
 def met(shape, instance=None):
-    """Number of what a ray meets: of the ``instance`` if there is one, else of the ``shape``."""
+    """Index of the ``instance`` that a ray meets, or else of the ``shape``."""
     index = dr.reinterpret_array(mi.UInt32, shape)
     if instance is None:
         return index
@@ -131,14 +126,14 @@ def met(shape, instance=None):
 
 
 def _curvatures(shape, grouped, extent) -> tuple[float, float]:
-    """``ends`` and ``starts`` of `Errors`, in a scene of the diameter ``extent``.
+    """``ends`` and ``starts`` of `Errors`, in a scene of diameter ``extent``.
 
     ``grouped``: the largest ``ends`` of shapes in groups.
     """
     kind = shape.shape_type()
     if kind in ROUND:
         matrix = matrix_of(shape)
-        # Across the axis of a cylinder, and of a sphere whatever the axis.
+        # Across the axis of a cylinder; any axis of a sphere.
         inverse = 1 / max(float(np.linalg.norm(matrix[:3, 0])), 1e-30)
         far = not inverse * extent <= FAR  # the extent may be NaN
         sign = (
@@ -152,20 +147,20 @@ def _curvatures(shape, grouped, extent) -> tuple[float, float]:
 
 
 def _stretch(shape) -> np.ndarray:
-    """By how much ``to_world`` stretches lengths, the largest first; zeros if it is not finite."""
+    """Singular values of ``to_world``, largest first; zeros if it is not finite."""
     linear = matrix_of(shape)[:3, :3]
     return np.linalg.svd(linear, compute_uv=False) if np.isfinite(linear).all() else np.zeros(3)
 
 
 def reaches(shape: mi.Shape) -> np.ndarray:
-    """Magnitude of the coordinates that hits on a shape are computed from, beyond that of the hits.
+    """Magnitude of the coordinates that hits on a shape are computed from.
 
-    One number; of a mesh one for each triangle, but one of an ``ellipsoidsmesh``.
+    Beyond that of the hits; one number, or one per triangle of a mesh (one for an ``ellipsoidsmesh``).
 
-    Coordinates whose rounding moves hits within the surface do not count: those of corners of rectangles and
-    edges of triangles weigh |n_i| / max |n|, so that a floor along the axes has 0, however large. Of spheres,
-    cylinders and grids all coordinates count, of instances all within them. 0 for others: disks and curves
-    are as exact near by as far away.
+    Coordinates whose rounding moves hits within the surface do not count: corners of rectangles and edges of
+    triangles are weighted by |n_i| / max |n|, so that an axis-aligned floor has 0, however large. For
+    spheres, cylinders and grids all coordinates count, for instances all of their shapes. 0 for disks and
+    curves, whose accuracy does not depend on their size.
     """
     kind = shape.shape_type()
     if is_instance(shape):
@@ -181,7 +176,7 @@ def reaches(shape: mi.Shape) -> np.ndarray:
     if not renamed.holds_a_mesh(params) or not len(renamed.faces(params)):
         return np.zeros(1)
     found = _reaches_of_triangles(renamed.positions(params), renamed.faces(params))
-    # Hits on ellipsoids tell the number of the ellipsoid, not that of the triangle.
+    # Hits on ellipsoids report the index of the ellipsoid, not of the triangle.
     return found.max(keepdims=True) if kind == mi.ShapeType.EllipsoidsMesh.value else found
 
 
@@ -191,7 +186,7 @@ _WHOLE = {*ROUND, mi.ShapeType.SDFGrid.value}
 def _reaches_of_triangles(positions, faces) -> np.ndarray:
     p = dr.unravel(mi.Point3f, mi.Float(positions))
     faces = dr.unravel(mi.Vector3u, mi.UInt32(faces))
-    # Some may name vertices that do not exist.
+    # Faces may refer to vertices that do not exist.
     known = dr.all(faces < dr.width(p))
     a, b, c = (dr.gather(mi.Point3f, p, index, known) for index in faces)
     edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
@@ -201,7 +196,7 @@ def _reaches_of_triangles(positions, faces) -> np.ndarray:
 
 
 def _finite(x) -> float:
-    """0 for a shape without a size, which is somebody else's business."""
+    """Replace non-finite values, of shapes without extent, by 0."""
     return float(x) if np.isfinite(x) else 0.0
 
 

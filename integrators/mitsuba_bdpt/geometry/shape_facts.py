@@ -1,4 +1,4 @@
-"""What follows from the parameters of a scene's shapes alone, found once for the renders until an edit."""
+"""Facts that follow from the parameters of a scene's shapes, cached until an edit."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Found = TypeVar("Found")
 
 
 class ShapeFacts:
-    """The `ShapeErrors` of a scene (``errors``), and what else is asked of single shapes.
+    """The `ShapeErrors` of a scene (``errors``), and facts about single shapes.
 
-    It holds numbers and no object of Mitsuba's: it may outlive the scene. Raises ``UsageError`` for shapes
-    of which Mitsuba's answers contradict each other (`check_inverse`).
+    Holds no object of Mitsuba: it may outlive the scene. Raises ``UsageError`` for shapes for which Mitsuba's
+    own calls disagree (`check_inverse`).
     """
 
     def __init__(self, scene: mi.Scene):
@@ -32,13 +32,10 @@ class ShapeFacts:
 
     @classmethod
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> ShapeFacts:
-        """Those of earlier renders of the scene, if no parameter of a shape was edited since, else new ones.
+        """Return the cached facts, or new ones if a parameter of a shape was edited.
 
-        What is remembered may be taken for another scene's, see `notices.notes`: so all counts that facts
-        follow from, the numbers that Dr.Jit has given to the shapes among it, by which facts are looked up.
-
-        (Looking for edits takes 0.3 ms with a dozen shapes, where finding all anew takes 2; of a mesh of 10^6
-        triangles both take 7.)
+        The key has everything that facts depend on, including the shapes' registry indices by which they are
+        looked up: the cache may belong to another scene, see `notices.notes`.
         """
         shapes = all_shapes(scene)
         own = [(_number(s), s.class_name(), s.has_flipped_normals(), repr(s.bbox())) for s in shapes]
@@ -46,9 +43,9 @@ class ShapeFacts:
         return remembered(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
 
     def about(self, kind: str, shape: mi.Shape, find: Callable[[], Found]) -> Found:
-        """What ``find()`` says about a ``shape`` of the scene, from its own parameters alone.
+        """Return the cached result of ``find()`` for a ``kind`` of fact and a ``shape``.
 
-        Found once for each ``kind`` of question and shape; what raises an error is asked again.
+        It must depend on the shape's own parameters alone; errors are not cached.
         """
         key = kind, _number(shape)
         if key not in self._found:
@@ -57,5 +54,5 @@ class ShapeFacts:
 
 
 def _number(shape: mi.Shape) -> int:
-    """That which Dr.Jit has given to a shape."""
+    """Registry index of a shape in Dr.Jit."""
     return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])

@@ -1,8 +1,8 @@
-"""Meshes that have vertex normals: which face Mitsuba's sampler has chosen, and its geometric normal.
+"""Meshes with vertex normals: the face that Mitsuba sampled, and its normal.
 
-The normal has the sign that hits report (``si.n``): that of the winding of the face, turned by
-``flip_normals``. Vertex normals may point to the other side: a mirroring ``to_world`` turns the winding only.
-The choice is repeated here, and checked against Mitsuba's where a scene is prepared, see `mitsubas_choices`.
+The normal has the sign that hits report (``si.n``): that of the face's winding, turned by ``flip_normals``.
+Vertex normals may point to the other side: a mirroring ``to_world`` turns the winding only. The choice is
+replicated here and checked at preparation, see `mitsubas_choices`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from .mitsubas_choices import CHECKED, OFF, spread_points
 
 
 class SmoothMeshes:
-    """Geometric normals, as hits report them, of emitting meshes that have vertex normals.
+    """Geometric normals, as hits report them, of emitting meshes with vertex normals.
 
-    Repeats the choice of a face that ``Mesh.sample_position`` makes: by area, from ``sample.y``. Mitsuba's
-    table is of sums of areas in single precision, so the choice is repeated on the same sums, made in the
-    same way: those in double precision find another face for 23 % of the points of a sphere of 32,512 faces.
+    Replicates the choice of a face in ``Mesh.sample_position``: by area, from ``sample.y``. The running sums
+    of areas must be Mitsuba's, in single precision: sums in double precision select other faces (see
+    experiments, section Rounding).
     """
 
     @staticmethod
     def of(emitters):
-        """Tables for those of ``emitters`` that need them, or None. An emitter may be None."""
+        """Return tables for the ``emitters`` (or None) that need them, else None."""
         faces = [e and _Faces.of(e.get_shape()) for e in emitters]
         if all(f is None for f in faces):
             return None
@@ -55,13 +55,13 @@ class SmoothMeshes:
         dr.make_opaque(self._normals, self._sums, self._area, self._first, self._count)
 
     def _check(self, index, owner, faces):
-        """Raise ``UsageError`` unless the points that Mitsuba samples are in the planes of the faces here."""
+        """Raise ``UsageError`` unless Mitsuba's sampled points are in the faces' planes."""
         u, shape = spread_points(CHECKED), owner.get_shape()
         p = np.array(shape.sample_position(0, u).p, dtype=np.float64).T
         face = np.array(self._face(mi.UInt32(index), u.y, mi.Bool(True))) - int(self._first[index])
-        with np.errstate(invalid="ignore"):  # vertices that are not finite
+        with np.errstate(invalid="ignore"):  # non-finite vertices
             height = np.abs(np.einsum("ij,ij->i", p - faces.corners[face], faces.normals[face]))
-        # Rounding of the points is some 2e-7. A neighbour's plane is further away up to 10^7 faces.
+        # Points are rounded by about 2e-7; a neighbour's plane is further away up to 10^7 faces.
         off = np.mean(height > 2e-6 * np.abs(faces.corners).max())
         if off > OFF:
             raise UsageError(
@@ -72,12 +72,12 @@ class SmoothMeshes:
             )
 
     def normal(self, n, index, u, active):
-        """Normal of the face chosen by ``u``; ``n`` for emitters that are no such mesh."""
+        """Normal of the face chosen by ``u``; ``n`` for other emitters."""
         mesh = active & (dr.gather(mi.UInt32, self._count, index, active) > 0)
         return dr.select(mesh, dr.gather(mi.Normal3f, self._normals, self._face(index, u, mesh), mesh), n)
 
     def _face(self, index, u, mesh):
-        """Row of the face that ``u`` chooses, as `DiscreteDistribution::sample` of Mitsuba does."""
+        """Row of the face chosen by ``u``, as Mitsuba's ``DiscreteDistribution::sample``."""
         low = dr.gather(mi.UInt32, self._first, index, mesh)
         high = dr.select(mesh, low + dr.gather(mi.UInt32, self._count, index, mesh) - 1, low)
         area = dr.gather(mi.Float, self._area, index, mesh)
@@ -95,8 +95,8 @@ class SmoothMeshes:
 class _Faces:
     """The faces of a mesh.
 
-    Unit ``normals`` and first ``corners``, shape (faces, 3); the running ``sums`` of their areas as Mitsuba
-    has them, and the whole ``area``.
+    Unit ``normals`` and first ``corners``, shape (faces, 3); the running ``sums`` of their areas as in
+    Mitsuba, and the total ``area``.
     """
 
     normals: np.ndarray
@@ -106,7 +106,7 @@ class _Faces:
 
     @staticmethod
     def of(shape) -> _Faces | None:
-        """Those of a mesh whose vertex normals differ from hits' geometric normals; None for other shapes."""
+        """Return the faces of a mesh with curved faces (`_curved_faces`), else None."""
         cross = _curved_faces(shape)
         if cross is None:
             return None
@@ -115,7 +115,7 @@ class _Faces:
         faces, positions = renamed.faces(params), renamed.positions(params)
         index = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, len(cross)))
         a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in index)
-        # As Mesh::build_pmf of Mitsuba, rounding included.
+        # As in Mitsuba's Mesh::build_pmf, rounding included.
         chosen = mi.DiscreteDistribution(dr.detach(0.5 * dr.norm(dr.cross(b - a, c - a))))
         normals = cross / np.maximum(length, 1e-300)[:, None]
         corners = np.array(a, dtype=np.float64).T
@@ -123,15 +123,14 @@ class _Faces:
 
 
 def _curved_faces(shape):
-    """Return the cross products of the edges of each face, shape (faces, 3), on the side of hits' normals.
+    """Cross products of faces' edges, (faces, 3), on the side of hits' normals.
 
-    For a mesh whose vertex normals differ from its faces' normals, be it by their sign; None for all other
-    shapes.
+    None unless it is a mesh whose vertex normals differ from its faces' normals, be it by their sign.
     """
     if shape is None or not shape.is_mesh():
         return None
     params = own_parameters(shape)
-    # Neither a rectangle (flat, without vertices) nor a mesh without normals at its vertices.
+    # Rectangles have no vertices; other meshes may have no vertex normals.
     if not renamed.holds_a_mesh(params) or not len(renamed.normals(params)):
         return None
     faces = np.array(renamed.faces(params)).reshape(-1, 3)

@@ -1,8 +1,8 @@
-"""What ``to_world`` may do to shapes that emit or measure, and to emitters without a shape.
+"""Checks of ``to_world`` of emitters, irradiance meters and their shapes.
 
-Points of shapes are sampled, and found by rays: with some matrices Mitsuba samples other points, normals or
-densities than its rays find. Environments, spots and projectors turn directions, whose densities are those of
-the angles before: a matrix that distorts angles changes them.
+With some matrices Mitsuba samples other points, normals or densities than its rays find. Environments, spots
+and projectors transform directions but keep the densities of the untransformed angles, which a matrix that
+distorts angles makes wrong.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ import numpy as np
 from ..errors import UsageError
 from ..host.introspection import inverse_of, is_instance, matrix_of, named
 
-# Relative; single precision and its products are far below.
+# Relative tolerance, far above single-precision rounding.
 _TOLERANCE = 1e-3
-# Of what only reflects: axes are often written with two figures, and a half-turn about (0.71, 0.71, 0) is off
-# by 0.023, as much as vertex normals. (With 0.47 images were off by 2 %.)
+# Relative tolerance for shapes that only reflect: a half-turn about (0.71, 0.71, 0), rounded to two figures,
+# is off by 0.023.
 _OF_REFLECTORS = 0.04
 
-# From this condition number on NumPy's inverse of a matrix in single precision is no judge of Mitsuba's.
+# Condition number above which a single-precision inverse cannot be judged.
 _FLAT = 1e5
 
 
 def check_to_world(shape, owner: str):
     """Raise ``UsageError`` if Mitsuba samples ``shape`` wrongly with its ``to_world``.
 
-    That is, other points or normals than rays find, or with another density than it states: `path` is wrong
-    there too. ``owner`` is what is on the shape. Meshes are right with every matrix.
+    That is, other points or normals than rays find, or another density than stated: `path` is wrong too.
+    ``owner``: the emitter or sensor on the shape. Meshes are right with every matrix.
     """
     check = _CHECKS.get(shape.shape_type())
     if check is None:
         return
     matrix, inverse = matrix_of(shape)[:3, :3], inverse_of(shape)[:3, :3]
-    # What is not finite is counted as such.
+    # Non-finite matrices are counted as such.
     reason = check(matrix, inverse) if np.isfinite([matrix, inverse]).all() else None
     if reason is not None:
         kind = shape.class_name().lower()
@@ -41,10 +41,10 @@ def check_to_world(shape, owner: str):
 
 
 def is_reversed(shape: mi.Shape) -> bool:
-    """Whether the normals that ``shape`` samples are the opposite of those that hits on it report (``si.n``).
+    """Whether normals sampled on ``shape`` are opposite to those of hits (``si.n``).
 
-    Those of mirrored rectangles are: hits take the cross product of the edges. (Of meshes see
-    `smooth_meshes`; mirrored disks and spheres agree, mirrored cylinders are refused by `check_to_world`.)
+    True for mirrored rectangles, whose hits use the cross product of the edges. (Meshes: see `smooth_meshes`;
+    mirrored disks and spheres agree, mirrored cylinders raise an error in `check_to_world`.)
     """
     if shape.shape_type() != mi.ShapeType.Rectangle.value:
         return False
@@ -52,9 +52,9 @@ def is_reversed(shape: mi.Shape) -> bool:
 
 
 def _disk(matrix, inverse):
-    """Rays find a disk by the inverse of the matrix that samples it; it may shear, and stretch."""
+    """Check that Mitsuba's inverse is right: rays use it, samples the matrix."""
     if np.linalg.det(matrix) == 0:
-        return None  # no area: said elsewhere
+        return None  # no area: checked elsewhere
     if not _differs(inverse, np.linalg.inv(matrix), _TOLERANCE):
         return None
     return (
@@ -65,7 +65,7 @@ def _disk(matrix, inverse):
 
 
 def _rectangle(matrix, inverse):
-    """Rays find the corners of a rectangle; its normal alone is by the inverse."""
+    """Check the normal: rays use the corners of a rectangle, its normal the inverse."""
     normal, true = inverse[2], np.cross(matrix[:, 0], matrix[:, 1])
     across = np.linalg.norm(np.cross(normal, true))
     if across <= _TOLERANCE * np.linalg.norm(normal) * np.linalg.norm(true):
@@ -105,18 +105,17 @@ def _cylinder(matrix, inverse):
 
 
 def check_inverse(shape: mi.Shape):
-    """Raise ``UsageError`` if points, normals and rays of ``shape`` are of different surfaces.
+    """Raise ``UsageError`` if points, normals and rays of ``shape`` disagree.
 
-    Those of cylinders, ``sdfgrid`` and instances are after ``rotate`` about an axis that is not of length 1,
-    whose inverse Mitsuba takes to be that of a rotation: one is by the matrix, another by this inverse. Path
-    tracing shades by what it is given and asks for no densities per area; strategies that do would weigh by,
-    and spread light over, another surface.
+    Mitsuba takes ``rotate`` about an axis of length other than 1 for a rotation, with a wrong inverse, and
+    uses the matrix for some and the inverse for others on cylinders, ``sdfgrid`` and instances. Path tracing
+    is unaffected, but densities per area would be of another surface.
     """
     if not is_instance(shape) and shape.shape_type() not in _USES_BOTH:
         return
     matrix, inverse = matrix_of(shape)[:3, :3], inverse_of(shape)[:3, :3]
     if not np.isfinite([matrix, inverse]).all() or np.linalg.cond(matrix) > _FLAT:
-        return  # counted, or with hardly any area
+        return  # counted as non-finite, or with hardly any area
     if _differs(inverse, np.linalg.inv(matrix), _OF_REFLECTORS):
         kind = shape.class_name().lower()
         raise UsageError(
@@ -127,15 +126,14 @@ def check_inverse(shape: mi.Shape):
 
 
 def _differs(inverse, true, tolerance: float) -> bool:
-    """Whether a row of a matrix is off by more than this share of its length."""
+    """Whether a row differs from ``true`` by more than ``tolerance`` of its length."""
     return bool(np.any(np.linalg.norm(inverse - true, axis=1) > tolerance * np.linalg.norm(true, axis=1)))
 
 
 def check_rotation(emitter: mi.Emitter):
-    """Check that the ``to_world`` of an environment keeps lengths.
+    """Raise ``UsageError`` unless the ``to_world`` of an environment is a rotation.
 
-    With any other matrix Mitsuba's own calls disagree with each other (next-event estimation four times the
-    radiance). Raises ``UsageError``.
+    With any other matrix Mitsuba's own calls disagree.
     """
     columns = matrix_of(emitter)[:3, :3]
     if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
@@ -146,14 +144,13 @@ def check_rotation(emitter: mi.Emitter):
 
 
 def check_angles(emitter: mi.Emitter):
-    """Check that the ``to_world`` of a projector or spot keeps angles.
+    """Raise ``UsageError`` unless ``to_world`` of a projector or spot keeps angles.
 
-    What it sends into a direction is a function of the angles before, and densities of directions are those
-    of these angles. Scaled by one factor or mirrored, it keeps them. Raises ``UsageError``.
+    Intensity and density are functions of the untransformed angles. Uniform scaling and mirroring keep them.
     """
     columns = matrix_of(emitter)[:3, :3]
     scale = np.linalg.norm(columns, axis=0).mean()
-    with np.errstate(invalid="ignore"):  # what is not finite is not close
+    with np.errstate(invalid="ignore"):  # non-finite is not close
         keeps = np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2)
     if not keeps:
         plugin, angle = _ANGLES[emitter.class_name()]
@@ -178,8 +175,8 @@ def _lengths(matrix) -> str:
     return ", ".join(f"{x:.4g}" for x in np.linalg.norm(matrix, axis=0))
 
 
-# Points, normals and rays of these are by the matrix and its inverse. (Disks and spheres are by the inverse
-# alone, as far as they only reflect, rectangles by their corners, and meshes keep no matrix.)
+# Shapes that use both matrix and inverse for points, normals and rays. (Disks and spheres, if they only
+# reflect, use the inverse alone, rectangles their corners, and meshes keep no matrix.)
 _USES_BOTH = {mi.ShapeType.Cylinder.value, mi.ShapeType.SDFGrid.value}
 
 
