@@ -1,6 +1,6 @@
-"""Diagnostics: parameters of a scene that spoil images.
+"""Diagnostics: scene parameters that spoil images.
 
-Reflectances above 1, spots that rounding changes, and values that are not finite.
+Reflectances above 1, spots too narrow for single precision, and non-finite values.
 """
 
 from __future__ import annotations
@@ -15,20 +15,19 @@ import numpy as np
 
 from ..host.introspection import children, named, number, own_parameters
 
-# What names of a BSDF's textures say that they scale the light that it scatters.
+# Suffixes of the names of BSDF textures that scale scattered light.
 _SCALES = ("reflectance", "transmittance", "base_color")
 
-# What is above 1 by more than rounding (8 bits per colour, half precision).
+# Largest reflectance not above 1 by more than rounding (8 bits per colour, half precision).
 _MORE_THAN_ALL = 1 + 1e-3
 
-# A step of single precision below 1, where cosines of narrow cones are.
+# Single-precision step below 1, the range of cosines of narrow cones.
 _STEP = 2.0**-24
 
-# A step over 1 - cos of the cutoff angle: below 0.2 degrees. The light that is lost or gained is less than
-# this quotient, whatever the orientation (stress case `narrow-spots`).
+# Largest step relative to 1 - cos of the cutoff angle (0.2 degrees): bounds the relative error of the light.
 _COARSE = 1e-2
 
-# Numbers of all bitmaps together that are looked at, at most: 2 ms.
+# Most bitmap values that are read, of all bitmaps together.
 _QUICKLY_READ = 1 << 17
 
 
@@ -36,7 +35,7 @@ _QUICKLY_READ = 1 << 17
 class _Scale:
     """A texture that scales what a BSDF scatters, the parameter ``name``.
 
-    ``owners``: the texture, that BSDF and the objects around it, the innermost first.
+    ``owners``: the texture, its BSDF and the enclosing objects, innermost first.
     """
 
     owners: tuple
@@ -44,10 +43,9 @@ class _Scale:
 
 
 def non_conserving_bsdfs(owners) -> list[str]:
-    """Return the BSDFs that are not energy-conserving, in words.
+    """Describe the BSDFs that are not energy-conserving, by their parameters.
 
-    Found among ``owners``, BSDFs or shapes with a BSDF, and the BSDFs inside them, as far as their parameters
-    tell.
+    ``owners``: BSDFs or shapes with a BSDF; nested BSDFs are included.
     """
     scales = _scales([(owner,) for owner in owners])
     most = max(_QUICKLY_READ // max(len(scales), 1), 1)
@@ -60,7 +58,7 @@ def non_conserving_bsdfs(owners) -> list[str]:
 
 
 def _scales(chains) -> list[_Scale]:
-    """What scales light in the objects that begin these ``chains``, each followed by those around it."""
+    """Scaling textures in ``chains``: objects followed by those enclosing them."""
     chains, found, seen = list(chains), [], set()
     for chain in chains:  # grows on the way
         for name, value in children(chain[0]).items():
@@ -73,7 +71,7 @@ def _scales(chains) -> list[_Scale]:
 
 
 def _called(owners) -> str:
-    """A name for the BSDF that holds the first of ``owners``, a texture, by the nearest that has an id."""
+    """Identify the BSDF of a texture, the first of ``owners``, by the nearest id."""
     holder = next((owner for owner in owners[1:] if owner.id()), None)
     if isinstance(holder, mi.BSDF):
         return f"BSDF {named(holder)}"
@@ -86,13 +84,13 @@ def _called(owners) -> str:
 
 
 def _file_of(texture) -> str:
-    """Name of the file of a bitmap, which has no id; only its text tells it. Empty for other textures."""
+    """File name of a bitmap without id, from its text; empty for other textures."""
     found = re.search(r'^\s*name = "(.*)",$', str(texture), re.MULTILINE)
     return found[1] if found and texture.class_name().startswith("BitmapTexture") else ""
 
 
 def _largest(texture, most: int) -> float:
-    """The largest value of a texture, 0 if it cannot be told. Of a bitmap's numbers so many are looked at."""
+    """Largest value of a texture, 0 if unknown; ``most``: values read of a bitmap."""
     inner = [_largest(value, most) for value in children(texture).values() if isinstance(value, mi.Texture)]
     if inner:
         return max(inner)
@@ -102,26 +100,26 @@ def _largest(texture, most: int) -> float:
         pass
     data = own_parameters(texture).get("data")
     if data is None or (mi.is_spectral and data.shape[-1] == 3):
-        return 0.0  # of colours these are coefficients of spectra, which are 1 at most
+        return 0.0  # colours are coefficients of spectra, which are at most 1
     if dr.is_integral_v(data):
-        return 1.0  # at most: bytes are shares of 255, and undoing sRGB keeps 1
+        return 1.0  # bytes are shares of 255, and undoing sRGB keeps 1
     values, count = dr.detach(data.array), min(dr.width(data), most)
-    # Sizes are no literals: one kernel for all.
+    # Opaque sizes: one kernel for all.
     index = dr.arange(mi.UInt64, count) * dr.opaque(mi.UInt64, dr.width(data)) // dr.opaque(mi.UInt64, count)
     read = dr.gather(type(values), values, mi.UInt32(index))
     return float(np.nanmax(np.array(read, dtype=np.float32), initial=0))
 
 
 def narrow_spots(scene) -> list[str]:
-    """The spots whose falloff Mitsuba computes from too few steps of a cosine, in words."""
+    """Describe spots whose falloff spans too few single-precision cosines."""
     found = []
     for emitter in scene.emitters():
         if emitter.class_name() != "SpotLight":
             continue
         angle = number(own_parameters(emitter)["cutoff_angle"])
-        if not math.isfinite(angle):  # named by `not_finite`
+        if not math.isfinite(angle):  # reported by `not_finite`
             continue
-        opening = 2 * math.sin(math.radians(angle) / 2) ** 2  # 1 - cos, of which none is lost
+        opening = 2 * math.sin(math.radians(angle) / 2) ** 2  # 1 - cos, without cancellation
         if _STEP > _COARSE * opening:
             most = f"{_STEP / opening:.0%}" if opening > _STEP else "all"
             found.append(f"spot {named(emitter)} has cutoff_angle={angle:g} (up to {most} of its light)")
@@ -129,7 +127,7 @@ def narrow_spots(scene) -> list[str]:
 
 
 def not_finite(scene) -> list[str]:
-    """Names of the scene's parameters that hold NaN or infinity. (Looks at every number.)"""
+    """Names of the scene's parameters that hold NaN or infinity. (Reads every value.)"""
     found, held = [], children(scene)
     for name, value in mi.traverse(scene):
         value = getattr(value, "matrix", value)  # of transforms
@@ -139,9 +137,9 @@ def not_finite(scene) -> list[str]:
 
 
 def _in_words(name: str, held) -> str:
-    """Return the ``name`` of a parameter of a scene in words.
+    """Describe the parameter ``name`` of a scene, whose objects are ``held``.
 
-    ``held`` are the scene's objects: Mitsuba names one without id by its address, which identifies nothing.
+    Mitsuba names objects without id by their address, which identifies nothing.
     """
     first, _, rest = name.partition(".")
     owner = held.get(first)

@@ -1,7 +1,8 @@
-"""Which medium light subpaths start in.
+"""Finds the medium in which light subpaths start.
 
-Scenes seldom say it: an area light on a shape without exterior medium may stand in a ball of milk. It is
-found by rays of emission: the near side of the first boundary that they meet, or what surrounds the scene.
+Scenes seldom declare it: an area light on a shape without exterior medium may stand in a ball of milk. Rays
+of emission find it: the near side of the first boundary that they meet, or the medium that surrounds the
+scene.
 """
 
 from __future__ import annotations
@@ -20,31 +21,31 @@ from ..media.media import Space, random_directions
 from ..transport.inputs import Shared
 from ..transport.phase import asymmetry
 
-# Rays by which a sensor is asked for its medium; an emitter by so many, fewer where there are many emitters.
-# A part of an emitter that is a thousandth of it and lies in another medium is missed by one in sixty.
+# Rays for a sensor's medium; for an emitter's (fewer if there are many); of all emitters. A part of 1/1000 of
+# an emitter in another medium is missed in one of sixty cases.
 _PROBES, _OF_EMITTER, _OF_EMITTERS = 64, 4096, 1 << 20
 
-# Random lines by which boundaries are compared, and the share of them that may disagree (rounding; edges):
-# lines through the scene, and so many through each shape that bounds a medium; half of both from the sensor.
+# Random lines that compare boundaries, and the tolerated share of disagreements (rounding, edges): through
+# the scene; through each shape that bounds a medium. Half of both start at the sensor.
 _LINES, _TOLERATED = 2048, 0.01
 _OF_SHAPE, _TOLERATED_OF_SHAPE, _MOST_SHAPES = 64, 0.05, 1024
 
-# Hits on a shape are in its box, but for this share of its size (its square, of coordinates: rounding).
+# Hits on a shape lie in its box up to this share of its size (its square, of coordinates: rounding).
 _SLACK = 1e-3
 
-# Rays that leave boundaries, of all shapes and of one at most.
+# Rays that leave boundaries: of all shapes, and most of one.
 _LEAVING, _LEAVING_ONE = 1 << 16, 1024
 
-# Relative difference of sigma_t rho and its reverse, on average, that rounding leaves.
+# Largest mean relative difference of sigma_t rho and its reverse due to rounding.
 _SYMMETRIC = 1e-3
 
 
 class LightMedia:
-    """The medium of every emitter; made anew for each render.
+    """The medium of every emitter; made for each render.
 
-    ``outside`` is the number of the medium that surrounds the scene, see `_outside`;
-    ``contradiction`` why light and camera subpaths would not agree on the media, empty if they do;
-    ``hides_infinity``: light from infinity does not arrive. ``far`` see `medium_at_far_plane`.
+    ``outside``: number of the medium that surrounds the scene, see `_outside`; ``contradiction``: why light
+    and camera subpaths would disagree on the media, or empty; ``hides_infinity``: light from infinity does
+    not arrive; ``far``: see `medium_at_far_plane`.
     """
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int):
@@ -55,7 +56,7 @@ class LightMedia:
         leaving = _Leaving.of(space, bounds) if bounds else None
         self.outside = _outside(space, around, leaving)
         self._outside = dr.opaque(mi.UInt32, self.outside)
-        # Nothing arrives from infinity through a homogeneous medium without end.
+        # An endless homogeneous medium absorbs all light from infinity.
         endless = space.media.objects[self.outside - 1] if self.outside else None
         self.hides_infinity = (
             endless is not None and endless.is_homogeneous() and space.media.looks[self.outside - 1].least > 0
@@ -73,14 +74,14 @@ class LightMedia:
         pairs = zip(front, back, found, strict=True)
         numbers = [(p.number if f is None else f, p.number if b is None else b) for f, b, p in pairs]
         self._front, self._back = (mi.UInt32([pair[i] for pair in numbers] or [0]) for i in (0, 1))
-        # Of emitters that stand partly in a medium, each ray is asked.
+        # Emitters in several media: the medium is determined per ray.
         mixed = [p.mixed and f is None for p, f in zip(found, front, strict=True)]
         self.mixed = any(mixed)
         self._mixed = mi.Bool(mixed or [False])
         dr.make_opaque(self._front, self._back, self._mixed)
 
     def at(self, e) -> mi.UInt32:
-        """The number of the medium in which the first ray of an `emitters.Emission` starts."""
+        """Number of the medium in which the first ray of an `emitters.Emission` starts."""
         outwards = dr.dot(e.anchor.n, e.d) >= 0
         number = dr.select(
             outwards, dr.gather(mi.UInt32, self._front, e.index), dr.gather(mi.UInt32, self._back, e.index)
@@ -97,7 +98,7 @@ class LightMedia:
         return boundaries.near_side(self._space, mi.Ray3f(e.anchor.towards(e.d), e.d), active, target)
 
     def _probed(self, leaving: _Leaving | None) -> list[_Probed]:
-        """What rays of each emitter find; towards boundaries too, which may be as small as a keyhole."""
+        """Media of rays of each emitter; also towards boundaries, however small."""
         count = self._emitters.count
         rng = np.random.default_rng(0)
         each = min(max(_OF_EMITTERS // max(count, 1), _PROBES), _OF_EMITTER)
@@ -120,7 +121,7 @@ class LightMedia:
         for emitter, part in zip(self._emitters.scene.emitters(), parts, strict=True):
             of_this = number[part[known[part]]]
             most = int(np.bincount(of_this).argmax()) if len(of_this) else self.outside
-            # One that is seldom chosen is not known well enough.
+            # Emitters with few samples are determined per ray.
             seldom = len(part) < _PROBES // 2 and emitter.sampling_weight() > 0
             finite = not mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
             lost = finite and target is not None and len(part) >= _PROBES // 2 and not len(of_this)
@@ -135,9 +136,9 @@ class LightMedia:
 
 @dataclass(frozen=True)
 class _Probed:
-    """What rays of an emitter find: the ``number`` of the medium that most start in.
+    """Media of an emitter's rays: the ``number`` that most start in.
 
-    ``mixed``: not all start in the same. ``unknown``: why it is not known at all, or empty.
+    ``mixed``: not all start in the same one; ``unknown``: why it is unknown, or empty.
     """
 
     number: int
@@ -146,7 +147,7 @@ class _Probed:
 
 
 def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
-    """By emitter: the media in front of and behind a shape that bounds media, else None."""
+    """By emitter: media in front of and behind a shape that bounds media, else None."""
     front, back = [], []
     for emitter in emitters.scene.emitters():
         shape = emitter.get_shape()
@@ -158,7 +159,7 @@ def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
 
 @dataclass(frozen=True)
 class _Asked:
-    """A `boundaries.NearSide` as arrays of NumPy."""
+    """A `boundaries.NearSide` as NumPy arrays."""
 
     number: np.ndarray
     found: np.ndarray
@@ -177,17 +178,17 @@ class _Asked:
 
 
 def _bounding_shapes(scene: mi.Scene) -> list[tuple[mi.Shape, mi.ScalarBoundingBox3f]]:
-    """Shapes of a scene that bound media, instances too, with their boxes."""
+    """Shapes of a scene that bound media, including instances, with their boxes."""
     bounds = [s for s in scene.shapes() if s.is_medium_transition() or is_instance(s)]
     return [(s, box) for s in bounds if (box := box_of(s)) is not None][:_MOST_SHAPES]
 
 
 @dataclass(frozen=True)
 class _Leaving:
-    """Rays that leave boundaries, (shapes, rays of each): the media that they start in, and where they end.
+    """Rays that leave boundaries, (shapes, rays of each): starting media and ends.
 
     Masks: ``escaped``, they leave the scene without meeting another boundary; ``lost``, they stay among
-    opaque surfaces. ``p`` where those of known medium start, (3, n).
+    opaque surfaces. ``p``: origins of rays of known medium, (3, n).
     """
 
     shapes: list[mi.Shape]
@@ -199,7 +200,7 @@ class _Leaving:
 
     @classmethod
     def of(cls, space: Space, bounds: list) -> _Leaving | None:
-        """Rays to both sides of the shapes ``bounds``; None if no boundary was met."""
+        """Trace rays to both sides of the shapes ``bounds``; None if no boundary is met."""
         each = min(max(_LEAVING // len(bounds), _OF_SHAPE), _LEAVING_ONE)
         count = each * len(bounds)
         rng = np.random.default_rng(4)
@@ -218,15 +219,15 @@ class _Leaving:
         return cls([s for s, _ in bounds], *(x.reshape(len(bounds), each) for x in arrays), p)
 
     def points(self, count: int, rng) -> mi.Point3f:
-        """So many random points of boundaries from which light may leave."""
+        """Random points of boundaries from which light may leave."""
         return mi.Point3f(self.p[:, rng.integers(self.p.shape[1], size=count)])
 
 
 def _outside(space: Space, around: _Asked, leaving: _Leaving | None) -> int:
-    """The number of the medium that surrounds the scene.
+    """Number of the medium that surrounds the scene.
 
-    That of most rays that leave the scene, from boundaries or ``around`` the sensor; the sensor's if none
-    does.
+    The most frequent one of rays that leave the scene, from boundaries or ``around`` the sensor; the sensor's
+    if none does.
     """
     numbers = np.full(around.escaped.sum(), space.media.sensor)
     if leaving is not None:
@@ -237,7 +238,7 @@ def _outside(space: Space, around: _Asked, leaving: _Leaving | None) -> int:
 def _contradiction_of_surroundings(
     space: Space, leaving: _Leaving, media: LightMedia, at_infinity: bool
 ) -> str:
-    """Why it is not certain which medium surrounds the scene; empty if it is."""
+    """Why the medium that surrounds the scene is uncertain; empty if it is not."""
     wrong = leaving.escaped & (leaving.number != media.outside)
     number = wrong.sum(1)
     share = np.where(number > 2, number / np.maximum(leaving.known.sum(1), 1), 0)
@@ -258,7 +259,7 @@ def _contradiction_of_surroundings(
 
 
 def _rays_around(sensor: mi.Sensor, count: int, seed: int) -> mi.Ray3f:
-    """Rays that start where those of a sensor do, in all directions if that is near to one point."""
+    """Rays from the sensor's origins; in all directions if these are near one point."""
     own, u = _camera_rays(sensor, count, seed)
     at_one_point = sensor.class_name() in _AT_ONE_POINT
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1])) if at_one_point else own.d
@@ -266,24 +267,24 @@ def _rays_around(sensor: mi.Sensor, count: int, seed: int) -> mi.Ray3f:
 
 
 def _camera_rays(sensor: mi.Sensor, count: int, seed: int):
-    """So many random rays of a sensor, and the random numbers that they were made of, (5, count)."""
+    """``count`` random rays of a sensor, and their random numbers, (5, count)."""
     u = np.random.default_rng(seed).random((5, count))
     film, aperture = mi.Point2f(u[2], u[3]), mi.Point2f(u[0], u[1])
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), mi.Float(u[4]), film, aperture)
     return ray, u
 
 
-# Sensors whose rays start near to one point, around which everything is looked at.
+# Sensors whose rays start near one point, around which all directions are probed.
 _AT_ONE_POINT = frozenset("PerspectiveCamera ThinLensCamera RadianceMeter".split())
 
 
 def _contradiction_of_media(
     space: Space, sensor: mi.Sensor, around: _Asked, outside: int, bounds: list
 ) -> str:
-    """Why the sensor and boundaries do not agree on the media between them; empty if they do.
+    """Why sensor and boundaries disagree on the media between them; or empty.
 
-    ``around`` are the boundaries around the sensor. Where these are everywhere, and none is in the sensor's
-    medium, the sensor is at fault.
+    ``around``: the boundaries around the sensor. If these are found in all directions, and none is in the
+    sensor's medium, the sensor is at fault.
     """
     if not space.scene.shapes():
         return ""
@@ -294,7 +295,7 @@ def _contradiction_of_media(
 
 
 def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: np.ndarray) -> str:
-    """Why the sensor is not in the medium ``around`` it (numbers, one for each ray); empty if it is."""
+    """Why the sensor is not in the medium ``around`` it (numbers, per ray); or empty."""
     declared = space.media.sensor
     if not len(around) or (around != declared).mean() <= _TOLERATED:
         return ""
@@ -311,7 +312,7 @@ def _called(space: Space, number: int) -> str:
 
 
 def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int, boxes: list) -> str:
-    """Why boundaries do not agree on the medium between them; empty if they do."""
+    """Why boundaries disagree on the medium between them; empty if they do not."""
     remedy = (
         "disagree about the medium between them: give each the interior and exterior medium that is there, "
         "and leave a gap where faces coincide"
@@ -319,7 +320,7 @@ def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int, boxe
     if boxes:
         lines = _lines(space, sensor, [box for _, box in boxes], _OF_SHAPE, outside)
         compared, wrong = _counted(space, lines, len(boxes))
-        # Of few comparisons one tells nothing.
+        # A few disagreements are not significant.
         share = np.where(wrong > 2, wrong / np.maximum(compared, 1), 0)
         if share.max() > _TOLERATED_OF_SHAPE:
             return f"shape {named(boxes[int(share.argmax())][0])} and those around it {remedy}"
@@ -332,14 +333,14 @@ def _contradiction_of_shapes(space: Space, sensor: mi.Sensor, outside: int, boxe
 
 
 def _counted(space: Space, lines: boundaries.Lines, parts: int) -> list[np.ndarray]:
-    """Count compared and disagreeing boundaries per part; ``lines`` are split into ``parts`` equal ones."""
+    """Count compared and disagreeing boundaries in each of ``parts`` of ``lines``."""
     found = boundaries.disagreements(space, lines)
     dr.eval(found)  # one kernel
     return [np.array(x).reshape(parts, -1).sum(1) for x in found]
 
 
 def _contradiction_of_phases(space: Space) -> str:
-    """Why light does not scatter alike in both directions; empty if it does."""
+    """Why scattering is not reciprocal; empty if it is."""
     for medium in space.media.objects:
         if asymmetry(medium) > _SYMMETRIC:
             return (
@@ -350,7 +351,7 @@ def _contradiction_of_phases(space: Space) -> str:
 
 
 def _contradiction_at_infinity(space: Space, outside: int) -> str:
-    """Why light from infinity is not that of the camera's side through the medium ``outside``."""
+    """Why light from infinity differs from the camera's side in ``outside``; or empty."""
     if not outside:
         return ""
     medium, look = space.media.objects[outside - 1], space.media.looks[outside - 1]
@@ -368,9 +369,9 @@ def _contradiction_at_infinity(space: Space, outside: int) -> str:
 
 
 def medium_at_far_plane(space: Space, sensor: mi.Sensor) -> int:
-    """The number of the medium in which most camera rays end at the far plane, of those that end in one.
+    """Number of the medium in which most clipped camera rays end at the far plane.
 
-    0 if none does, where nothing shines behind, and for sensors without far plane.
+    0 if none ends in a medium, without emitters at infinity, and for sensors without far plane.
     """
     infinite = any(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in space.scene.emitters())
     if not infinite or not isinstance(sensor, mi.ProjectiveCamera):
@@ -384,7 +385,7 @@ def medium_at_far_plane(space: Space, sensor: mi.Sensor) -> int:
 
 
 def _contradiction_at_far_plane(space: Space, sensor: mi.Sensor, far: int) -> str:
-    """Why camera rays that end in the medium ``far`` are not light's ways from infinity; empty if it is 0."""
+    """Why camera rays that end in the medium ``far`` disagree with light; or empty."""
     if not far:
         return ""
     return (
@@ -394,10 +395,10 @@ def _contradiction_at_far_plane(space: Space, sensor: mi.Sensor, far: int) -> st
 
 
 def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int) -> boundaries.Lines:
-    """Random lines, ``each`` of them through random points of every box, box by box.
+    """Random lines, ``each`` through random points of every box, box by box.
 
-    Every other one goes straight through the scene, from the medium ``outside``. The others start at the
-    sensor, and stay where light can go: they find what the first do not, which know no medium behind walls.
+    Every other line goes straight through the scene, from the medium ``outside``. The others start at the
+    sensor and are reflected, since straight lines lose the medium behind walls.
     """
     count = each * len(boxes)
     rng = np.random.default_rng(1)
@@ -406,7 +407,7 @@ def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int
     straight, (ray, _) = _through_scene(space, through, rng), _camera_rays(sensor, count, 2)
     own = mi.Ray3f(mi.Point3f(ray.o), mi.Vector3f(ray.d))
     lane = dr.arange(mi.UInt32, count)
-    if sensor.class_name() in _AT_ONE_POINT:  # every other one of those goes to its point at once
+    if sensor.class_name() in _AT_ONE_POINT:  # every other one goes directly to its point
         own.d = dr.select(lane % 4 == 1, dr.normalize(through - own.o), own.d)
     reflected = lane % 2 == 1
     medium = dr.select(reflected, dr.opaque(mi.UInt32, space.media.sensor), dr.opaque(mi.UInt32, outside))
@@ -417,7 +418,7 @@ def _lines(space: Space, sensor: mi.Sensor, boxes: list, each: int, outside: int
 
 
 def _through_scene(space: Space, through: mi.Point3f, rng) -> mi.Ray3f:
-    """Random lines ``through`` these points of the scene, from outside of it."""
+    """Random lines ``through`` these points of the scene, starting outside of it."""
     box = scene_box(space.scene)
     d = random_directions(rng, dr.width(through))
     return mi.Ray3f(through - d * (float(np.linalg.norm(np.array(box.extents()))) * 1.1), d)

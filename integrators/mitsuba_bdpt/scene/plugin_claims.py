@@ -1,8 +1,8 @@
-"""Checks of what plugins written in Python state about themselves.
+"""Checks of the properties that Python plugins declare.
 
-Strategies, densities and tables follow from flags and from methods like ``is_spatially_varying``, whose
-defaults are easily left as they are. A statement that a plugin's own answers contradict makes strategies
-disagree, so it raises an error. Mitsuba's own plugins are not asked.
+Strategies, densities and tables follow from flags and methods like ``is_spatially_varying``, whose defaults
+are easily left unchanged. A declaration that the plugin's own values contradict makes strategies disagree, so
+it raises an error. Mitsuba's own plugins are not checked.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from ..host.introspection import children, named
 from ..host.notices import remembered
 from ..media.media import random_directions, symmetric_frame
 
-_COUNT = 4096  # answers of a plugin
+_COUNT = 4096  # samples of a plugin
 
-# What Mitsuba raises of a method that a Python class does not have.
+# Errors that Mitsuba raises for methods that a Python class lacks.
 _NOT_IMPLEMENTED = re.compile("pure virtual|not implemented", re.IGNORECASE)
 
-# Share of the answers that may differ, by rounding or at edges, and by how much each may (relative). Wrong
-# statements show in most answers, far beyond the noise of single precision.
+# Tolerated share of differing samples (rounding, edges), and their relative difference. Wrong declarations
+# show in most samples.
 _OFF, _RELATIVE = 0.05, 0.01
 
 
 def check_plugins(scene: mi.Scene, sensor: mi.Sensor) -> None:
-    """Raise ``UsageError`` if a Python plugin of the scene contradicts what it states about itself.
+    """Raise ``UsageError`` if a Python plugin contradicts its declarations.
 
-    Plugins are asked again after an edit of their parameters. No kernel runs in a scene without any.
+    Repeated after edits of plugins' parameters. Runs no kernel in scenes without Python plugins.
     """
     if not any(map(_users_classes, _CHECKS)):
         return
@@ -53,7 +53,7 @@ def check_plugins(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
 
 def _users_classes(base: str) -> bool:
-    """Whether somebody derived a class from Mitsuba's class ``base`` in the present variant."""
+    """Whether there are user-defined subclasses of Mitsuba's class ``base``."""
     left = list(getattr(mi, base).__subclasses__())
     for found in left:  # grows on the way
         left += found.__subclasses__()
@@ -65,9 +65,9 @@ def _is_users(kind: type) -> bool:
 
 
 def _counts(owner, owners) -> bool:
-    """Whether a strategy relies on what ``owner`` states.
+    """Whether a strategy relies on the declarations of ``owner``.
 
-    Of textures, on those that emitters sample: not on those of BSDFs and spots.
+    Of textures only on those that emitters sample, not those of BSDFs and spots.
     """
     if not isinstance(owner, mi.Texture):
         return True
@@ -80,7 +80,7 @@ def _base(owner) -> str:
 
 
 def _held(scene: mi.Scene) -> list[mi.Object]:
-    """Whatever the scene holds that `_CHECKS` knows, once each."""
+    """Objects of the scene that `_CHECKS` covers, once each."""
     kinds = tuple(getattr(mi, base) for base in _CHECKS)
     left, seen = [scene], {}
     for owner in left:  # grows on the way
@@ -102,7 +102,7 @@ def _contradiction(owner, method: str, states: str, but: str, remedy: str) -> Us
 
 
 def _numbers(value) -> np.ndarray:
-    """A spectrum's or a number's values: (channels, answers); of a Mueller matrix the intensity's."""
+    """Values (channels, samples) of a spectrum or number; intensity if polarized."""
     if isinstance(value, mi.Spectrum) or dr.depth_v(value) > 1:
         value = mi.unpolarized_spectrum(value) if mi.is_polarized and dr.depth_v(value) > 2 else value
     found = np.atleast_2d(np.array(value, dtype=np.float64))
@@ -110,7 +110,7 @@ def _numbers(value) -> np.ndarray:
 
 
 def _differ(a, b, where) -> bool:
-    """Whether two answers differ on more than `_OFF` of the lanes ``where`` both are finite."""
+    """Whether finite values differ on more than `_OFF` of the lanes ``where``."""
     a, b = _numbers(a), _numbers(b)
     with np.errstate(all="ignore"):
         known = np.isfinite(a).all(0) & np.isfinite(b).all(0) & where
@@ -119,13 +119,13 @@ def _differ(a, b, where) -> bool:
 
 
 def _lit(value) -> np.ndarray:
-    """Mask of the answers that are finite and not 0."""
+    """Mask: values are finite and not 0."""
     found = _numbers(value)
     return np.isfinite(found).all(0) & (found != 0).any(0)
 
 
 def _interaction() -> mi.SurfaceInteraction3f:
-    """Points all over the unit square of texture coordinates, seen from all directions."""
+    """Points in the unit square of texture coordinates, seen from all directions."""
     si = dr.zeros(mi.SurfaceInteraction3f, _COUNT)
     si.uv = spread_points(_COUNT)
     si.p = mi.Point3f(si.uv.x, si.uv.y, 0)
@@ -144,7 +144,7 @@ def _wavelengths():
 
 
 def _places(scene: mi.Scene) -> mi.Point3f:
-    """Points all over the scene's box, or the unit cube if it has none."""
+    """Points in the scene's box, or in the unit cube if it has none."""
     box = scene_box(scene)
     if not is_finite(box):
         box = mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
@@ -194,7 +194,7 @@ def _check_texture(texture: mi.Texture, scene, media) -> None:
 
 
 def _first_answer(methods: tuple[Callable, ...], si):
-    """What the first of ``methods`` returns that is implemented; None if none is."""
+    """Return the value of the first of ``methods`` that is implemented, or None."""
     for method in methods:
         try:
             return method(si, mi.Bool(True))
@@ -253,7 +253,7 @@ def _known(value) -> np.ndarray:
 
 
 def _check_null(bsdf, si, kind, drawn, flags: int, media: bool) -> None:
-    """Check ``eval_null_transmission`` against the flag ``Null``, in scenes with media, which ask it."""
+    """Check ``eval_null_transmission`` against the flag ``Null`` in scenes with media."""
     if not media:
         return
     passes = _lit(bsdf.eval_null_transmission(si, mi.Bool(True))).any()
@@ -330,7 +330,7 @@ def _check_emitter(emitter: mi.Emitter, scene, media) -> None:
 
 
 def _hit(it, ds, infinite: bool) -> mi.SurfaceInteraction3f:
-    """The sample ``ds`` as rays from ``it`` would find it."""
+    """The sample ``ds`` as a hit of a ray from ``it``."""
     if infinite:
         si = dr.zeros(mi.SurfaceInteraction3f, _COUNT)
         si.t, si.wi, si.wavelengths = mi.Float(dr.inf), -ds.d, it.wavelengths

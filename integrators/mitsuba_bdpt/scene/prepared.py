@@ -1,4 +1,4 @@
-"""What a render knows of its scene and sensor before it decides anything."""
+"""A scene and a sensor, prepared for one render."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from .plugin_claims import check_plugins
 class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
-    ``emitters`` and ``camera`` are the two kinds of endpoints, ``smooth``, ``delta`` and ``refracts``:
-    whether some BSDF has such a lobe; ``traits`` see `bsdf.Traits`; ``space`` what lies between vertices and
-    ``light_media`` where light subpaths start, None in scenes without media.
+    ``emitters``, ``camera``: the endpoints; ``smooth``, ``delta``, ``refracts``: some BSDF has such a lobe;
+    ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``, in which light subpaths
+    start, are None in scenes without media.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
@@ -53,14 +53,17 @@ class PreparedScene:
         self.delta = any(b.flags() & delta for b in found)
 
     def stored_vertices(self, settings: Settings) -> int:
-        """The longest path in edges that uses all strategies."""
+        """Longest path, in edges, that uses all strategies."""
         if settings.internals.stored_vertices is not None:
             return settings.internals.stored_vertices
         return DEFAULT_STORED if self.space is None else MAX_STORED
 
 
 def _check_passed(found):
-    """Raise ``UnsupportedError`` where edges would pass what polarizes: joins know the intensity alone."""
+    """Raise ``UnsupportedError`` for polarizing null lobes.
+
+    Shadow rays carry the intensity only.
+    """
     for one in bsdf.polarizing(found):
         raise UnsupportedError(
             f"{named(one)} of class {one.class_name()} polarizes what it lets pass, which is not supported "
@@ -69,10 +72,10 @@ def _check_passed(found):
 
 
 def _prepare_bitmaps(found):
-    """Ask the bitmaps of BSDFs something.
+    """Evaluate the bitmaps of BSDFs once.
 
-    Mitsuba makes of them what kernels read when they are first asked, and that runs what was recorded so far:
-    the first pass would be two kernels, and the second one a third.
+    Mitsuba prepares their data at the first evaluation, which runs what was recorded so far: it would split
+    the first pass into two kernels.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     held = (v for owner in draws.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
@@ -81,11 +84,11 @@ def _prepare_bitmaps(found):
             try:
                 ask(si)
                 break
-            except RuntimeError:  # what it is asked depends on its channels, on ``raw`` and on the variant
+            except RuntimeError:  # the implemented call depends on channels, ``raw`` and the variant
                 continue
 
 
 def bsdfs(scene: mi.Scene) -> list[mi.BSDF]:
-    """The BSDFs of all shapes, those of shape groups included; that of an instance is never met."""
+    """BSDFs of all shapes, including those in shape groups, without instances' own."""
     found = [s.bsdf() for s in all_shapes(scene) if not is_instance(s)]
     return [b for b in found if b is not None]
