@@ -3,9 +3,8 @@
 Mitsuba offsets ray origins by 8.9e-5 (1 + max|p|), which exceeds small scenes and leaves gaps in large ones.
 Here the offset along the geometric normal follows from the rounding error of the hit:
 ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t, reach)`` with maximum norms, where ``o`` and ``t`` belong to the ray
-that found ``p``, and
-``reach`` bounds the coordinates from which hits on the shape are computed, as far as their rounding moves
-hits along the normal (`reaches`).
+that found ``p``, and ``reach`` bounds the coordinates from which hits on the shape are computed, as far as
+their rounding moves hits along the normal (`reaches`).
 
 Shadow rays end short of their target by its offset, not by a fraction of the distance, and by more if their
 own length errs more (`_before`). Towards spheres and cylinders they end earlier still; where these are so

@@ -1,17 +1,15 @@
-"""Participating media: which there are, flights along an edge, transmittance between two points.
+"""Participating media: tables, free flight, transmittance between two points.
 
-Measures. Vertices on surfaces are in the area measure, vertices in a medium in the volume measure. Free
-flight is sampled with the density sigma_t T of collisions (analogously), so that a walk multiplies by the
-albedo sigma_s / sigma_t alone and evaluates no transmittance T; that stands in joins only. Every strategy
-that makes a path samples each of its volume vertices once, and every edge but the one that it joins: of all
-these densities the weights of multiple importance sampling keep 1 / T of the joining edge (M. Raab, D.
-Seibert, A. Keller 2008; J. Křivánek et al. 2014, "Unifying Points, Beams, and Paths in Volumetric Light
-Transport Simulation", supplemental document).
+Measures: surface vertices are in the area measure, volume vertices in the volume measure. Free flight samples
+the density sigma_t T of collisions, so that a walk multiplies by the albedo sigma_s / sigma_t alone; only
+connections evaluate the transmittance T. Every strategy of a path samples each of its volume vertices once,
+and every edge but the connecting one: of these densities the MIS weights keep 1 / T of the connecting edge
+(M. Raab, D. Seibert, A. Keller 2008; J. Křivánek et al. 2014, "Unifying Points, Beams, and Paths in
+Volumetric Light Transport Simulation", supplemental document).
 
-In the weights T is replaced by ``T~``, a function of the edge alone which every strategy has to agree on: any
-such function leaves the estimate unbiased, as weights add up to 1 for each path. A random estimate of T does
-not.
+The weights use ``T~`` in place of T, a function of the edge alone that all strategies share: the estimate
+stays unbiased, since weights add up to 1 for each path. A random estimate of T would not do.
 
-An *edge* joins two vertices; null surfaces and null collisions in between are no vertices: they cut it into
+An *edge* connects two vertices; null surfaces and null collisions on it are no vertices, but cut it into
 *segments*.
 """

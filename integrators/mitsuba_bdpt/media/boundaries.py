@@ -1,4 +1,4 @@
-"""Which medium a ray is in, found from the boundaries that it meets."""
+"""Finds the medium along a ray from the boundaries that it meets."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from .media import Space
 
 @dr.syntax
 def behind(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
-    """The number of the medium at the end of ``ray``, which starts in ``medium``, and whether it gets there.
+    """Trace ``ray`` from ``medium`` through transmitting surfaces.
 
-    Surfaces that let something pass straight on are passed.
+    Returns the number of the medium at its end, and whether it arrives there.
     """
     o, left = mi.Point3f(ray.o), mi.Float(ray.maxt)
     number = mi.UInt32(medium) + dr.zeros(mi.UInt32, dr.width(ray.o))
@@ -37,10 +37,10 @@ def behind(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, m
 
 @dataclass
 class NearSide:
-    """The first boundary that rays meet: the ``number`` of the medium before it.
+    """The first boundary along rays: the ``number`` of the medium before it.
 
-    Masks: ``found``, there is one; ``escaped``, the ray has left the scene without meeting one. Neither holds
-    for a ray that stays among opaque surfaces.
+    Masks: ``found``, there is one; ``escaped``, the ray left the scene without meeting one. Neither holds for
+    a ray that stays among opaque surfaces.
     """
 
     number: mi.UInt32
@@ -48,17 +48,17 @@ class NearSide:
     escaped: mi.Bool
 
 
-# Reflections at opaque surfaces after which a ray is given up: among walls without a boundary it never ends.
+# Most reflections at opaque surfaces; among walls without a boundary a ray would never end.
 _REFLECTIONS = 16
 
 
 @dr.syntax
 def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool, target: mi.Point3f | None = None) -> NearSide:
-    """Find the first boundary along ``ray`` of whose side light may leave.
+    """Find the first boundary along ``ray`` whose near side light may leave.
 
-    Scenes leave the medium of other sides unstated: that within a wall, at the back of a lamp. Such sides,
-    and surfaces that bound no medium, are passed straight on if they transmit light. Opaque ones reflect the
-    ray as mirrors do, so that it stays where light can go; every other one towards the ``target``.
+    Scenes leave other sides undeclared, such as that within a wall or at the back of a light. Rays pass
+    straight through such sides and surfaces that bound no medium if they transmit. Opaque ones reflect the
+    ray as a mirror, so that it stays where light can go; every other reflection goes towards the ``target``.
     """
     aims = mi.Bool(target is not None)
     aim = mi.Point3f(0) if target is None else target
@@ -95,9 +95,9 @@ class Leaving:
 
 
 def leaving(space: Space, line: mi.Ray3f, through: mi.Point3f, local: mi.Vector3f) -> Leaving:
-    """Rays from the boundary on each ``line`` that is nearest to the point ``through``.
+    """Rays from the boundary on each ``line`` nearest to the point ``through``.
 
-    ``local`` their directions in a frame about the boundary's normal.
+    ``local``: their directions in a frame about the boundary's normal.
     """
     start, found = _before_the_nearest(space, line, through)
     segment = mi.Ray3f(start, line.d, line.time, line.wavelengths)
@@ -110,7 +110,7 @@ def leaving(space: Space, line: mi.Ray3f, through: mi.Point3f, local: mi.Vector3
 
 @dr.syntax
 def _before_the_nearest(space: Space, line: mi.Ray3f, through: mi.Point3f) -> tuple[mi.Point3f, mi.Bool]:
-    """A point on each ``line`` just before its boundary nearest to ``through``, and whether there is one."""
+    """Point on each ``line`` just before the boundary nearest to ``through``; if any."""
     o, start = mi.Point3f(line.o), mi.Point3f(line.o)
     best, going = dr.full(mi.Float, dr.inf, dr.width(line.o)), mi.Bool(True)
     while dr.hint(going, label="boundaries near a point", exclude=[space, line, through]):
@@ -129,9 +129,9 @@ def _before_the_nearest(space: Space, line: mi.Ray3f, through: mi.Point3f) -> tu
 class Lines:
     """Lines along which boundaries are compared.
 
-    ``medium`` the number of the one that each ``ray`` starts in. Mask ``reflected``: opaque surfaces reflect
-    the line towards its ``target``, as often as light may go on there; other lines go through. Boundaries
-    count in the box from ``low`` to ``high``.
+    ``medium``: number of the medium at each ``ray``'s origin. Mask ``reflected``: opaque surfaces reflect the
+    line towards its ``target``, as often as light may leave there; other lines go straight through.
+    Boundaries count in the box from ``low`` to ``high``.
     """
 
     ray: mi.Ray3f
@@ -142,17 +142,16 @@ class Lines:
     high: mi.Point3f
 
 
-# Reflections of such a line, which among walls would never end either.
+# Most reflections of such a line.
 _AIMED = 4
 
 
 @dr.syntax
 def disagreements(space: Space, lines: Lines) -> tuple[mi.UInt32, mi.UInt32]:
-    """Number of boundaries along ``lines`` that are compared with the one before, and how many disagree.
+    """Count compared pairs of boundaries along ``lines``, and those that disagree.
 
-    Of two boundaries that follow each other, the far side of the first has to be the near side of the second,
-    where light may leave both into the segment between them. Behind an opaque surface that bounds no medium
-    the medium is not known until the next boundary.
+    The far side of a boundary must be the near side of the next one, if light may leave both into the segment
+    between. Behind an opaque surface that bounds no medium, the medium is unknown until the next boundary.
     """
     ray = lines.ray
     o, d, current = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.UInt32(lines.medium)
@@ -183,14 +182,14 @@ def disagreements(space: Space, lines: Lines) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def _transmits(si) -> mi.Bool:
-    """Mask: the BSDF of the surface ``si`` has lobes through which light gets to the other side."""
+    """Mask: the BSDF of the surface ``si`` has transmissive lobes."""
     return (si.bsdf().flags() & int(mi.BSDFFlags.Transmission)) != 0
 
 
 def _may_leave(si, d) -> mi.Bool:
-    """Mask: light may leave the surface ``si`` along ``d``, by emission or by its BSDF.
+    """Mask: light may leave the surface ``si`` along ``d``, by emission or scattering.
 
-    A BSDF that states no side may scatter to both.
+    A BSDF without side flags may scatter to both sides.
     """
     front = dr.dot(si.sh_frame.n, d) > 0
     sides = mi.UInt32(int(mi.BSDFFlags.FrontSide)), mi.UInt32(int(mi.BSDFFlags.BackSide))
@@ -204,17 +203,17 @@ def _mirrored(d, n) -> mi.Vector3f:
     return d - n * (2 * dr.dot(d, n))
 
 
-# Cosine below which rounding decides on which side of a plane a direction within it goes.
+# Cosine below which rounding decides the side of a direction.
 _GRAZING = 1e-3
 
 
 def _towards(target, si, d) -> mi.Vector3f:
-    """Direction from ``si`` to ``target``, that of a mirror where this is not on the side of ``-d``."""
+    """Direction from ``si`` to ``target``; the mirror's if that is on the other side."""
     aimed = dr.normalize(target - si.p)
     return dr.select(dr.dot(si.n, aimed) * -dr.sign(dr.dot(si.n, d)) > _GRAZING, aimed, _mirrored(d, si.n))
 
 
 def _onwards(space: Space, segment, si, d, turned) -> mi.Point3f:
-    """Start of the ray that goes on from ``si`` along ``d``, on the same side where it is ``turned``."""
+    """Origin of the ray from ``si`` along ``d``; ``turned``: on the same side."""
     straight = segment(rays.passed(segment, si, space.shape_errors))
     return dr.select(turned, rays.surface_anchor(si, segment, space.shape_errors).towards(d), straight)

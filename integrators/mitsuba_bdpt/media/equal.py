@@ -1,7 +1,7 @@
-"""Media that are equal: told apart by what they are, not by which of Mitsuba's objects they are.
+"""Equality of media by their properties, not by object identity.
 
-Files loaded with ``optimize=False`` and scenes made in Python have an object of their own for each shape that
-states a medium.
+Files loaded with ``optimize=False`` and scenes made in Python have a separate object for each shape that
+declares a medium.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 
 from ..host.introspection import children, own_parameters
 
-# Relative difference that rounding leaves (sigma_t 0.4 with scale 2, and 0.8).
+# Relative difference due to rounding (sigma_t 0.4 with scale 2, and 0.8).
 _ROUNDING = 1e-5
 
 
 def representatives(media: list[mi.Medium], answers: Callable[[mi.Medium], np.ndarray]) -> list[int]:
-    """For each of ``media`` the index of the first one that is equal to it.
+    """Return for each of ``media`` the index of the first one that is equal to it.
 
     ``answers(medium)``: extinction, scattering and phase function at random points and directions.
 
-    Two media are equal if they have the same structure (`_structure`), the same values, and the same answers
-    to rounding. Constants count by the answers alone, since only their product matters. Volumes that vary are
-    equal to themselves alone: Mitsuba states neither the filter of a grid, nor how it goes on beyond its box.
+    Equal media have the same structure (`_structure`), the same values, and the same answers up to rounding.
+    Constants count by the answers alone, since only their product matters. Varying volumes equal only
+    themselves: Mitsuba exposes neither a grid's filter nor its wrap mode.
     """
     structures = [_structure(medium) for medium in media]
     answered = cache(lambda index: answers(media[index]))
@@ -48,12 +48,12 @@ def _same(structure: tuple | None, other: tuple | None) -> bool:
 
 
 def _structure(medium: mi.Medium) -> tuple | None:
-    """Classes of a medium and of all that it holds, and its volumes; None with a plugin written in Python.
+    """Classes of a medium and its descendants, and its volumes, to compare media.
 
-    What such a plugin is, its parameters do not tell.
+    None with Python plugins, which parameters do not identify.
     """
     parts = list(_held(medium, "medium"))
-    # Objects of Mitsuba's own plugins have just these types, those of plugins in Python derived ones.
+    # Objects of Mitsuba's own plugins have exactly these types, Python plugins derived ones.
     if any(type(owner) not in (mi.Medium, mi.Volume, mi.PhaseFunction) for _, owner in parts):
         return None
     of_parts = (
@@ -64,7 +64,7 @@ def _structure(medium: mi.Medium) -> tuple | None:
 
 
 def _held(owner: mi.Object, path: str) -> Iterator[tuple[str, mi.Object]]:
-    """``owner`` and all that it holds, with paths; volumes are left as they are."""
+    """Yield ``owner`` and its descendants with paths; volumes are not descended into."""
     yield path, owner
     if isinstance(owner, mi.Volume):
         return
@@ -78,7 +78,7 @@ def _varies(owner: mi.Object) -> bool:
 
 
 def _values(owner: mi.Object) -> dict[str, Any]:
-    """The parameters of ``owner`` by which it may differ from an equal structure."""
+    """Parameters of ``owner`` in which it may differ from an equal structure."""
     if isinstance(owner, mi.Volume):
         return {}
     skipped = "scale" if isinstance(owner, mi.Medium) and owner.is_homogeneous() else ""

@@ -1,4 +1,4 @@
-"""Free flight along an edge: through segments of media and null surfaces to the next vertex."""
+"""Free flight along an edge: through media and null surfaces to the next vertex."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .media import Media, Space, coefficients, depth_of, interaction, of_depth
 
 @dataclass
 class Edge:
-    """What a subpath in media carries along an edge; vertices start new ones.
+    """State of a subpath along an edge in media; reset at vertices.
 
-    ``medium`` the number of the one that it is in; ``maxt`` how far its ray may go; ``depth`` optical depth
-    of T~ so far, ``rest`` optical depth until the next collision (of a grid's majorant: tentative); ``event``
-    counts events, null ones included, and names random numbers; ``rays`` traced so far, of the subpath, and
-    tentative ``collisions`` (None where there are no grids). In
-    chromatic media ``channel`` the one that flights are sampled in, and ``ratio`` its densities' over their
-    mean over channels, of all flights of the subpath (``Spectrum``); else None. ``lit``: next-event
-    estimation is allowed at the vertex before, None where it is everywhere.
+    ``medium``: number of the current one; ``maxt``: remaining length of the ray; ``depth``: optical depth of
+    T~ so far; ``rest``: optical depth until the next collision (of a grid's majorant: tentative); ``event``:
+    count of events, null ones included, which indexes random numbers; ``rays``: traced so far by the subpath;
+    ``collisions``: tentative ones (None without grids). In chromatic media ``channel``: the one that flights
+    are sampled in, and ``ratio`` (``Spectrum``): the densities over their mean over channels, of all flights
+    of the subpath; else None. ``lit``: next-event estimation is allowed at the vertex before, None if
+    everywhere.
     """
 
     medium: mi.UInt32
@@ -38,7 +38,7 @@ class Edge:
 
     @staticmethod
     def begin(media: Media, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
-        """The first edge of a subpath; ``u`` decides its flight, ``u_channel()`` the channel."""
+        """First edge of a subpath; ``u`` samples its flight, ``u_channel()`` the channel."""
         channel = ratio = None
         if not media.gray:
             channel, ratio = choose_channel(u_channel()), mi.UnpolarizedSpectrum(1)
@@ -56,10 +56,10 @@ class Edge:
         )
 
     def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, lit, u: mi.Float) -> Edge:
-        """The edge after an event at its end, of this ``length`` since the ray began.
+        """Return the edge after an event at distance ``length`` from the ray's origin.
 
-        Where the event was ``null`` it goes on, else a new one begins: in ``medium``, from a vertex that is
-        ``lit``. ``u`` decides its flight.
+        After a ``null`` event it continues, else a new one begins in ``medium``, from a vertex that is
+        ``lit``. ``u`` samples its flight.
         """
         return replace(
             self,
@@ -79,9 +79,10 @@ class Edge:
 
 @dataclass
 class Landing:
-    """Where an edge ends: the ``pi`` that the ray from ``o`` finds, or the distance ``t`` of a collision.
+    """End of an edge.
 
-    ``collided`` tells which; ``edge`` and ``throughput`` as they arrive.
+    The hit ``pi`` of the ray from ``o``, or (``collided``) a collision at distance ``t``; ``edge`` and
+    ``throughput`` at the end.
     """
 
     o: mi.Point3f
@@ -93,17 +94,17 @@ class Landing:
 
 
 def choose_channel(u: mi.Float) -> mi.UInt32:
-    """One of the channels of a spectrum, uniformly."""
+    """Choose a channel of a spectrum uniformly."""
     count = len(mi.UnpolarizedSpectrum(0))
     return dr.minimum(mi.UInt32(u * count), count - 1)
 
 
 def advance(space: Space, ray: mi.Ray3f, landing: Landing, word, active: mi.Bool, hidden) -> Landing:
-    """Follow an edge to where it ends; ``landing`` is the ray's first hit, ``hidden`` see `_passes`.
+    """Follow an edge to its end, from the ray's first hit ``landing``.
 
-    Random numbers of tracking follow ``word``.
+    Random numbers of tracking follow ``word``; ``hidden``: see `_passes`.
     """
-    if not space.media.see_through and hidden is None:  # nothing to pass
+    if not space.media.see_through and hidden is None:  # no surface to pass
         landing = _segment(space.media, ray, landing, word, active)[1]
     else:
         landing = _through_surfaces(space, ray, landing, word, active, hidden)
@@ -111,9 +112,9 @@ def advance(space: Space, ray: mi.Ray3f, landing: Landing, word, active: mi.Bool
 
 
 def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:
-    """``landing``, dark where it ends at the far plane, in a homogeneous medium that goes on behind it.
+    """Return ``landing``, dark at the far plane in a homogeneous medium.
 
-    The surroundings are not seen through that without end, as in ``volpath``.
+    The medium continues without end, and the environment is invisible through it, as in ``volpath``.
     """
     number = landing.edge.medium
     endless = active & ~landing.collided & ~landing.pi.is_valid() & media.is_homogeneous(number)
@@ -123,7 +124,7 @@ def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:
 
 @dr.syntax
 def _through_surfaces(space: Space, ray, landing: Landing, word, active, hidden) -> Landing:
-    """`advance` where there are surfaces to pass."""
+    """Like `advance`, with surfaces to pass."""
     going = mi.Bool(active)
     while dr.hint(going, label="segments of an edge", exclude=[space, ray, hidden, active]):
         si, landing, word = _segment(space.media, ray, landing, word, going)
@@ -133,7 +134,7 @@ def _through_surfaces(space: Space, ray, landing: Landing, word, active, hidden)
 
 
 def _segment(media: Media, ray, landing: Landing, word, active):
-    """Fly along one segment; returns the surface at its end, what arrives, and the next random word."""
+    """Fly along one segment; returns its end surface, landing, next random word."""
     edge, pi = landing.edge, landing.pi
     segment = mi.Ray3f(landing.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
     si = pi.compute_surface_interaction(segment, mi.RayFlags.Minimal, active)
@@ -159,11 +160,11 @@ def _segment(media: Media, ray, landing: Landing, word, active):
 
 
 def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
-    """Distance of the collision (infinite if there is none), optical depths travelled and left."""
+    """Distance of the collision (infinite if none), optical depths travelled and left."""
     sigma = media.extinction(edge.medium, ray.d, ray, active)
     own = sigma if media.gray else at(sigma, edge.channel)
     t = edge.rest / own
-    collides = t < end  # of nothing at all it is NaN or infinite
+    collides = t < end  # NaN or infinite in vacuum
     travelled = dr.select(collides, t, end)
     depth = depth_of(sigma, travelled)
     rest = dr.select(own > 0, edge.rest - own * travelled, edge.rest)
@@ -179,10 +180,10 @@ def at(spectrum: mi.UnpolarizedSpectrum, channel: mi.UInt32):
 
 
 def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, active):
-    """Throughput after a segment with a collision at ``t`` or none, and the edge with its channels' ratios.
+    """Throughput and edge after a segment with a collision at ``t``, or none.
 
-    In gray media what is sampled cancels but for the albedo. In chromatic ones the densities of all channels
-    count: the balance heuristic over the channel that is sampled (A. Wilkie et al. 2014).
+    In gray media all but the albedo cancels. In chromatic media the densities of all channels count: the
+    balance heuristic over the sampled channel (A. Wilkie et al. 2014).
     """
     if media.gray and not media.scatters:
         return dr.select(collided, 0, throughput), edge
@@ -202,9 +203,9 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
 
 
 def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum:
-    """Throughput after a flight through homogeneous media of optical ``depth`` that ends before it collides.
+    """Throughput after a flight of optical ``depth`` that ends before a collision.
 
-    As `_weighted`: in gray media transmittance over density is 1.
+    In homogeneous media; as `_weighted`: in gray media transmittance / density is 1.
     """
     if edge.ratio is None:
         return throughput
@@ -213,10 +214,10 @@ def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum
 
 
 def _passes(media: Media, si, hidden) -> mi.Bool:
-    """Mask: an edge goes through this surface, which nobody looks at.
+    """Mask: an edge passes this surface without a vertex.
 
-    Of plugin ``null``, without emitter and sensor; ``hidden`` (a mask or None): emitters are passed, as by
-    ``path`` under ``hide_emitters``.
+    It does at plugin ``null`` without emitter and sensor, and at emitters where ``hidden`` (a mask or None),
+    as ``path`` does under ``hide_emitters``.
     """
     emits = si.shape.emitter() != dr.zeros(mi.EmitterPtr)
     passes = mi.Bool(False)
@@ -228,7 +229,7 @@ def _passes(media: Media, si, hidden) -> mi.Bool:
 
 
 def _onwards(space: Space, ray, si, landing: Landing, going) -> Landing:
-    """Where ``going``, on the other side of the surface ``si``."""
+    """Continue on the other side of the surface ``si`` where ``going``."""
     edge, media = landing.edge, space.media
     segment = mi.Ray3f(landing.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
     onwards = rays.passed(segment, si, space.shape_errors)

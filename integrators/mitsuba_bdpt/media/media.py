@@ -17,31 +17,32 @@ from ..geometry.rounding import ShapeErrors
 from ..host.introspection import all_shapes, children, is_instance, named
 from .equal import representatives
 
-# Optical depth beyond which T~ is that of this depth: ratios of densities stay within single precision.
-# (Whatever T~ is there, joins across such edges add next to nothing.)
+# Optical depth above which T~ is constant, so that ratios of densities stay within single precision;
+# connections across such edges contribute next to nothing.
 DEEPEST = 32.0
 
 _LEAST = math.exp(-DEEPEST)
 
-# Points and directions at which a medium is looked at to find what it depends on, and its mean extinction.
+# Sample points and directions at which a medium's properties are evaluated.
 _PROBES = 4096
 
 
 class Media:
-    """The media that rays of a scene and sensor may be in, numbered from 1; number 0 (``UInt32``) is none.
+    """Media that rays of a scene and sensor may be in, numbered from 1; 0 is vacuum.
 
-    Media that are equal (`equal.representatives`) have one number. ``objects`` the media, one of each number,
-    ``looks`` what each is like (`_Look`); ``sensor`` the number of the one that the sensor declares. What
-    there is, for branches while a kernel is recorded: ``grids``: some medium is not homogeneous;
-    ``coloured_grids``: the extinction of some grid depends on the wavelength; ``scatters``: some albedo is
-    not 0; ``gray``: no extinction of homogeneous media depends on the wavelength, so that optical depths are
-    ``Float``, else ``Spectrum``; ``directional``: extinction depends on the direction (microflakes);
-    ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: visibility rays
-    have to look at surfaces; ``all_lit``: next-event estimation is allowed in all media
-    (``sample_emitters``).
+    Equal media (`equal.representatives`) share a number (``UInt32``). Raises ``UnsupportedError`` for media
+    for which Mitsuba's own calls disagree, ``UsageError`` for invalid coefficients.
 
-    Raises ``UnsupportedError`` for media whose own calls contradict each other, ``UsageError`` for numbers
-    that are no medium's.
+    * ``objects``, ``looks``: one medium and its `_Look` per number; ``sensor``: number of the sensor's
+      medium.
+    * ``grids``: some medium is heterogeneous; ``coloured_grids``: the extinction of one depends on
+      wavelength.
+    * ``scatters``: some albedo is not 0; ``directional``: extinction depends on direction (microflakes).
+    * ``gray``: no homogeneous medium's extinction depends on wavelength; optical depths are then ``Float``,
+      else ``Spectrum``.
+    * ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: shadow rays
+      have to evaluate surfaces.
+    * ``all_lit``: next-event estimation is allowed in all media (``sample_emitters``).
     """
 
     def __init__(self, found: dict[int, mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
@@ -60,7 +61,7 @@ class Media:
         self.coloured_grids = any(look.coloured_grid for look in looks)
         self.directional = any(look.directional for look in looks)
         self._spectral_table = self.gray or not mi.is_spectral
-        # With an entry for vacuum.
+        # Entry 0 is vacuum.
         self._extinction = self._table([look.majorant for look in looks])
         self._mean = mi.Float([0.0, *(look.mean for look in looks)])
         self._homogeneous = mi.UInt32([0, *map(int, homogeneous)])
@@ -76,12 +77,15 @@ class Media:
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Iterable[mi.BSDF]) -> Media | None:
-        """Those of a scene seen by a sensor, whose shapes have these BSDFs; None if there are none."""
+        """Return the media of a scene seen by a sensor, None if there are none.
+
+        ``bsdfs``: those of the scene's shapes.
+        """
         found = media_of(scene, [sensor])
         return Media(found, sensor.get_medium(), bsdfs) if found else None
 
     def _table(self, majorants):
-        """Extinction by number, ``Float`` or ``Spectrum``; None if it depends on more than the number."""
+        """Extinction by number, ``Float`` or ``Spectrum``; None if other variables matter."""
         if not self._spectral_table:
             return None
         entries = np.array([np.zeros(len(majorants[0])), *majorants])
@@ -100,21 +104,21 @@ class Media:
         return dr.gather(mi.UInt32, self._homogeneous, number) == 1
 
     def is_null(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Mask: the BSDF of the surface ``si`` lets everything pass straight on."""
+        """Mask: the BSDF of the surface ``si`` has a null lobe only."""
         return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(
             mi.BSDFFlags.Null
         )
 
     def is_lit(self, number: mi.UInt32) -> mi.Bool:
-        """Mask: next-event estimation is allowed at vertices in the medium, or on surfaces (number 0)."""
+        """Mask: next-event estimation is allowed in the medium, or on surfaces (number 0)."""
         return dr.gather(mi.UInt32, self._lit, number) == 1
 
     def mean(self, number: mi.UInt32) -> mi.Float:
-        """Mean extinction of the medium (1 / scene unit), of a grid within its box; 0 in vacuum."""
+        """Mean extinction (1 / scene unit), of a grid within its box; 0 in vacuum."""
         return dr.gather(mi.Float, self._mean, number)
 
     def extinction(self, number: mi.UInt32, d: mi.Vector3f, shared, active: mi.Bool):
-        """Extinction of homogeneous media along ``d``, majorant of grids (1 / scene unit); 0 in vacuum.
+        """Extinction along ``d`` (1 / scene unit), a grid's majorant; 0 in vacuum.
 
         ``Float`` if `gray`, else ``Spectrum``; ``shared`` carries time and wavelengths.
         """
@@ -133,7 +137,7 @@ class Media:
         return majorant[0] if self.gray else majorant
 
     def ask(self, number: mi.UInt32, question, *args):
-        """Answers of ``question(medium, *args)``, without meaning in vacuum; ``args`` end with a mask."""
+        """Evaluate ``question(medium, *args)``, undefined in vacuum; ``args[-1]``: mask."""
         *others, active = args
         active = active & (number != 0)
         if len(self.objects) == 1:
@@ -144,10 +148,10 @@ class Media:
 
 @dataclass(frozen=True)
 class Space:
-    """What lies between vertices: the ``scene``, its ``media`` and the rounding errors of its shapes.
+    """The space between vertices: ``scene``, ``media``, rounding errors of shapes.
 
-    ``null_transmission(si, active)``: transmission of a surface straight on (``Spectrum``); ``clipped``: some
-    camera ray ends in a homogeneous medium at the far plane, behind which there are the surroundings.
+    ``null_transmission(si, active)``: transmission of a surface straight through (``Spectrum``); ``clipped``:
+    some camera ray ends in a homogeneous medium at the far plane, in front of the environment.
     """
 
     scene: mi.Scene
@@ -157,14 +161,14 @@ class Space:
     clipped: bool = False
 
 
-# Lobes other than passing straight on.
+# Lobes other than null.
 _OTHER_LOBES = int(
     mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Delta1D
 )
 
 
 def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f:
-    """A point ``p`` in a medium, reached along unit ``d``, for Mitsuba's calls."""
+    """Interaction at ``p`` in a medium, reached along unit ``d``, for Mitsuba's calls."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p, mei.wi, mei.sh_frame = p, -d, symmetric_frame(-d)
     mei.time, mei.wavelengths = shared.time, shared.wavelengths
@@ -172,10 +176,10 @@ def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f
 
 
 def symmetric_frame(n: mi.Vector3f) -> mi.Frame3f:
-    """A frame about unit ``n`` whose matrix is its own transpose: half a turn, or a reflection of the z axis.
+    """Frame about unit ``n`` whose matrix equals its transpose.
 
-    Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix: another distribution than its
-    density.
+    It is a half-turn or a reflection of the z axis. Mitsuba 3.9.1's ``sggx`` samples with the transposed
+    frame: another distribution than its density.
     """
     sign = dr.select(n.z >= 0, mi.Float(1), mi.Float(-1))
     h = dr.normalize(n + mi.Vector3f(0, 0, sign))
@@ -192,13 +196,13 @@ def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool
 
 
 def depth_of(sigma: mi.Float | mi.UnpolarizedSpectrum, length: mi.Float) -> mi.Float | mi.UnpolarizedSpectrum:
-    """Optical depth of a ``length``, which may be infinite, in a medium of extinction ``sigma``."""
-    # (In spectral variants the choice by entries is no `Spectrum`.)
+    """Optical depth of a ``length``, which may be infinite, at extinction ``sigma``."""
+    # (In spectral variants `select` by entries returns no `Spectrum`.)
     return type(sigma)(dr.select(sigma > 0, sigma * length, 0))
 
 
 def of_depth(depth: mi.Float | mi.UnpolarizedSpectrum):
-    """T~ of an optical depth: the mean over the channels of exp(-depth), not below that of `DEEPEST`."""
+    """T~ of an optical depth: mean over channels of exp(-depth), bounded by `DEEPEST`."""
     transmittance = dr.exp(-depth)
     if isinstance(depth, mi.UnpolarizedSpectrum):
         transmittance = dr.mean(transmittance)
@@ -206,14 +210,14 @@ def of_depth(depth: mi.Float | mi.UnpolarizedSpectrum):
 
 
 def media_of(scene: mi.Scene, sensors: Iterable[mi.Sensor]) -> dict[int, mi.Medium]:
-    """The media that rays of a scene and these sensors may be in, by their place in Mitsuba's registry."""
+    """Media that rays of a scene and these sensors may be in, by registry index."""
     media = [sensor.get_medium() for sensor in sensors]
     media += [medium for shape in all_shapes(scene) for medium in _sides(shape)]
     return {_registry_id(medium): medium for medium in media if medium is not None}
 
 
 def _sides(shape: mi.Shape) -> tuple:
-    """The media on both sides of a shape, None for none; instances have those of their groups' shapes."""
+    """Media on both sides of a shape; none for instances (their shapes have them)."""
     if is_instance(shape) or not shape.is_medium_transition():
         return ()
     return shape.interior_medium(), shape.exterior_medium()
@@ -224,14 +228,14 @@ def _registry_id(medium: mi.Medium) -> int:
 
 
 def _numbers(number_of: dict[int, int]) -> mi.UInt32:
-    """A table of the numbers of media by their place in Mitsuba's registry."""
+    """Table from Mitsuba's registry index to the number of a medium."""
     return mi.UInt32([number_of.get(place, 0) for place in range(max(number_of) + 1)])
 
 
 def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray):
-    """Raise ``UnsupportedError`` if the extinction of a homogeneous medium depends on where it is asked.
+    """Raise ``UnsupportedError`` if a homogeneous medium's extinction varies in space.
 
-    ``majorant`` is its answer at ``mei`` (`probes`).
+    ``majorant``: its values at ``mei`` (`probes`).
     """
     if not medium.is_homogeneous():
         return
@@ -253,7 +257,7 @@ def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray)
 
 
 def _answers(medium: mi.Medium) -> np.ndarray:
-    """Majorant, sigma_s, sigma_t and phase function at `probes`, one row for each channel of each."""
+    """Majorant, sigma_s, sigma_t, phase function at `probes`, one row per channel."""
     mei = probes(medium)
     wo = random_directions(np.random.default_rng(1), _PROBES)
     value, _ = medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, wo)
@@ -273,7 +277,7 @@ def _majorants(medium: mi.Medium, mei: mi.MediumInteraction3f) -> np.ndarray:
 
 
 def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
-    """Random points within a grid, or within all that varies in a homogeneous medium.
+    """Random points in a grid, or in the varying volumes of a homogeneous medium.
 
     With directions of arrival and wavelengths.
     """
@@ -294,12 +298,12 @@ def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
 
 
 def random_directions(rng, count: int) -> mi.Vector3f:
-    """So many unit vectors, evenly spread over the sphere."""
+    """Random unit vectors, uniform over the sphere."""
     return mi.warp.square_to_uniform_sphere(mi.Point2f(rng.random((2, count))))
 
 
 def _volumes(owner) -> list[mi.Volume]:
-    """What varies in space of a medium, its phase function included."""
+    """Volumes of a medium that vary in space, including its phase function's."""
     found = []
     for held in children(owner).values():
         if isinstance(held, mi.PhaseFunction):
@@ -310,16 +314,16 @@ def _volumes(owner) -> list[mi.Volume]:
 
 
 def _points_within(boxes: list[mi.BoundingBox3f], rng) -> mi.Point3f:
-    """Points spread over boxes, in each as many; the origin without any."""
+    """Points spread equally over boxes; the origin if there are none."""
     if not boxes:
         return dr.zeros(mi.Point3f, _PROBES)
     return points_in(boxes, np.arange(_PROBES) % len(boxes), rng.random((_PROBES, 3)))
 
 
 def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str:
-    """What the extinctions of a medium should not be, in words; empty if nothing.
+    """Describe invalid extinctions or albedos of a medium; empty if there are none.
 
-    Raises ``UsageError`` if it is homogeneous, of which nothing would be left, or too much.
+    Raises ``UsageError`` for invalid values of a homogeneous medium.
     """
     with np.errstate(all="ignore"):
         albedo = np.where(sigma_t != 0, sigma_s / sigma_t, 0)
@@ -343,13 +347,11 @@ def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str
 
 
 class _Look:
-    """What a medium is like, from its own answers at random points and directions.
+    """Properties of a medium, from its values at random points and directions.
 
-    ``majorant`` (channels,): that of all directions; ``gray``, ``directional``, ``scatters`` see `Media`;
-    ``coloured_grid``; ``mean`` extinction, ``least`` (of the majorant) of all channels; ``strange`` what
-    its numbers should not be, in words, or empty.
-
-    Raises ``UnsupportedError`` and ``UsageError``, see `_check` and `_strange`.
+    ``majorant`` (channels,): maximum over directions; ``gray``, ``directional``, ``scatters``,
+    ``coloured_grid``: see `Media`; ``mean`` extinction, ``least`` majorant of all channels; ``strange``:
+    `_strange`. Raises ``UnsupportedError`` and ``UsageError``, see `_check` and `_strange`.
     """
 
     def __init__(self, medium: mi.Medium):
@@ -361,7 +363,7 @@ class _Look:
         )
         self.strange = _strange(medium, sigma_s, sigma_t)
         self.majorant, self.least = majorant.max(1), float(majorant.min())
-        # A grid's flights are sampled with one number for all channels.
+        # A grid's flights are sampled with one majorant for all channels.
         self.gray = not homogeneous or bool((majorant == majorant[:1]).all())
         self.coloured_grid = not homogeneous and not (sigma_t == sigma_t[:1]).all()
         same = majorant == majorant[:, :1]

@@ -1,8 +1,8 @@
-"""Grids, whose transmittance is known in expectation only: delta tracking and ratio tracking.
+"""Transmittance of grids: delta tracking and ratio tracking.
 
 E. R. Woodcock et al. 1965; J. Novák, A. Selle, W. Jarosz 2014, "Residual Ratio Tracking for Estimating
-Attenuation in Participating Media". Both fly through a homogeneous medium of the grid's majorant and meet
-tentative collisions. T~ of a grid is that of its mean extinction within its box.
+Attenuation in Participating Media". Both sample tentative collisions in a homogeneous medium of the grid's
+majorant. T~ of a grid is that of its mean extinction within its box.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from .media import Media, coefficients, interaction
 
 @dataclass
 class Tracked:
-    """What delta tracking finds: the distance ``t`` of a real collision (infinite if there is none).
+    """Result of delta tracking: distance ``t`` of a real collision (infinite if none).
 
-    ``depth`` optical depth of T~ up to it, ``rest`` what is left until the next tentative collision,
-    ``throughput`` times the ratios of null collisions, the next random ``word``, and the number of tentative
+    ``depth``: optical depth of T~ up to it; ``rest``: optical depth until the next tentative collision;
+    ``throughput`` times the ratios of null collisions; next random ``word``; number of tentative
     ``collisions``.
     """
 
@@ -35,18 +35,21 @@ class Tracked:
 
 
 def exponential(u: mi.Float) -> mi.Float:
-    """Optical depth with density exp(-depth) from ``u`` in [0, 1); never 0, where vertices would coincide."""
+    """Sample an optical depth with density exp(-depth) from ``u`` in [0, 1); never 0.
+
+    At 0, vertices would coincide.
+    """
     return dr.select(u > 0, -dr.log(1 - u), 2.0**-25)
 
 
 def _tracks(majorant, throughput, inside):
-    """Where a majorant is tracked, and ``throughput``, NaN where that is not finite, to be counted."""
+    """Mask of finite majorants above 0; ``throughput``, NaN at non-finite ones."""
     finite = dr.isfinite(majorant)
     return inside & finite & (majorant > 0), dr.select(inside & ~finite, dr.nan, throughput)
 
 
 def _within(media: Media, number, ray, end, active):
-    """Where ``ray`` is within the grid's box, up to ``end``: from, to, and whether at all."""
+    """Interval of ``ray`` in the grid's box, up to ``end``; mask: it is not empty."""
 
     def box(medium: mi.Medium, ray, active):
         return medium.intersect_aabb(ray)
@@ -58,7 +61,7 @@ def _within(media: Media, number, ray, end, active):
 
 @dr.syntax
 def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tracked:
-    """Delta tracking along ``ray`` up to ``end``; first a tentative collision after depth ``rest``."""
+    """Delta tracking along ``ray`` up to ``end``; ``rest``: first tentative collision."""
     low, high, inside = _within(media, number, ray, end, active)
     majorant = media.majorant(number, ray, active)
     t, met = mi.Float(low), mi.Float(dr.inf)
@@ -76,7 +79,7 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
         _, sigma_t = media.ask(number, coefficients, mei, tentative)
         null = dr.mean(majorant - sigma_t)
         u, word = sequential(word)
-        # The probability of a real collision is the mean over channels, whose ratios are left.
+        # The probability of a real collision is the mean over channels; the channels' ratios remain.
         passed = tentative & (u * majorant < null)
         left_over = polarization.scaled(throughput, (majorant - sigma_t) / null)
         throughput = dr.select(passed, left_over, throughput)

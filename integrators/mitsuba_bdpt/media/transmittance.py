@@ -1,4 +1,4 @@
-"""Transmittance between two points: through media and surfaces that let light pass straight on."""
+"""Transmittance between two points, through media and surfaces with null lobes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from .media import Media, Space, depth_of, of_depth
 
 @dataclass
 class Crossing:
-    """``transmittance`` of an edge, an unbiased estimate (``Spectrum``), and the optical ``depth`` of its T~.
+    """Unbiased ``transmittance`` of an edge (``Spectrum``), ``depth`` of its T~.
 
-    ``clear``: no surface is in the way. How many ``segments`` it has, and tentative ``collisions`` in grids
-    (None without any).
+    ``clear``: no surface blocks it; ``segments``: their number; ``collisions``: tentative ones in grids (None
+    without any).
     """
 
     transmittance: mi.UnpolarizedSpectrum
@@ -30,12 +30,12 @@ class Crossing:
 
     @property
     def tr(self):
-        """T~ of the edge, which the weights have."""
+        """T~ of the edge, as used in the weights."""
         return of_depth(self.depth)
 
     @property
     def visible(self):
-        """Mask: something passes. (NaN does, so that it is counted.)"""
+        """Mask: transmittance is not 0. (True for NaN, so that it is counted.)"""
         return ~dr.all(self.transmittance == 0)
 
 
@@ -48,10 +48,9 @@ def between(
     word: mi.UInt32,
     hidden: bool = False,
 ) -> Crossing:
-    """What passes along ``ray``, which starts in ``medium``, up to its end; 0 where not ``active``.
+    """Transmittance along ``ray``, from ``medium`` to its end; 0 where not ``active``.
 
-    ``own`` is as of `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are
-    passed.
+    ``own``: see `rays.occluded`; random numbers of tracking follow ``word``; ``hidden``: emitters are passed.
     """
     media = space.media
     if not media.null_lobes and not hidden:
@@ -63,9 +62,9 @@ def between(
 
 
 def depth_along(space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool):
-    """Optical depth of T~ along ``ray``, which starts in ``medium``, up to its end or what blocks it.
+    """Optical depth of T~ along ``ray``, from ``medium`` to its end or what blocks it.
 
-    The end may lie on a surface, which rounding puts before it or behind it.
+    The end may lie on a surface, which rounding puts before or behind it.
     """
     if not space.media.null_lobes:
         return _along(space.media, medium, ray, ray.maxt, mi.UInt32(0), active)[1]
@@ -73,7 +72,7 @@ def depth_along(space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool)
 
 
 def _along(media: Media, medium, ray, length, word, active):
-    """Transmittance of one segment (``Spectrum``), optical depth of T~, next random word, collisions."""
+    """Segment: transmittance (``Spectrum``), depth of T~, next word, collisions."""
     sigma = media.extinction(medium, ray.d, ray, active)
     depth = depth_of(sigma, length)
     transmittance, collisions = mi.UnpolarizedSpectrum(dr.exp(-depth)), None
@@ -86,7 +85,7 @@ def _along(media: Media, medium, ray, length, word, active):
 
 @dr.syntax
 def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> Crossing:
-    """`between` where there are surfaces to pass."""
+    """Like `between`, with surfaces to pass."""
     media, scene = space.media, space.scene
     o, left, medium = mi.Point3f(ray.o), mi.Float(ray.maxt), mi.UInt32(medium)
     transmittance, word, going = mi.UnpolarizedSpectrum(1), mi.UInt32(word), mi.Bool(active)
@@ -114,14 +113,14 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
 
 
 def _is_end(si, own, t) -> mi.Bool:
-    """Mask: the surface ``si`` at distance ``t`` from where the ray starts is what the ray ends at."""
+    """Mask: the surface ``si`` at distance ``t`` from the ray's origin is its target."""
     if own is None:
         return mi.Bool(False)
     return (met(si.shape, si.instance) == own.number) & (t >= own.t)
 
 
 def _onward(space: Space, si, active, hidden: bool) -> mi.UnpolarizedSpectrum:
-    """What the surface ``si`` lets pass."""
+    """Transmission of the surface ``si`` straight through."""
     passed = space.null_transmission(si, active)
     if not hidden:
         return passed
