@@ -1,20 +1,17 @@
-"""The samples of one kernel launch, where each of them lies, and which of them share a light subpath.
+"""The samples of one kernel launch: their pixels, and which share a light subpath.
 
-The pixels of a batch are cut into S parts of one size (the last ones may be short), and a lane serves one
-sample of a pixel of each part. Were that the same pixel of all parts, pixels that share light subpaths would
-lie at one distance from each other all over the image, and the noise that they have in common would make
-stripes. So the pixels of each part are dealt anew:
+The pixels of a batch are cut into S parts of equal size (the last ones may be short); a lane serves a sample
+of one pixel of each part. Equal offsets in all parts would correlate pixels at one distance all over the
+image, and the noise would show stripes. So the pixels of each part are permuted:
 
-* All samples of a pixel share with those of the same pixels, in all passes, so that its light subpaths are
-  neighbours in the sequence, a net where its camera samples are one (see `points`). To deal one of 16
-  otherwise, in the first pass, made 8 % more error in `uplight_room` with S = 4.
-* Runs of neighbouring pixels stay together if there are many, so that rays of neighbouring lanes are
-  coherent.
-* Runs are dealt by a Feistel network: with their numbers written as a table of rows and columns, each column
-  is turned by a hash of its number, then each row, then each column again. That is a bijection for any number
-  of runs, and needs neither memory nor, in the loop over the parts, a division.
+* All samples of a pixel share with the same other pixels in all passes, so that its light subpaths are
+  neighbours in the sequence and form a net where its camera samples do (see `points`).
+* Runs of neighbouring pixels stay together in large parts, which keeps rays of neighbouring lanes coherent.
+* A Feistel network permutes runs: with their numbers in a table of rows and columns, each column is rotated
+  by a hash of its number, then each row, then each column. It is a bijection for any number of runs and needs
+  neither memory nor, in the loop over the parts, a division.
 
-What is left over, less than a run and the few runs that make no row of the table, stays in its place.
+The remainder, less than a run and the few runs that fill no row of the table, stays in place.
 """
 
 from __future__ import annotations
@@ -28,9 +25,8 @@ import mitsuba as mi
 from ..sampling import sobol
 from .inputs import Kernel
 
-# Points of a net of one pixel, and nets of a pixel: their means differ by what points leave of the variance.
-# (Longer nets gain more, and there are fewer of them: with 16 points in half as many pixels what is found in
-# a Cornell box is off by 31 % instead of 24 %.)
+# Points of a net of one pixel, and nets per pixel: the difference of their means measures the stratification
+# gain. Longer nets gain more, but fewer of them measure it less precisely.
 NET, NETS = 8, 2
 
 
@@ -38,13 +34,12 @@ NET, NETS = 8, 2
 class Batch:
     """The samples of one launch: of a pass, of a band of its rows, or of a pilot.
 
-    Pixels ``first_pixel`` and on, ``pixels`` of them (row by row in the film region), samples
-    ``first_sample`` and on, ``samples`` of each pixel.
+    ``pixels`` pixels from ``first_pixel`` on (row by row in the film region), with ``samples`` samples of
+    each from ``first_sample`` on.
 
-    With ``spread``, for pilots, the pixels are not neighbours, but one by chance in each of equal parts of
-    the first so many, and samples are independent of each other. Then come those of ``nets`` other pixels
-    chosen like that, `batch.NETS` of `batch.NET` samples each, which are points of a sequence of their own;
-    and so many times ``light`` as there are camera samples light subpaths.
+    For pilots, ``spread`` > 0: one random pixel in each of ``pixels`` equal parts of the first ``spread``,
+    with independent samples; then ``nets`` further pixels, with `NETS` nets of `NET` samples each, every net
+    with its own sequence; ``light``: light subpaths per camera sample.
     """
 
     first_pixel: int
@@ -67,7 +62,7 @@ class Batch:
 
 
 class Places:
-    """Where a camera sample of the batch lies: pixel, and index in the image's sequence."""
+    """Maps camera samples of a batch to pixels and to indices in the image's sequence."""
 
     def __init__(self, kernel: Kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
@@ -94,14 +89,14 @@ class Places:
         pixel = dr.select(in_net, after // (NETS * NET), slot // self._samples)
         sample = dr.select(in_net, after % (NETS * NET), slot % self._samples)
         parts = dr.select(in_net, self._nets, self._pixels)
-        # By chance: one in so many would miss columns of films that wide.
+        # Random: a regular stride would miss columns of films of that width.
         hashed = sobol.mix(dr.select(in_net, ~pixel, pixel + 1))
         within = mi.UInt64(hashed) % self._spread
         pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // parts)
         return pixel + self._first_pixel, sample
 
     def index(self, slot: mi.UInt32) -> mi.UInt64:
-        if self._pilot:  # each sample, or net, is of a sequence of its own
+        if self._pilot:  # each sample, or net, has its own sequence
             within = dr.select(slot >= self._first_net, (slot - self._first_net) % NET, 0)
             return (mi.UInt64(slot - within) << 32) | mi.UInt64(within)
         pixel, sample = self._split(slot)
@@ -112,26 +107,22 @@ class Places:
         return self._camera.region.pixel(pixel)
 
 
-# Most pixels of a run: single ones make renders of one sample per pass 4 to 8 % slower.
+# Most pixels of a run; runs of one pixel are 4 to 8 % slower with one sample per pass.
 LONGEST_RUN = 16
 
-# A part has as many runs or more, or else runs of one pixel: few would meet at few distances.
+# Parts of fewer runs use runs of one pixel: few runs would meet at few distances.
 LEAST_RUNS = 256
 
-# Words that make other seeds of a pass's: 1 and 2 make those of the points (`Points.stream`). Parts that are
-# dealt, from 1 on, have those after them.
+# Words that derive seeds from that of a pass: the points use 1 and 2 (`Points.stream`), parts the words after
+# them.
 _WORDS_OF_POINTS = 2
 
-_ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # tell the keys of the rounds apart
+_ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # distinguish the keys of the rounds
 
 
 @dataclass
 class Seat:
-    """A lane's place in a part.
-
-    Of the ``lane`` of this number: ``row`` and ``column`` of its run, ``pixel`` in the run, ``sample`` of the
-    pixel.
-    """
+    """A lane's place in a part: ``row`` and ``column`` of its run, pixel, and sample."""
 
     lane: mi.UInt32
     row: mi.UInt32
@@ -143,10 +134,9 @@ class Seat:
 class Sharing:
     """The map of a batch's camera samples to lanes.
 
-    Slots number the camera samples, pixel by pixel with ``samples`` of each of the ``pixels``; there are
-    ``total`` of them. Each of the ``lanes`` serves ``served`` slots or fewer, all in different pixels. The
-    map is another for each ``seed`` (``UInt32``), so that in the mean of several renders no two pixels share
-    much.
+    Slots number the ``total`` camera samples, pixel by pixel with ``samples`` of each of the ``pixels``. Each
+    of the ``lanes`` serves at most ``served`` slots, all in different pixels. The map depends on ``seed``
+    (``UInt32``), so that over several renders no two pixels remain correlated.
     """
 
     def __init__(self, pixels: int, samples: int, served: int, seed: mi.UInt32):
@@ -161,17 +151,14 @@ class Sharing:
         self._rows, self._columns = dr.opaque(u32, rows), dr.opaque(u32, columns)
 
     def seat(self, lane: mi.UInt32) -> Seat:
-        """What `slot` needs of a ``lane`` (``UInt32``), the same for all parts."""
+        """The `Seat` of a ``lane`` (``UInt32``), the same for all parts."""
         pixel = lane // self._samples
         run = pixel >> self._bits
         row = run // self._columns
         return Seat(lane, row, run - row * self._columns, pixel & self._last, lane - pixel * self._samples)
 
     def slot(self, seat: Seat, part: mi.UInt32) -> mi.UInt32:
-        """The sample of a ``part`` (``UInt32``) that a lane serves.
-
-        There is none if this is not below ``total``.
-        """
+        """The slot that a lane serves in a ``part``; none if not below ``total``."""
         keys = self._keys(part)
         row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))
         column = _turned(seat.column, self._columns, sobol.mix(row ^ keys[1]))
@@ -180,7 +167,7 @@ class Sharing:
         return part * self._lanes + self._place(seat, part, row, column, hashed)
 
     def lane(self, slot: mi.UInt32) -> mi.UInt32:
-        """The lane that serves a sample, the inverse of `slot`."""
+        """The lane that serves a slot, the inverse of `slot`."""
         part = slot // self._lanes
         seat, keys = self.seat(slot - part * self._lanes), self._keys(part)
         hashed = sobol.mix(seat.column ^ keys[2])
@@ -194,10 +181,10 @@ class Sharing:
         return [key ^ word for word in _ROUNDS]
 
     def _place(self, seat, part, row, column, hashed):
-        """Place in a part of what is dealt from a ``seat``; the first part stays as it is.
+        """Place in a part after the permutation; the first part is not permuted.
 
-        Pixels of a run change places too (by low bits of a hash whose high bits turned the column), or else
-        those that share lanes would lie a multiple of a run apart.
+        Also permutes the pixels within a run, by the low bits of the hash whose high bits rotated the column:
+        otherwise pixels that share lanes would lie multiples of a run apart.
         """
         run = row * self._columns + column
         dealt = ((run << self._bits) + (seat.pixel ^ (hashed & self._last))) * self._samples + seat.sample
@@ -205,7 +192,7 @@ class Sharing:
 
 
 def run_pixels(part: int) -> int:
-    """Pixels of a run, a power of two, in parts of so many pixels."""
+    """Pixels of a run, a power of two, in parts of ``part`` pixels."""
     run = 1
     while run < LONGEST_RUN and part >= 2 * run * LEAST_RUNS:
         run *= 2
@@ -213,10 +200,9 @@ def run_pixels(part: int) -> int:
 
 
 def table_size(runs: int) -> tuple[int, int]:
-    """Rows and columns of a table of ``runs`` or nearly so many; 0 rows if there are no runs.
+    """Rows and columns of a table of at most ``runs`` runs; 0 rows without runs.
 
-    Of those with between half and twice the root of it as columns, the one that leaves out least, the
-    squarest of these.
+    Among column counts from half to twice the root, the table that leaves out least, then the squarest.
     """
     root = isqrt(runs)
     sizes = ((runs // columns, columns) for columns in range(max(root // 2, 1), 2 * root + 2))
@@ -224,7 +210,7 @@ def table_size(runs: int) -> tuple[int, int]:
 
 
 def _turned(place, count, hashed):
-    """``place`` in a cycle of ``count``, turned by a hash."""
+    """Rotate ``place`` in a cycle of ``count`` by a hash."""
     place = place + dr.mul_hi(hashed, count)
     return dr.select(place >= count, place - count, place)
 

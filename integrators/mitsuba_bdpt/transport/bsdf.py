@@ -1,10 +1,10 @@
-"""Evaluation of Mitsuba's BSDFs in both directions, and the one home of the adjoint factor.
+"""Evaluates and samples Mitsuba's BSDFs on both subpaths, with the adjoint factor.
 
-Directions: ``c`` points towards the camera's side of a vertex, ``l`` towards the light's side, both
-away from the surface. On camera subpaths Mitsuba's ``si.wi`` is ``c``. On light subpaths ``si.wi``
-is ``l``, and the BSDF is evaluated in *radiance* mode with the two swapped, times the ratio of
-geometric cosines |n.c| / |n.l|: exact for bump and normal maps, interpolated normals and hair,
-where Mitsuba's importance mode with Veach's correction (thesis, eq. 5.19) is not.
+Directions point away from the surface: ``c`` to the camera's side of a vertex, ``l`` to the light's side. On
+camera subpaths ``si.wi`` is ``c``. On light subpaths ``si.wi`` is ``l``, and the BSDF is evaluated in
+*radiance* mode with the two swapped, times the ratio of geometric cosines |n.c| / |n.l|. This is exact for
+bump and normal maps, interpolated normals and hair; Mitsuba's importance mode with Veach's correction
+(thesis, eq. 5.19) is not.
 """
 
 from __future__ import annotations
@@ -22,16 +22,15 @@ from . import draws
 from .draws import needs_full_pdf, nested
 from .spectra import brightest, is_finite, is_zero
 
-# Two points of one plane see each other under a cosine that is rounding; its square leaves single precision.
+# Two points of one plane are connected under a cosine that is rounding; its square underflows.
 _LEAST_COS = 1e-18
 
 
 @dataclass
 class Evaluation:
-    """``value`` f |cos| (light subpaths: adjoint factor included), densities in solid angle.
+    """``value`` f |cos| (light side: with adjoint factor); densities in solid angle.
 
-    ``pdf_fwd_w`` of leaving into the new direction, ``pdf_rev_w`` of the reverse (0 where `Traits.reverse`
-    does not hold).
+    ``pdf_fwd_w`` of the new direction, ``pdf_rev_w`` of the reverse (0 without `Traits.reverse`).
     """
 
     value: mi.Spectrum
@@ -41,7 +40,7 @@ class Evaluation:
 
 @dataclass
 class Step:
-    """A sampled direction. Densities as in `Evaluation`; ``pdf_*`` are unset where ``delta``."""
+    """A sampled direction; ``pdf_*`` as in `Evaluation`, unset where ``delta``."""
 
     wo: mi.Vector3f
     weight: mi.Spectrum
@@ -55,12 +54,12 @@ class Step:
 
 @dataclass(frozen=True)
 class Traits:
-    """What the BSDFs that rays may meet demand: `needs_full_pdf`, `needs_round_trip`, and who is `Asked`.
+    """Properties of the BSDFs that rays can hit.
 
-    ``glossy``: whether one has a glossy lobe; ``transmits``: whether one has a lobe, not delta, that scatters
-    to the other side; ``mapped``: whether one has a bump or normal map; ``parts``: whether one is drawn by
-    its parts, see `draws`; ``reverse``: whether some strategy in use starts from the other side, so that
-    weights ask for the densities of the reverse directions.
+    See `needs_full_pdf`, `needs_round_trip`, `Asked`. ``glossy``: one has a glossy lobe; ``transmits``: one
+    has a non-delta lobe on the other side; ``mapped``: one has a bump or normal map; ``parts``: one is
+    sampled by its parts, see `draws`; ``reverse``: a strategy in use starts from the other side, so that
+    weights need reverse densities.
     """
 
     full_pdf: bool
@@ -73,11 +72,11 @@ class Traits:
     reverse: bool = True
 
     def from_one_side(self) -> Traits:
-        """Of the same BSDFs where no subpath starts from the other side."""
+        """The traits without reverse densities."""
         return replace(self, round_trip=False, reverse=False)
 
     def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """What the surface ``si`` lets pass straight on, of every polarization."""
+        """Null transmission of the surface at ``si``, for all polarizations."""
 
         def ask(self, si, active):
             return mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(self.eval_null_transmission(si, active)))
@@ -86,7 +85,7 @@ class Traits:
 
     @staticmethod
     def of(bsdfs: Sequence[mi.BSDF]) -> Traits:
-        """Of BSDFs that one virtual call may visit."""
+        """Traits of BSDFs that one virtual call may visit."""
         through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
         glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
         transmits = any(bsdf.flags() & through for bsdf in bsdfs)
@@ -97,22 +96,21 @@ class Traits:
         )
 
 
-# From so many BSDFs on, virtual calls ask few questions each. A call of all that is asked at a vertex hands
-# over the interaction once, which saves 6 % of the time in a Cornell box; but each place that makes one has
-# functions of its own, one per BSDF, where the same few questions, asked anywhere, are compiled once. (Rooms
-# of 10 and of 27 materials take the same time either way. What diverging lanes cost in a decision is another
-# matter, see `planning.choice.MANY_KINDS`.)
+# From this number of BSDFs on virtual calls are small. One call of everything that a vertex needs passes the
+# interaction once (6 % faster in a Cornell box), but each call site compiles its own functions, one per BSDF;
+# equal small calls are compiled once. Divergence of lanes is another matter, see
+# `planning.choice.MANY_KINDS`.
 MANY = 10
 
-# Points at which surfaces are asked what they let pass.
+# Points at which null transmission is tested.
 _ASKED = 4096
 
 
 class Asked:
-    """Virtual calls of these ``bsdfs`` alone, which are `MANY` or not.
+    """Virtual calls of ``bsdfs`` only.
 
-    Mitsuba's visit all of the process, and a kernel holds a function for each of them: those inside of
-    others, which no ray meets, and those of other scenes.
+    Mitsuba's visit all BSDFs of the process, each with a function in the kernel: also nested ones, which no
+    ray hits, and those of other scenes.
     """
 
     def __init__(self, bsdfs: Iterable[mi.BSDF]):
@@ -126,7 +124,6 @@ class Asked:
 
     @property
     def count(self) -> int:
-        """How many there are."""
         return len(self.bsdfs)
 
     @property
@@ -135,20 +132,20 @@ class Asked:
         return len({draws.structure(bsdf) for bsdf in self.bsdfs})
 
     def __call__(self, bsdf, question, *args):
-        """Answers of ``question(bsdf, *args)``, the last of ``args`` being the call's mask.
+        """Return ``question(bsdf, *args)``; the last of ``args`` is the call's mask.
 
-        A BSDF itself, in place of a pointer, answers without a call.
+        A BSDF instead of a pointer needs no virtual call.
         """
-        # Run step by step, calls of functions of ours fail for `plastic`; its own methods do not.
+        # In evaluated mode calls of Python functions fail for `plastic`; its own methods do not.
         if isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
             return question(bsdf, *args)
         number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
         return dr.switch(number, [partial(question, b) for b in self.bsdfs], *args)
 
     def together(self, bsdf, questions, *args):
-        """Answers of ``questions(bsdf, *args)``, which asks through this object.
+        """Return ``questions(bsdf, *args)``, which calls through this object.
 
-        In one call, or where there are `MANY` BSDFs in one for each question.
+        In one virtual call, or with `MANY` BSDFs in one per question.
         """
         return questions(bsdf, *args) if self.many else self(bsdf, questions, *args)
 
@@ -170,7 +167,7 @@ class Target:
 
 
 def with_wi(si: mi.SurfaceInteraction3f, wi: mi.Vector3f) -> mi.SurfaceInteraction3f:
-    """A copy of ``si`` that is seen from ``wi``. (Assigning to ``si.wi`` changes aliases.)"""
+    """A copy of ``si`` with ``wi``. (Assigning to ``si.wi`` changes aliases.)"""
     other = mi.SurfaceInteraction3f(si)
     other.wi = wi
     return other
@@ -184,16 +181,16 @@ def connectible(bsdf: mi.BSDFPtr):
 def evaluate(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, traits: Traits
 ) -> Evaluation:
-    """BSDF of a camera vertex towards the local direction ``wo``, and both densities."""
+    """Evaluate a camera vertex towards the local ``wo``, with both densities."""
     return _evaluation(*_evaluated(bsdf, si, wo, active, traits))
 
 
 def _evaluated(bsdf, si, wo, active, traits: Traits):
-    """Value, and densities of ``wo`` and of the reverse, the other direction being ``si.wi``."""
+    """Value and densities of ``wo`` and the reverse; the other direction is ``si.wi``."""
 
     def ask(self, si, wo, active):
         ctx = mi.BSDFContext()
-        if traits.mapped:  # Mitsuba's shadowing of bumps squares the cosine: 0 by infinity on one plane
+        if traits.mapped:  # Mitsuba's bump shadowing squares the cosine: 0 times infinity in one plane
             active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)
         value, pdf = self.eval_pdf(ctx, si, wo, active)
         value = polarization.in_world(si, value, -wo, si.wi)
@@ -203,20 +200,19 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
 
 
 def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
-    """The `Evaluation` of a BSDF; its value is NaN also where a density is not finite.
+    """Build an `Evaluation`; its value is NaN also where a density is non-finite.
 
-    NaN, so that whoever uses it counts it: no weight follows from such a density. (Where the value is 0 it
-    does not matter.)
+    No weight follows from such a density; NaN is counted later. Irrelevant where the value is 0.
     """
     finite = dr.isfinite(pdf_fwd_w + pdf_rev_w)
     return Evaluation(dr.select(finite | is_zero(value), value, dr.nan), pdf_fwd_w, pdf_rev_w)
 
 
 def evaluate_adjoint(bsdf, si, wo, active, traits: Traits, cos_ratio=None) -> Evaluation:
-    """BSDF of a light vertex towards the local direction ``wo`` (to the camera's side).
+    """Evaluate a light vertex towards the local direction ``wo`` (camera's side).
 
-    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal,
-    which is computed unless given.
+    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal (computed
+    if None).
     """
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
@@ -224,7 +220,7 @@ def evaluate_adjoint(bsdf, si, wo, active, traits: Traits, cos_ratio=None) -> Ev
 
 
 def _evaluated_adjoint(bsdf, si, wo, active, traits: Traits):
-    """As `_evaluated`, with the directions swapped."""
+    """Like `_evaluated`, with the directions swapped."""
     value, pdf_rev_w, pdf_fwd_w = _evaluated(bsdf, with_wi(si, wo), si.wi, active, traits)
     return value, pdf_fwd_w, pdf_rev_w
 
@@ -241,9 +237,9 @@ def geometric_cos(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Float:
 def sample(
     bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
 ) -> tuple[Step, Evaluation | None]:
-    """Continue a camera subpath where ``active``: the `Step`. ``u1`` picks the lobe, ``u2`` the direction.
+    """Sample the next direction of a camera subpath; ``u1`` picks the lobe.
 
-    With a ``target`` also its `Evaluation`. Returns both, None for the latter without a target.
+    Returns the `Step`, and the `Evaluation` of ``target`` or None.
     """
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
@@ -252,7 +248,7 @@ def sample(
 
     drawn, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
     step = _step(si, drawn, drawn.weight)
-    if traits.round_trip:  # no alternative that would have to make this event from the other side
+    if traits.round_trip:  # no alternative has to sample this event from the other side
         step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
     return step, _evaluation(*evaluated) if target else None
 
@@ -260,9 +256,9 @@ def sample(
 def sample_adjoint(
     bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
 ) -> tuple[Step, Evaluation | None]:
-    """Continue a light subpath; arguments and results as of `sample`.
+    """Continue a light subpath; arguments and results as in `sample`.
 
-    The adjoint factor is part of ``weight``, and of the evaluation's ``value``.
+    The adjoint factor is part of ``weight`` and of the evaluation's ``value``.
     """
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
@@ -277,9 +273,9 @@ def sample_adjoint(
 
 
 def _answers(questions, asked: Asked, target, bsdf, *args):
-    """Answers of ``questions(bsdf, *args)``, the last of ``args`` a mask.
+    """Return ``questions(bsdf, *args)`` for an optional ``target``.
 
-    Direction and mask of a ``target`` follow.
+    The last of ``args`` is a mask; direction and mask of ``target`` are appended.
     """
     joined = (target.wo, target.active) if target else ()
     mask = args[-1] | target.active if target else args[-1]
@@ -288,25 +284,24 @@ def _answers(questions, asked: Asked, target, bsdf, *args):
 
 
 def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
-    """Weight of a sample of a light subpath without the ratio of geometric cosines."""
+    """Weight of a light subpath's sample without the ratio of geometric cosines."""
     bs, delta = drawn.bs, mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
     f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits))
-    # The radiance that a camera subpath carries, without its factor eta^-2.
+    # Removes the factor eta^-2 of radiance on camera subpaths.
     eta2 = dr.square(bs.eta)
     delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
     weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.density)
-    # Whatever the density says of a direction that Mitsuba rejects. NaN is kept, to be counted.
+    # Mitsuba may return a density for a rejected direction. NaN is kept, to be counted.
     return dr.select((drawn.pdf_fwd_w == 0) | drawn.rejected, 0, weight)
 
 
 @dataclass
 class _Drawn:
-    """What a BSDF draws (`draws.draw`), ``bs`` in radiance mode.
+    """A sample of a BSDF (`draws.draw`), ``bs`` in radiance mode.
 
-    Its ``weight``, densities (where it is delta ``pdf_fwd_w`` is the probability of the event, and there is
-    no ``pdf_rev_w``), if `_asks_back` the weight ``back`` of a delta event made from its other end, 0 if it
-    does not lead back; ``of_parts``, in scenes with BSDFs that are drawn so: density and rejection, as in
-    `draws.Draw`, which are ``pdf_fwd_w`` and a weight of 0 elsewhere.
+    ``weight`` and densities (delta: ``pdf_fwd_w`` is the probability of the event, ``pdf_rev_w`` unset);
+    ``back``, if `_asks_back`: weight of the delta event sampled from its other end, 0 if it does not lead
+    back; ``of_parts``: density and rejection as in `draws.Draw` in scenes with BSDFs sampled by parts.
     """
 
     bs: mi.BSDFSample3f
@@ -326,7 +321,7 @@ class _Drawn:
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
-    """A direction that a BSDF draws, with its densities both ways, in one virtual call."""
+    """Sample a direction with densities both ways, in one virtual call."""
 
     def ask(self, si, u1, u2, active):
         ctx, found = mi.BSDFContext(), draws.draw(self, si, u1, u2, active)
@@ -336,7 +331,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         smooth = active & ~delta
         pdf_fwd_w = bs.pdf
         if traits.full_pdf:
-            meant = [self] if isinstance(self, mi.BSDF) else traits.asked.bsdfs  # a pointer may be any
+            meant = [self] if isinstance(self, mi.BSDF) else traits.asked.bsdfs  # a pointer may refer to any
             behind = draws.none_from_behind(meant, si, bs)
             weight, found.rejected = dr.select(behind, 0, weight), found.rejected | behind
             full = smooth & ~(bs.pdf == 0)
@@ -352,18 +347,18 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
 
 
 def _asks_back(traits: Traits, adjoint: bool) -> bool:
-    """Whether delta events are also made from their other end.
+    """Whether delta events are also sampled from their other end.
 
-    On light subpaths of polarized variants for their matrices: that of light which travels the other way does
-    not follow from it. (Mitsuba's importance mode is another answer, but turns retarders the wrong way.)
+    On light subpaths of polarized variants for the Mueller matrix, which does not follow from that of the
+    other direction. (Mitsuba's importance mode turns retarders the wrong way.)
     """
     return traits.round_trip or (adjoint and bool(mi.is_polarized))
 
 
 def _back(bsdf, si, bs, u1, u2, active):
-    """The weight of a delta event sampled from its other end, 0 if it does not lead back.
+    """Weight of a delta event sampled from its other end, 0 if it does not lead back.
 
-    The event is taken to have the same probability from either end, as those of Mitsuba's BSDFs.
+    Assumes equal probabilities from either end, as of Mitsuba's BSDFs.
     """
     back = draws.draw(bsdf, with_wi(si, bs.wo), u1, u2, active)
     weight = polarization.in_world(si, back.weight, -si.wi, bs.wo)
@@ -371,10 +366,9 @@ def _back(bsdf, si, bs, u1, u2, active):
 
 
 def _event_cos_ratio(si, bs):
-    """|m.l| / |m.c| about the normal m of a delta event.
+    """|m.l| / |m.c| about the normal m of a delta event; 1 without refraction.
 
-    Under a bump or normal map m is not the shading frame's. Reflection and null: 1. Refraction: m along eta_c
-    c + eta_l l.
+    Under a bump or normal map m is not the shading normal. On refraction m is along eta_c c + eta_l l.
     """
     m = bs.eta * bs.wo + si.wi  # bs.eta = eta_c / eta_l when sampling from l
     ratio = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
@@ -384,12 +378,12 @@ def _event_cos_ratio(si, bs):
 
 
 def _step(si, drawn: _Drawn, weight) -> Step:
-    """The step that a sample stands for, of this ``weight``."""
+    """The `Step` of a sample with this ``weight``."""
     bs = drawn.bs
     delta, cos_out = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), geometric_cos(si, bs.wo)
-    # A direction that is NaN hits nothing, and nobody would know.
+    # A NaN direction hits nothing and would go unnoticed.
     finite = dr.isfinite(dr.select(delta, cos_out, cos_out + drawn.pdf_fwd_w + drawn.pdf_rev_w))
-    finite &= is_finite(drawn.weight) & dr.isfinite(bs.eta)  # roulette asks for eta
+    finite &= is_finite(drawn.weight) & dr.isfinite(bs.eta)  # roulette uses eta
     return Step(
         wo=bs.wo,
         weight=dr.select(finite | drawn.rejected, weight, dr.nan),
@@ -403,9 +397,9 @@ def _step(si, drawn: _Drawn, weight) -> Step:
 
 
 def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
-    """Those of ``bsdfs``, and of what is in them, that polarize what they let pass straight on.
+    """The ``bsdfs``, and nested ones, whose null transmission polarizes.
 
-    They are asked at points all over their textures, from both sides.
+    Tested at points all over their textures, from both sides.
     """
     if not mi.is_polarized:
         return []
@@ -419,17 +413,17 @@ def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
 
 
 def _is_scalar(matrix: mi.Spectrum) -> bool:
-    """Whether Mueller matrices are numbers for each wavelength times the identity."""
+    """Whether Mueller matrices are multiples of the identity per wavelength."""
     rows = [[np.array(matrix[i, j]) for j in range(4)] for i in range(4)]
     first = rows[0][0]
     return all(np.abs(rows[i][j] - (i == j) * first).max() < 1e-6 for i in range(4) for j in range(4))
 
 
 def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether a delta event may exist from one end only: under a bump or normal map.
+    """Whether a delta event may exist from one end only: with bump or normal maps.
 
-    Mitsuba's maps drop sampled directions (not incident ones) on different sides of the surface and
-    of the perturbed normal, and turn the normal towards the incident direction.
+    Mitsuba's maps reject sampled directions (not incident ones) on different sides of the surface and of the
+    perturbed normal, and flip the normal towards the incident direction.
     """
     return any(
         b.class_name() in draws.MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in nested(bsdfs)

@@ -29,10 +29,10 @@ from .walk import Vertex, is_lit, newest_coefficient, where_lit
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
-    """s, t >= 2: a camera vertex joined with a light vertex, before visibility (eqs. 40, 41).
+    """s, t >= 2: connect two vertices, before visibility (eqs. 40, 41).
 
-    ``active`` where the contribution is not zero. The throughputs of ``z`` and ``y`` contain the edges to
-    them; that of ``y`` is over its cosine of incidence, so that of its adjoint factor |n.d| alone is missing.
+    ``active`` where the contribution is nonzero. Throughputs contain the edges to the vertices; that of ``y``
+    is divided by its cosine of incidence, so that only |n.d| of its adjoint factor is missing.
     """
     h = kernel.heuristic
     k = z.edges + y.edges + 1
@@ -71,11 +71,10 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
 
 @dr.syntax
 def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, total, add):
-    """Join ``z`` with every stored light vertex, a visibility ray each.
+    """Connect ``z`` with every stored light vertex, with a shadow ray each.
 
-    ``add(contribution, seen, total)`` adds a contribution to the running ``total`` and returns it: as the
-    draw of `connect_one` sees it before its visibility ray, and after (`visibility.seen`). Returns the
-    ``total`` and `Counters`.
+    ``add(contribution, seen, total)`` accumulates a contribution, before and after visibility
+    (`visibility.seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -97,9 +96,9 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
 
 
 def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> tuple[mi.Spectrum, Counters]:
-    """Join ``z`` with one light vertex, drawn by its weighted unshadowed contribution.
+    """Connect ``z`` with one light vertex, drawn by weighted unshadowed contribution.
 
-    The estimate is that of all of them. Returns what it adds to the sample, weighted, and `Counters`.
+    Estimates the sum over all vertices. Returns the weighted contribution and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
@@ -107,9 +106,9 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
         drawn = _draw(kernel, z, path, candidates, u)
     else:
         drawn = _draw_by_guess(kernel, z, path, candidates, u, stream)
-    # In this order: the draw may hit a tiny one, for which total / size is infinite.
+    # In this order: total / size is infinite for tiny drawn values.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
-    if kernel.plan.joined > 1:  # each of so many light subpaths is an estimate of its own
+    if kernel.plan.joined > 1:  # each light subpath is a separate estimate
         value = value / kernel.plan.joined
     active = drawn.total > 0
     active, survival, rouletted = roulette(kernel, value, drawn.u, active)
@@ -137,22 +136,21 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     return c.weighted(), counted + c.counted
 
 
-# The probability with which a candidate is drawn evenly, so that what guesses miss is drawn too.
+# Probability of a uniform draw, so that connections of approximate size 0 are drawn too.
 EVENLY = 0.005
 
-# Which series of hashed numbers a draw by guesses takes; merges have the first.
+# Index of the series of hashed numbers of draws by approximation; merges use the first.
 _OF_GUESSES = 2
 
 
 @dataclass
 class _Drawn:
-    """A draw among inner connections.
+    """A drawn inner connection.
 
-    The weighted ``value`` of the one drawn, the ``total`` size of all, the ``end`` of the visibility ray to
-    it (its slot, if `ShapeErrors.small`), what is left of the random number ``u``, how many were
-    ``evaluated`` and are not zero, and ``lost`` for want of a finite value. In scenes with media, where the
-    weight is known after the ray only, also its ``unweighted`` value, its ``sides`` (see `Contribution`) and
-    its ``size`` in the draw.
+    Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
+    `ShapeErrors.small`), rescaled random number ``u``, number ``evaluated`` and nonzero, number ``lost`` as
+    non-finite. In scenes with media, where the weight is known after the shadow ray, also ``unweighted``
+    value, ``sides`` (see `Contribution`) and ``size`` in the draw.
     """
 
     value: mi.Spectrum
@@ -171,8 +169,7 @@ class _Drawn:
 def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     """Draw one of the inner connections of ``z`` in proportion to its size.
 
-    The draw is a running one. One random number serves all of it: what is left of it after each decision is
-    uniform again.
+    Weighted reservoir sampling with one random number.
     """
     small = kernel.shape_errors.small
     slot, value, total = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0)
@@ -192,7 +189,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         total, take, u = offer(total, size, u)
         value = dr.select(take, of_this, value)
         kept = None if kept is None else dr.select(take, (c.value, *c.sides[1:], size), kept)
-        # The end of the visibility ray is kept rather than the slot: a look-up by lane costs more.
+        # Stores the end of the shadow ray, not the slot: a lookup by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
         nonzero += one(c.active)
         lost += c.counted.non_finite
@@ -207,10 +204,10 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
 
 @dr.syntax
 def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, stream: Stream) -> _Drawn:
-    """As `_draw`, among the vertices of several light subpaths, by a `sketches.guess` of what each adds.
+    """Like `_draw`, from several light subpaths, by approximate size.
 
-    The BSDFs are evaluated for the one drawn. One of all is drawn evenly with the probability `EVENLY`, and
-    where guesses say nothing. The ``total`` is the size of the estimate.
+    Sizes: `sketches.guess`. Evaluates only the BSDFs of the drawn connection. Draws uniformly with
+    probability `EVENLY`, and where all approximations are 0. ``total`` is the size of the estimate.
     """
     some = candidates > 0
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
@@ -246,7 +243,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:
-    """The connection ``c`` of ``z`` and ``y`` as it is drawn: in media with a guess of the transmittance."""
+    """The connection ``c`` as drawn: in media with an approximate transmittance."""
     if kernel.space is None:
         return c
     between = y.si.p - z.si.p
@@ -255,18 +252,17 @@ def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Co
 
 
 def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:
-    """From ``z`` to the light vertex ``y``."""
+    """Shadow ray from ``z`` to the light vertex ``y``."""
     met = rounding.met(y.si.shape, y.si.instance)
     ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
     return Sight(ray, own, z.medium_towards(kernel, ray.d))
 
 
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
-    """Number of light vertices to try at ``z``.
+    """Number of light vertices to connect with ``z``.
 
-    Slot i holds y_{i+1} or a later one, and paths have at most `Kernel.last_inner` edges. (In scenes with
-    media, where null events are no edges, several vertices may have the same number, as where the slots are
-    those of several light subpaths.)
+    Slot i holds y_{i+1} or a later one; paths have at most `Kernel.last_inner` edges. With media (null events
+    are no edges), or slots of several light subpaths, several vertices may have the same number.
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
     if kernel.space is not None or path.sketches is not None:

@@ -1,4 +1,4 @@
-"""What a strategy returns: its estimate and its weight; and what the lanes of a kernel count."""
+"""Contributions of strategies, and the counters of lanes."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ from . import spectra
 from .inputs import Kernel
 from .plan import Plan
 
-# Least probability of surviving roulette: random numbers are multiples of 2^-24.
+# Least survival probability of roulette: random numbers are multiples of 2^-24.
 LEAST_SURVIVAL = 2.0**-20
 
 
 @dataclass
 class Counters:
-    """Numbers (``UInt32``) of what a lane has done; None for what is not counted, which costs nothing.
+    """Counters of a lane (``UInt32``); None if not counted, at no cost.
 
-    Rays by kind: closest hits of ``camera`` and ``light`` subpaths, shadow rays of s = 1, t = 1 (with (1,1))
-    and inner connections. Inner connections by what became of them: ``evaluated``, of these ``zero``;
-    ``rouletted`` (splats too) have no ray. ``non_finite``: values that count as zero because they are not
-    finite: contributions (those of s = 1 and t <= 1 if they are visible, inner ones before it is known),
-    subpaths that end for want of a finite throughput, colours, features. In scenes with media ``segments``
-    of edges, those of joins included, each with a ray of its own, and tentative ``collisions`` in grids.
-    With merging closest hits of photons' subpaths (``photon``), the ``photons`` kept, and the ``merges``:
-    camera vertices near to some. Where s = 0 is guided the same of photons, the camera vertices where it was
-    (``aimed``), and the closest hits that followed (``guided``).
+    * Closest hits of ``camera`` and ``light`` subpaths; shadow rays of s = 1, t = 1 (with (1,1)), inner
+      connections.
+    * Inner connections: ``evaluated``, of these ``zero``; ``rouletted`` (splats too) have no ray.
+    * ``non_finite``: values that count as zero: contributions (s = 1 and t <= 1 if visible, inner ones before
+      visibility), subpaths that end with a non-finite throughput, colours, features.
+    * With media ``segments`` of edges, connections included, each with a ray; tentative ``collisions`` in
+      grids.
+    * With merging closest hits of photon subpaths (``photon``), stored ``photons``, and ``merges``: camera
+      vertices near a photon. With guiding the same of photons, guided camera vertices (``aimed``), and
+      closest hits that followed (``guided``).
 
-    Records are added up, never changed: Dr.Jit's loops would not see it.
+    Records are added, never changed: Dr.Jit's loops would not see it.
     """
 
     camera: mi.UInt32 | None = None
@@ -54,7 +55,7 @@ class Counters:
 
     @staticmethod
     def zeros(*names: str) -> Counters:
-        """Counters of these ``names`` at 0. Loops hold only those that they change, see `Walk`."""
+        """Counters of these ``names`` at 0; loops store only counters that they change."""
         return Counters(**{name: mi.UInt32(0) for name in names})
 
     def __add__(self, other: Counters) -> Counters:
@@ -64,7 +65,7 @@ class Counters:
         return Counters(*(added(getattr(self, name), getattr(other, name)) for name in COUNTERS))
 
     def summed(self) -> mi.UInt64:
-        """The lanes' counters added up: ``UInt64``, in the order of `COUNTERS`."""
+        """Sum over lanes: ``UInt64``, in the order of `COUNTERS`."""
         total = dr.zeros(mi.UInt64, len(COUNTERS))
         for i, name in enumerate(COUNTERS):
             if (value := getattr(self, name)) is not None:
@@ -74,10 +75,10 @@ class Counters:
         return total
 
 
-# What edges through media count.
+# Counters of edges in media.
 MEDIA = ("segments", "collisions")
 
-# What merging counts, beside its rays.
+# Counters of merging besides rays.
 MERGING = ("photons", "merges")
 
 COUNTERS = tuple(field.name for field in fields(Counters))
@@ -89,19 +90,19 @@ def one(mask: mi.Bool) -> mi.UInt32:
 
 
 def counted_in_media(space: Space | None) -> list[str]:
-    """The names of what edges through media count in this scene: collisions where there are grids."""
+    """Names of the counters of edges in media; collisions only with grids."""
     return [] if space is None else list(MEDIA if space.media.grids else MEDIA[:1])
 
 
 def counted_by_light(plan: Plan, space: Space | None) -> Counters:
-    """What the vertices of light subpaths count."""
+    """Counters of the vertices of light subpaths."""
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
     names += ["non_finite"] * (plan.splat or plan.arrival)
     return Counters.zeros(*names, *counted_in_media(space) * plan.splat)
 
 
 def counted_by_camera(plan: Plan, space: Space | None) -> Counters:
-    """What the vertices of camera subpaths count."""
+    """Counters of the vertices of camera subpaths."""
     one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
     names += ["shadow_inner", "evaluated", "zero"] * inner
@@ -110,15 +111,14 @@ def counted_by_camera(plan: Plan, space: Space | None) -> Counters:
 
 @dataclass
 class Contribution:
-    """An estimate of one strategy.
+    """Estimate of one strategy.
 
-    ``value`` unweighted (a spectrum), ``weight`` in [0, 1], numbers of light vertices ``s`` and camera
-    vertices ``t``, ``active``; ``shares`` see `mis.ByClass`, ``kind`` the class among `mis.CLASSES`;
-    ``position`` on the film in pixels, None where it adds to the lane's own pixel (t >= 2); ``counted`` what
-    was done for it. In scenes with media ``value`` and ``weight`` are those of an edge without any until
-    `visibility.seen` has looked; it needs the ``sides``: what `mis.Heuristic.weigh` takes. ``emission``: what
-    `Emitters.cell` says of the path, where a pilot asks for it. ``towards``: the direction in which the light
-    reaches the sensor, None for t >= 2, which know it by their `CameraStart`.
+    ``value``: unweighted spectrum; ``weight`` in [0, 1]; ``s``, ``t``: numbers of light and camera vertices;
+    ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`; ``position`` on the film in pixels, None
+    for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
+    the connected edge until `visibility.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
+    ``emission``: result of `Emitters.cell`, for pilots. ``towards``: direction in which light reaches the
+    sensor, None for t >= 2 (`CameraStart`).
     """
 
     value: mi.Spectrum
@@ -135,15 +135,14 @@ class Contribution:
     towards: mi.Vector3f | None = None
 
     def weighted(self) -> mi.Spectrum:
-        """What the strategy adds to the image."""
+        """The weighted contribution to the image."""
         return dr.select(self.active, self.value * self.weight, 0)
 
 
 def drop_non_finite(c: Contribution) -> Contribution:
-    """``c``, inactive where it adds no finite value, which is counted: such a contribution counts as zero.
+    """Deactivate and count non-finite contributions, which count as zero.
 
-    All contributions pass here on their way to the sink; whatever finds a density from which no weight
-    follows makes the value NaN.
+    All contributions pass here before the sink. Densities from which no weight follows make the value NaN.
     """
     lost = c.active & ~spectra.is_finite(c.value * c.weight)
     return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))
@@ -152,13 +151,14 @@ def drop_non_finite(c: Contribution) -> Contribution:
 def roulette(
     kernel: Kernel, value: mi.Spectrum, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.Bool, mi.Float, Counters]:
-    """Unbiased roulette on a weighted contribution before its visibility is tested.
+    """Unbiased roulette on a weighted contribution before its shadow ray.
 
-    Returns where it survived, the probability of that, and `Counters`."""
+    Returns the survival mask, its probability, and `Counters`.
+    """
     if not kernel.plan.roulette:
         return active, mi.Float(1), Counters()
     size = size_of(value)
-    # Not below the spacing of the random numbers, which are 0 more often than that; NaN goes on.
+    # At least the spacing of the random numbers; NaN survives.
     survival = dr.clip(size * kernel.inverse_threshold, LEAST_SURVIVAL, 1)
     survival = dr.select(dr.isfinite(size), survival, 1)
     survived = u < survival
@@ -166,5 +166,5 @@ def roulette(
 
 
 def size_of(value: mi.Spectrum):
-    """A measure of a contribution's size; any will do as long as it is positive where f is."""
+    """Size of a contribution; any measure works that is positive where f is."""
     return spectra.brightest(value)

@@ -1,10 +1,10 @@
-"""Directions that Mitsuba's BSDFs draw, with the density that they are drawn by.
+"""Samples Mitsuba's BSDFs with the density of the sampled direction.
 
-Multiple importance sampling asks that the density of a draw is what ``pdf()`` says of its direction. That of
-Mitsuba's ``blendbsdf`` (3.9.1) is another: it keeps what one of its parts has drawn and rejected (a
-``diffuse`` from behind, a ``roughdielectric`` below the horizon), with what the other part reflects there,
-and it mixes the probability of a delta event with the density of the other part, so that mirrors within are
-too dark. So a blend is drawn here by its parts.
+Multiple importance sampling requires that the density of a sample equals ``pdf()`` of its direction.
+Mitsuba's ``blendbsdf`` (3.9.1) violates it: it keeps directions that one part sampled and rejected (a
+``diffuse`` from behind, a ``roughdielectric`` below the horizon), with the value of the other part, and it
+mixes the probability of a delta event with the density of the other part, which darkens mirrors. So a blend
+is sampled here by its parts.
 """
 
 from __future__ import annotations
@@ -19,24 +19,22 @@ import mitsuba as mi
 from ..host.introspection import children
 from .spectra import is_zero
 
-# Plugins whose sample() returns the density of the lobe that was picked, not that of pdf().
-# Plugins that are not Mitsuba's own are treated like them.
+# Plugins whose sample() returns pdf(). Others, third-party ones included, may return that of the picked lobe.
 _SAMPLED_PDF_IS_PDF = frozenset(
     "SmoothDiffuse SmoothConductor RoughConductor SmoothDielectric RoughDielectric ThinDielectric "
     "SmoothPlastic RoughPlastic PolarizedPlastic Principled PrincipledThin Hair "
     "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
 )
 
-# Plugins inside of which there are other frames.
+# Plugins that change the frame of nested BSDFs.
 MAPS = "BumpMap", "NormalMap"
 
 
 @dataclass
 class Draw:
-    """A direction ``bs`` and its ``weight``, f |cos| over its density (or probability, if it is delta).
+    """A direction ``bs``; ``weight``: f |cos| / density (or probability, if delta).
 
-    ``density``: that by which it was drawn (solid angle), `bs.pdf` but for what `_density` says. Where it was
-    ``rejected`` there is none, whatever is stated.
+    ``density``: solid angle, `bs.pdf` corrected by `_density`; unspecified where ``rejected``.
     """
 
     bs: mi.BSDFSample3f
@@ -46,9 +44,9 @@ class Draw:
 
 
 def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active: mi.Bool) -> Draw:
-    """What a BSDF draws in radiance mode where ``active``; ``u1`` picks the lobe, ``u2`` the direction.
+    """Sample a BSDF in radiance mode; ``u1`` picks the lobe, ``u2`` the direction.
 
-    ``bs.pdf`` is what Mitsuba's ``sample`` states, of a blend its ``pdf()`` (solid angle); or the probability
+    ``bs.pdf``: as returned by Mitsuba's ``sample``; for a blend ``pdf()`` (solid angle), or the probability
     of a delta event.
     """
     if not by_parts(bsdf):
@@ -57,9 +55,9 @@ def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active
 
 
 def by_parts(bsdf) -> bool:
-    """Whether `draw` asks the parts of a BSDF: a blend is among them.
+    """Whether `draw` samples the parts of a BSDF: it contains a blend.
 
-    Not under bump and normal maps, nor of a pointer, of which any may be meant: there draws are Mitsuba's.
+    Not under bump and normal maps, nor through a pointer, which may refer to any BSDF: Mitsuba samples these.
     """
     if not isinstance(bsdf, mi.BSDF) or bsdf.class_name() not in _BY_PARTS:
         return False
@@ -72,7 +70,7 @@ def _by_mitsuba(bsdf, si, u1, u2, active) -> Draw:
 
 
 def _blend(bsdf, si, u1, u2, active) -> Draw:
-    """Of a ``blendbsdf``: one part draws, and where it does not reject, both are evaluated."""
+    """Sample one part of a ``blendbsdf``, and evaluate both unless it rejects."""
     parts, share = children(bsdf), _share(bsdf, si, active)
     second = u1 < share
     found = [
@@ -85,14 +83,14 @@ def _blend(bsdf, si, u1, u2, active) -> Draw:
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo, smooth)
     bs.pdf = dr.select(delta, bs.pdf * dr.select(second, share, 1 - share), pdf)
     density = dr.select(delta, bs.pdf, _density(bsdf, si, bs.wo, pdf, smooth))
-    # A direction that is NaN has a density of 0; it is not rejected, but counted, as is a share that is NaN.
+    # A NaN direction has density 0; like a NaN share it is counted, not rejected.
     rejected = mine.rejected | ((density == 0) & ~dr.isnan(bs.wo.z))
     weight = dr.select(rejected, 0, dr.select(delta, mine.weight, value / density))
     return _unless_nan(share, Draw(bs, weight, density, rejected))
 
 
 def _share(bsdf, si, active) -> mi.Float:
-    """The share of a blend's second part, or that of what is masked."""
+    """Share of a blend's second part, or opacity of a mask."""
     texture = children(bsdf)["weight" if bsdf.class_name() == "BlendBSDF" else "opacity"]
     share = texture.eval_1(si, active)
     return dr.select(dr.isnan(share), share, dr.clip(share, 0, 1))
@@ -104,10 +102,10 @@ def _unless_nan(share, found: Draw) -> Draw:
 
 
 def _part(bsdf, si, u1, u2, active) -> Draw:
-    """What a part of a blend draws.
+    """Sample a part of a blend.
 
-    It is rejected on a side to which its lobe (if it tells) does not lead, and where its weight is 0 though
-    it is not black: where a black part draws, the other one may be seen.
+    Rejected on a side to which the sampled lobe (if known) does not scatter, and where its weight is 0
+    although it is not black: where a black part is sampled, the other one may contribute.
     """
     found, cos_theta = draw(bsdf, si, u1, u2, active), mi.Frame3f.cos_theta
     if by_parts(bsdf):
@@ -116,7 +114,7 @@ def _part(bsdf, si, u1, u2, active) -> Draw:
     smooth = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo, smooth)
     rejected = is_zero(found.weight) & (~is_zero(f) | (pdf == 0) | (bs.sampled_type == 0))
-    if not any(b.class_name() in MAPS for b in nested([bsdf])):  # sides are those of another frame
+    if not any(b.class_name() in MAPS for b in nested([bsdf])):  # sides refer to another frame
         side = cos_theta(si.wi) * cos_theta(bs.wo)  # false for NaN
         reflects, passes = (
             mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
@@ -126,9 +124,9 @@ def _part(bsdf, si, u1, u2, active) -> Draw:
 
 
 def _density(bsdf, si, wo, pdf, active):
-    """The density by which a BSDF that states ``pdf`` draws the direction ``wo`` (solid angle).
+    """Density (solid angle) with which a BSDF of this ``pdf`` samples ``wo``.
 
-    From behind, a ``principled`` without transmission states a density, and draws nothing.
+    From behind, a ``principled`` without transmission has a density but samples nothing.
     """
     kind = bsdf.class_name()
     if kind == "TwoSidedBRDF" or not any(_is_blind_behind(b) for b in nested([bsdf])):
@@ -152,7 +150,7 @@ def _is_blind_behind(bsdf) -> bool:
 
 
 def _two_sided(bsdf, si, u1, u2, active) -> Draw:
-    """Of a ``twosided``: its parts see the world mirrored from behind."""
+    """Sample a ``twosided``: its parts are mirrored from behind."""
     parts, back = children(bsdf), mi.Frame3f.cos_theta(si.wi) < 0
     si = mi.SurfaceInteraction3f(si)
     si.wi = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
@@ -166,7 +164,7 @@ def _two_sided(bsdf, si, u1, u2, active) -> Draw:
 
 
 def _mask(bsdf, si, u1, u2, active) -> Draw:
-    """Of a ``mask``: straight on, or what is masked."""
+    """Sample a ``mask``: null event or the nested BSDF."""
     opacity, straight_on = _share(bsdf, si, active), dr.zeros(mi.BSDFSample3f)
     seen = u1 < opacity
     straight_on.wo, straight_on.eta, straight_on.pdf = -si.wi, mi.Float(1), 1 - opacity
@@ -181,10 +179,10 @@ _BY_PARTS = {"BlendBSDF": _blend, "TwoSidedBRDF": _two_sided, "MaskBSDF": _mask}
 
 
 def none_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
-    """Mask: no direction was drawn, since ``si`` is seen from behind a rough conductor of ``bsdfs``.
+    """Mask: no direction was sampled on the back of a rough conductor of ``bsdfs``.
 
-    Mitsuba's (Beckmann) draws NaN there and takes it back by a weight of 0, which Mitsuba's blend multiplies
-    by the density, NaN. No other BSDF of Mitsuba's does: NaN of others is counted.
+    Mitsuba's (Beckmann) samples NaN there with weight 0; Mitsuba's blend multiplies that by the density, NaN.
+    NaN of other BSDFs is counted.
     """
     if not any(b.class_name() == "RoughConductor" for b in nested(bsdfs)):
         return mi.Bool(False)
@@ -192,23 +190,23 @@ def none_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
 
 
 def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether some BSDF's sample() may report another density than its pdf().
+    """Whether a BSDF's sample() may report a density other than its pdf().
 
-    A mixture that reports the picked lobe's density gives an unbiased ``weight`` but cannot serve
-    in the weights of multiple importance sampling, nor as divisor of a full evaluation.
+    The density of the picked lobe gives an unbiased ``weight``, but serves neither in weights of multiple
+    importance sampling nor as divisor of a full evaluation.
     """
     return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in nested(bsdfs))
 
 
 def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
-    """``bsdfs`` and every BSDF inside them (two-sided, mask, blend, bump and normal maps)."""
+    """``bsdfs`` and all BSDFs nested in them (twosided, mask, blend, maps)."""
     found = list(bsdfs)
-    for bsdf in found:  # grows on the way
+    for bsdf in found:  # grows in the loop
         found += [value for value in children(bsdf).values() if isinstance(value, mi.BSDF)]
     return found
 
 
 def structure(plugin: mi.Object) -> tuple[Any, ...]:
-    """The class of ``plugin`` and the structures of what it holds (BSDFs, textures), by name."""
+    """Class of ``plugin`` and the structures of its BSDFs and textures, by name."""
     held = {name: value for name, value in children(plugin).items() if isinstance(value, mi.Object)}
     return plugin.class_name(), *((name, structure(held[name])) for name in sorted(held))

@@ -1,4 +1,4 @@
-"""What a kernel is given besides its batch: scene, strategies in use, coefficients, limits, an observer."""
+"""Inputs of a kernel besides its batch: scene, plan, coefficients, limits."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ..settings import MAX_STORED, Settings
 from . import mis
 from .plan import Plan
 
-# Sizes of the lanes' local memory. On CPUs they do not matter for speed; few of them make few kernels.
+# Sizes of the lanes' local memory: irrelevant to the speed of CPUs; few sizes give few kernels.
 STORE_SIZES = (64, 256, MAX_STORED)
 
-# In scenes with media, so many vertices of a light subpath are kept at most; see `light_path.Thinning`.
+# Most stored vertices of a light subpath in scenes with media, see `light_path.Thinning`.
 KEPT = 64
 
 
 @dataclass
 class Coefficients:
-    """kappa of each class of strategies, with which it enters all weights, see `plan.Plan`.
+    """kappa of each class of strategies in all weights, see `plan.Plan`.
 
     The Python number 0 for classes that are not in use.
     """
@@ -38,10 +38,10 @@ class Coefficients:
 
 @dataclass
 class Shared:
-    """Time and wavelengths of a lane's light subpath and of all camera subpaths it serves.
+    """Time and wavelengths of a lane's light subpath and its camera subpaths.
 
-    ``u_wavelength`` chose the wavelengths, ``weight`` is 1 / their density; ``wavelength_set`` their number
-    among `WavelengthSets` (None where there are none).
+    ``u_wavelength``: sample value of the wavelengths, ``weight``: 1 / their density; ``wavelength_set``:
+    index in `WavelengthSets`, None without sets.
     """
 
     time: mi.Float
@@ -52,37 +52,33 @@ class Shared:
 
 
 class Observer:
-    """Observes the subpaths of a lane while they are recorded, for tools; this one does nothing.
+    """Observes the subpaths of a lane during recording, for tools; does nothing.
 
-    `kernel.retrace` takes one. What it is given are arrays of Dr.Jit, which it must not change. In recorded
-    loops they have no values yet; who wants to read them turns `SymbolicLoops` and `SymbolicConditionals`
-    off, so that loops run step by step. Lanes whose subpath has ended keep the values of their last step,
-    with ``active`` false.
+    See `kernel.retrace`. Arguments are Dr.Jit arrays and must not be changed. In recorded loops they have no
+    values yet; disable `SymbolicLoops` and `SymbolicConditionals` to read them. Lanes whose subpath has ended
+    keep the values of their last step, with ``active`` false.
     """
 
     def emitted(self, emission):
-        """A light subpath starts: y_0 and the direction of its first edge, an `emitters.Emission`."""
+        """A light subpath starts: y_0 and the first direction, an `emitters.Emission`."""
 
     def started(self, kernel, side, walk, stream):
-        """A subpath is on its first edge; ``side`` is its `walk.Side`, ``stream`` its random numbers."""
+        """A subpath is on its first edge; ``side``: its `walk.Side`."""
 
     def vertex(self, side, walk, vertex, step):
-        """A subpath has reached a ``vertex`` (`walk.Vertex`) and sampled the next ``step``.
+        """A subpath has reached a `walk.Vertex` and sampled the next ``step``.
 
-        ``step`` is a `bsdf.Step`, None in scenes without surfaces; ``walk`` as it was before it arrived.
+        ``step``: a `bsdf.Step`, None in scenes without surfaces; ``walk`` as before its arrival.
         """
 
     def drawn(self, end):
-        """One inner connection of a camera vertex was drawn.
-
-        ``end``: the light vertex, or where a visibility ray ends that is to reach it.
-        """
+        """An inner connection was drawn; ``end``: light vertex or end of the shadow ray."""
 
 
 class Kernel:
-    """Everything that a pass needs besides its batch. Holds the scene for one render only."""
+    """Inputs of a pass besides its batch. Holds the scene for one render only."""
 
-    # What `bound` adds for one batch.
+    # Set by `bound` for one batch.
     points: Points
     count_light: mi.Float
     observer: Observer
@@ -96,7 +92,7 @@ class Kernel:
         self.plan, self.heuristic = plan, heuristic
         self.shape_errors = prepared.emitters.shape_errors
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
-        # Whether some path can be made from the light's side too, so that weights know how likely that is.
+        # Whether a strategy in use starts from the light's side, so that weights need reverse densities.
         self.reverse = plan.light or plan.merging or plan.guided > 0
         self.traits = prepared.traits if self.reverse else prepared.traits.from_one_side()
         self.space = prepared.space
@@ -117,20 +113,20 @@ class Kernel:
         self.served = u32(plan.served)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
-        # The photons of a pass, a `photons.merging.Merging`; None where vertices are not merged.
+        # `photons.merging.Merging` of a pass; None without merging.
         self.merging = None
-        # What guides s = 0, a `photons.photon_guide.Guide`; None where nothing does.
+        # `photons.photon_guide.Guide`; None without guiding.
         self.guide = None
-        # Whether s = 0 makes no paths on which it might be guided: see `photons.guiding_benefit`.
+        # Whether s = 0 skips paths on which it could be guided, see `photons.guiding_benefit`.
         self.without_isolated = False
-        # Whether contributions say where their path is emitted, see `Contribution.emission`.
+        # Whether contributions store their emission, see `Contribution.emission`.
         self.tells_emission = False
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
-        """The kernel for one batch, with the batch's ``points``.
+        """The kernel for one batch with its ``points``.
 
-        ``count_light`` is the batch's exact count of light subpaths per camera subpath, which the estimates
-        of t <= 1 are divided by (weights keep the nominal one).
+        ``count_light``: exact number of light subpaths per camera subpath in the batch, the divisor of
+        estimates of t <= 1 (weights use the nominal number).
         """
         other = copy(self)
         other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
@@ -138,14 +134,13 @@ class Kernel:
         return other
 
     def within_store(self, k: mi.UInt32) -> mi.Bool:
-        """Mask: paths of ``k`` edges use all strategies; longer ones s = 0 and s = 1 only."""
+        """Mask: paths of ``k`` edges use all strategies; longer ones only s = 0 and s = 1."""
         return k <= self._reach
 
     def set_threshold(self, size: mi.Float64):
-        """Contributions below ``size`` play roulette, none if it is 0.
+        """Set the roulette threshold to ``size`` (``Float64`` of width 1), 0 for none.
 
-        The threshold is a power of two near it, so that the order of atomic sums rarely changes a decision.
-        ``size``: ``Float64`` of width 1.
+        Rounded to a power of two, so that the order of atomic sums rarely changes a decision.
         """
         rounded = dr.exp2(dr.round(dr.log2(size)))
         self.inverse_threshold = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
@@ -153,7 +148,7 @@ class Kernel:
 
 
 def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
-    """Run-time values, or ``by_class`` those of a pilot: 1 in the place of the class, see `mis.ByClass`."""
+    """Coefficients of ``plan``; ``by_class``: one-hot for pilots, see `mis.ByClass`."""
 
     def entry(kind, value, used):
         if not used:
@@ -170,8 +165,8 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
         splat=entry("light", light, plan.splat),
         endpoints=entry("light", light, plan.endpoints),
         arrival=entry("light", light, plan.arrival),
-        # One of M candidates is no M independent samples. (With M = 4 the error is 0.96 times that with
-        # kappa = M in `cornell_box`, 0.88 in `veach_bidir`.)
+        # One of M candidates is not M independent samples; see experiments, "Several light subpaths per
+        # lane".
         inner=entry("inner", math.sqrt(plan.joined), plan.connections != "none"),
     )
 

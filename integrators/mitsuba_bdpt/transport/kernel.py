@@ -1,11 +1,10 @@
 """One batch (a pass, a band of its rows, or a pilot) as one kernel.
 
-A lane carries one light subpath, kept in its local memory, and then one after the other the S camera
-subpaths that it serves, in S different pixels (see `batch`); all strategies of a pair are evaluated by that
-lane. No vertex lies in global memory: apart from the film, the footprint does not grow with samples or image
-size. (In a pilot what each sample adds does.)
+A lane traces one light subpath into its local memory, then its S camera subpaths one after the other, in S
+different pixels (see `batch`), and evaluates all strategies of each pair. No vertex lies in global memory:
+except in pilots, only the film grows with the image size, and nothing with the number of samples.
 
-What a lane does. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
+Work of a lane. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
 k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
     time, wavelengths <- drawn for all subpaths of the lane                 subpaths.shared_by_lane
@@ -13,7 +12,8 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
     # The light subpath, or M of them one after the other                   _light_subpath, _light_subpaths
     y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   subpaths.emission
     (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
-    the first edge <- a ray; it ends here for want of a throughput          subpaths.light_walk
+    the first edge <- a ray; it ends here if the throughput is 0 or not     subpaths.light_walk
+        finite
     d_vcm <- 1 / densities of y_0 and direction (eq. 31)
     d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
     for y in y_1, y_2, ... up to where the subpath misses or ends:          walk.random_walk
@@ -24,7 +24,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             that point <- one virtual call
         t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
         t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
-        keep y, if on a surface whose BSDF is not delta, for inner          light_path
+        store y, if on a surface whose BSDF is not delta, for inner         light_path
             connections, unless no camera subpath could reach it in time
         d_vcm, d_vc (eqs. 34, 35, 53, 54), throughput <- the event at y     walk._leave
         roulette of the subpath; the next edge <- a ray
@@ -45,10 +45,10 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
                         (eqs. 42, 43)
             s = 1:  total += z lit by the point (eqs. 44, 45)               techniques.next_event
-            s >= 2: total += z joined with kept vertices y (eqs. 40, 41):
+            s >= 2: total += z connected with stored y (eqs. 40, 41):
                         each of them,                                       connections.connect_all
                         or one, drawn by what it would add unshadowed       connections.connect_one
-                (of several light subpaths by a guess of that)
+                (of several light subpaths by an approximation of that)
             d_vcm, d_vc, throughput <- the event at z                       walk._leave
             roulette of the subpath; the next edge <- a ray
         add the total to the film                                           sink.end
@@ -62,7 +62,7 @@ In scenes with media y and z may lie in one as well; null surfaces are passed an
     d_vcm <- over T~ of the edge, on arrival                                walk._vertex, mis.to_area
     BSDF -> phase function, cosine -> 1, in a volume                        scattering, phase
     a shadow ray -> transmittance T of the value and T~ of the weight       visibility, media.transmittance
-    keep y -> of a long subpath 64 vertices that stand for all              light_path.Thinning
+    store y -> of a long subpath 64 reweighted vertices                     light_path.Thinning
 
 Each strategy i of a path adds w_i f / (n_i p_i). n_i is its number of samples per camera sample: the light
 subpaths per camera subpath for t <= 1, else 1. The weights w_i are those of a `mis.Heuristic`; of the balance
@@ -70,19 +70,17 @@ heuristic (eq. 37)
 
     w_i = kappa_i p_i / sum_j kappa_j p_j = kappa_i / (light side + kappa_i + camera side)
 
-with kappa_j p_j / p_i added up over the strategies of fewer light vertices (light side) and of more (camera
+with kappa_j p_j / p_i summed over the strategies of fewer light vertices (light side) and of more (camera
 side), from the partial sums of y and z. kappa_i contains n_i, as 1 / S for t <= 1 (where S does not divide
-the batch's pixels, the estimate's n_i is the exact one: weights need only sum to 1), beside what the plan
-gives the class (`inputs._coefficients`). Classes of strategies that the
-plan leaves out have kappa = 0 and are not recorded.
+the batch's pixels, only the estimate's n_i is exact: weights need only sum to 1), and the plan's coefficient
+of the class (`inputs._coefficients`). Classes that the plan leaves out have kappa = 0 and are not recorded.
 
-What t = 1 or a drawn inner connection would add plays roulette before its shadow ray is traced
-(`contribution.roulette`). What is not finite is stopped, and counted: the walk ends a subpath
-(`walk.not_finite`), a contribution is dropped before it is added up or drawn
+Contributions of t = 1 and drawn inner connections play roulette before their shadow ray is traced
+(`contribution.roulette`). Non-finite values are dropped and counted: the walk ends a subpath
+(`walk.not_finite`), contributions are dropped before they are summed or drawn
 (`contribution.drop_non_finite`), and the sink drops colours of the film and features.
 
-A pilot's batch has several light subpaths per camera sample, most of them without one; its estimates are
-those of one each.
+A pilot has several light subpaths per camera sample, most without one; its estimates are those of one each.
 """
 
 from __future__ import annotations
@@ -111,9 +109,9 @@ from .walk import is_sds_vertex, random_walk
 
 @dataclass
 class Lane:
-    """What a lane's camera subpaths share: the map of samples, time and wavelengths, light vertices.
+    """What a lane's camera subpaths share.
 
-    In a pilot also where the light subpath was emitted, see `Contribution.emission`.
+    ``emission``, in a pilot: see `Contribution.emission`.
     """
 
     place: Places
@@ -123,10 +121,10 @@ class Lane:
 
 
 def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UInt64:
-    """Trace one batch and put its contributions into ``sink`` (see `sink`).
+    """Trace one batch and accumulate its contributions in ``sink`` (see `image.sink`).
 
-    ``spp`` is the render's total, which places the batch in the image's point sequence. Returns
-    `Counters.summed`; nothing is evaluated yet.
+    ``spp``: samples per pixel of the render, which place the batch in the image's sequence. Returns
+    `Counters.summed`; evaluates nothing.
     """
     sharing = shared_by(kernel, batch, points)
     kernel = kernel.bound(points, _count_light(kernel, batch, sharing), Observer())
@@ -147,10 +145,9 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UI
 def retrace(
     kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot: mi.UInt32, observer: Observer
 ) -> mi.UInt64:
-    """Trace some camera samples of a batch again, as `trace` does, and show an ``observer`` how.
+    """Trace the camera samples ``slot`` again, like `trace`, with an ``observer``.
 
-    The samples of these ``slot``s (``UInt32``), with the light subpath of the lane that each is in. (For
-    whoever looks at single samples; no render does.)
+    ``slot``: ``UInt32``; each with the light subpath of its lane. For tools that inspect single samples.
     """
     sharing = shared_by(kernel, batch, points)
     kernel = kernel.bound(points, _count_light(kernel, batch, sharing), observer)
@@ -159,9 +156,9 @@ def retrace(
 
 
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
-    """Which camera samples of a batch share a light subpath.
+    """Which camera samples of a batch share a light subpath; none in a pilot.
 
-    Those of a pilot do not, and some of its light subpaths have none.
+    Some light subpaths of a pilot have no camera sample.
     """
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
@@ -169,15 +166,15 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
 
 
 def _count_light(kernel: Kernel, batch: Batch, sharing: Sharing) -> float:
-    """Light subpaths per camera subpath: exact also where S does not divide the batch's pixels.
+    """Light subpaths per camera subpath, exact also if S does not divide the pixels.
 
-    A pilot's estimates are those of one, whose number it divides by itself.
+    1 for a pilot, which divides by their number itself.
     """
     return 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size
 
 
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
-    """The lanes of these numbers with their light subpaths, which are traced."""
+    """Trace the light subpaths of these lanes; returns the lanes."""
     place_in_sequence = place.index(index)
     stream = kernel.points.stream("light", place_in_sequence)
     shared = subpaths.shared_by_lane(kernel, stream, place_in_sequence)
@@ -192,7 +189,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
 
 @dr.syntax
 def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path):
-    """Trace the light subpaths of a lane one after the other, as `_light_subpath` does each."""
+    """Trace the light subpaths of a lane one after the other, see `_light_subpath`."""
     counters = Counters.zeros("light", "non_finite") + counted_by_light(kernel.plan, kernel.space)
     number, count = mi.UInt32(0), kernel.plan.joined
     while dr.hint(
@@ -211,9 +208,9 @@ def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path)
 
 
 def _light_subpath(kernel: Kernel, sink, stream, shared, path):
-    """Trace a light subpath: its splats, (1,1) included, and the vertices for inner connections.
+    """Trace a light subpath: its splats, (1,1) included, and its stored vertices.
 
-    Returns the latter, what was counted, and in a pilot where it was emitted.
+    Returns the stored vertices, the counters, and in a pilot the emission.
     """
     plan = kernel.plan
     e = subpaths.emission(kernel, stream, shared)
@@ -223,7 +220,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     counters = Counters()
 
     def splat(c):
-        """Hand a contribution with t <= 1 to the sink."""
+        """Pass a contribution with t <= 1 to the sink."""
         c = contribution.drop_non_finite(replace(c, emission=emitted))
         return c.counted + sink.splat(kernel, c, shared)
 
@@ -241,10 +238,10 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         return path, counters
 
     if kernel.space is not None:
-        # No purpose is left to name this number (`points`); that of vertex 0 chooses the channel.
+        # All purposes are in use (`points`); CHANNEL at vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
-    walk = subpaths.light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 makes SDS paths
+    walk = subpaths.light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 samples SDS paths
     guide = None if walk.only_delta is None else partial(guided_hits.look_back, kernel)
     active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, guide)
     state = path, counted_by_light(plan, kernel.space)
@@ -259,7 +256,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 
 @dr.syntax
 def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
-    """``serve`` each camera sample of the lane at this `batch.Seat`; what they count."""
+    """Call ``serve`` for each camera sample of the lane; returns the counters."""
     walked = Counters.zeros("camera", *counted_in_media(kernel.space))
     counters = walked + _camera_counters(kernel)
     served = mi.UInt32(0)
@@ -281,9 +278,9 @@ def _camera_counters(kernel: Kernel) -> Counters:
 
 
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
-    """Trace a camera subpath and join it with the lane's light subpath."""
+    """Trace a camera subpath and connect it with the lane's light subpath."""
     sample = subpaths.camera_sample(kernel, lane.place, lane.shared, slot, active)
-    active = active & (kernel.max_depth >= 1)  # `&=` would change the sample's too
+    active = active & (kernel.max_depth >= 1)  # `&=` would also change the sample's
     walk = subpaths.camera_walk(kernel, sample, active)
     side = subpaths.camera_side(kernel, sample, lane.shared, walk, sink.alpha, _camera_guide(kernel))
     visit = _camera_visit(kernel, sink, lane, sample)
@@ -295,14 +292,14 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
 
 
 def _camera_guide(kernel: Kernel):
-    """`Side.guide` of camera subpaths; None where s = 0 is not guided."""
+    """`Side.guide` of camera subpaths; None without guiding."""
     if kernel.without_isolated:
         return partial(guided_hits.mark, kernel)
     return None if kernel.guide is None else partial(guided_hits.advise, kernel)
 
 
 def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
-    """What is done at each vertex of a camera subpath: the strategies with t >= 2."""
+    """The strategies with t >= 2 at each vertex of a camera subpath."""
     plan, start, shared = kernel.plan, sample.start, lane.shared
 
     def add(c, total, lost):
@@ -314,7 +311,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
         return *add(c, total, lost), merges + one(c.active)
 
     def merged(z, walk, total, counted):
-        # A branch of its own: few lanes are on an isolated path.
+        # A separate branch: few lanes are on an SDS path.
         return dr.if_stmt(
             (z, total, *counted),
             is_sds_vertex(kernel, kernel.kappa.splat, walk, z),
@@ -335,7 +332,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             total, lost, aimed, traced = state
             counters = replace(counters, non_finite=lost, aimed=aimed, guided=traced)
         if plan.hit:
-            # A branch of its own: few lanes hit an emitter.
+            # A separate branch: few lanes hit an emitter.
             total, lost = dr.if_stmt(
                 (z, total, counters.non_finite),
                 techniques.sees_emitter(kernel, z),

@@ -1,4 +1,4 @@
-"""Vertices of a light subpath that inner connections can use."""
+"""Stored vertices of a light subpath, for inner connections."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from .walk import Vertex, newest_coefficient, volume_cosine
 
 @dataclass
 class StoredVertex:
-    """A light vertex y_{s-1}, s >= 2, as an inner connection needs it.
+    """A light vertex y_{s-1}, s >= 2, for inner connections.
 
-    ``throughput_over_cos`` f cos / pdf of all events before this vertex, the edge to it included, over the
-    geometric cosine of incidence |n.wi|, which is the constant part of the adjoint factor |n.wo| / |n.wi| (in
-    volumes both are 1); ``partial`` partial sums in the area measure; ``edges`` number of edges up to it,
-    s - 1; ``anchor`` starts rays; ``medium`` the number of that in which it lies, 0 on surfaces, None in
-    scenes without media.
+    ``throughput_over_cos``: f cos / pdf of all events before this vertex, including the edge to it, over the
+    geometric cosine of incidence |n.wi|, the constant part of the adjoint factor |n.wo| / |n.wi| (in volumes
+    both are 1); ``partial``: partial sums in the area measure; ``edges`` up to it, s - 1; ``anchor``: starts
+    rays; ``medium``: index of its medium, 0 on surfaces, None in scenes without media.
     """
 
     si: mi.SurfaceInteraction3f
@@ -36,7 +35,7 @@ class StoredVertex:
 
     @property
     def volume(self) -> mi.Bool | None:
-        """Mask: in a medium; None in scenes without."""
+        """Mask: in a medium; None in scenes without media."""
         return None if self.medium is None else self.medium != 0
 
     def cosine(self, d: mi.Vector3f) -> mi.Float:
@@ -45,7 +44,7 @@ class StoredVertex:
 
     @staticmethod
     def of(vertex: Vertex) -> StoredVertex:
-        """What is stored of a ``vertex`` that a light subpath has reached."""
+        """The stored form of a ``vertex`` of a light subpath."""
         return StoredVertex(
             si=vertex.si,
             bsdf=vertex.bsdf,
@@ -59,15 +58,14 @@ class StoredVertex:
 
 @dataclass
 class Thinning:
-    """Which vertices of a long light subpath in media are kept, for the others too.
+    """Stochastic thinning of the stored vertices of a long light subpath in media.
 
-    The first half of `KEPT` all, of later ones the i-th with probability (`KEPT` / 2)^2 / (i (i - 1)), by
-    systematic sampling: with C(i) the sum of the probabilities of the first i and u in [0, 1), the i-th is
-    kept if an integer lies in (C(i - 1) + u, C(i) + u]. C(i) = `KEPT` - (`KEPT` / 2)^2 / i stays below
-    `KEPT`, and so do their number and their places in memory. In integers, of which `_UNIT` are 1: rounding
-    is in the probability too.
+    Keeps the first `KEPT` / 2, and of later ones the i-th with probability (`KEPT` / 2)^2 / (i (i - 1)) by
+    systematic sampling: with C(i) the sum of the first i probabilities and u in [0, 1), the i-th is kept if
+    an integer lies in (C(i - 1) + u, C(i) + u]. C(i) = `KEPT` - (`KEPT` / 2)^2 / i bounds the number of kept
+    vertices. Computed in integer units of 1 / `_UNIT`, so that the probability includes rounding.
 
-    ``tried`` vertices so far; ``offset`` u.
+    ``tried``: vertices so far; ``offset``: u.
     """
 
     tried: mi.UInt32
@@ -77,11 +75,11 @@ class Thinning:
 
     @staticmethod
     def begin(u: mi.Float) -> Thinning:
-        """Of a new subpath; ``u`` in [0, 1)."""
+        """Thinning of a new subpath; ``u`` in [0, 1)."""
         return Thinning(mi.UInt32(0), mi.UInt32(u * Thinning._UNIT))
 
     def place(self, tried: mi.UInt32) -> tuple[mi.UInt32, mi.Bool, mi.Float]:
-        """Place in memory of the vertex after ``tried``, whether it is kept, and with which probability."""
+        """Slot of the vertex after ``tried``, whether it is kept, and the probability."""
         before, after = self._sum(tried), self._sum(tried + 1)
         place = (before + self.offset) // self._UNIT
         kept = (after + self.offset) // self._UNIT > place
@@ -96,11 +94,11 @@ class Thinning:
 
 @dataclass
 class LightPath:
-    """The `StoredVertex` objects of a lane's light subpath in local memory, ``count`` of them.
+    """The `StoredVertex` objects of a lane's light subpath in local memory.
 
-    Of ``throughput_over_cos`` what `polarization.stokes` says; ``d_vcm`` and ``d_vc`` are their ``partial``;
-    ``rounding`` offset and curvature of their anchors, the rest of which is in ``si``; ``s`` the number of
-    light vertices up to and including each; ``medium`` None in scenes without media.
+    ``throughput_over_cos`` as `polarization.stokes`; ``d_vcm`` and ``d_vc``: ``partial``; ``rounding``:
+    offset and curvature of anchors, whose rest is in ``si``; ``s``: light vertices up to and including each;
+    ``count``: number of stored vertices; ``medium``: None in scenes without media.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
@@ -112,11 +110,11 @@ class LightPath:
     count: mi.UInt32
     medium: dr.Local[mi.UInt32] | None = None
     thinning: Any = None  # a `Thinning`, in scenes with media
-    sketches: Any = None  # `Sketches`, where they are drawn by a guess
+    sketches: Any = None  # `Sketches`, for draws by approximation
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
-    """Local memory for stored vertices; no field is a Bool (these abort LLVM code generation)."""
+    """Local memory for stored vertices; without Bool (LLVM code generation aborts)."""
     size = kernel.store_size
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
@@ -125,7 +123,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         d_vc=dr.alloc_local(type(kernel.heuristic.zero()), size),
         rounding=dr.alloc_local(mi.Vector2f, size),
         s=dr.alloc_local(mi.UInt32, size),
-        # As wide as the lanes: Dr.Jit takes an index of width 1 for the same in all lanes.
+        # As wide as the lanes: Dr.Jit treats an index of width 1 as equal in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
         medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
         sketches=Sketches.allocate(kernel, size) if kernel.plan.joined > 1 else None,
@@ -133,7 +131,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
 
 
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
-    """Keep a light vertex that inner connections can use."""
+    """Store a light vertex if inner connections can use it."""
     keep = vertex.hit & (vertex.edges <= kernel.last_stored) & vertex.connectible()
     y, slot = StoredVertex.of(vertex), path.count
     if path.thinning is not None:
@@ -156,7 +154,7 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
 
 
 def _thinned(path: LightPath, y: StoredVertex, keep):
-    """``y`` for all vertices that it stands for, its place, and whether it is kept; counts it as tried."""
+    """``y`` reweighted, its slot, and whether it is kept; counts it as tried."""
     thinning = path.thinning
     place, kept, probability = thinning.place(thinning.tried)
     path.thinning = replace(thinning, tried=thinning.tried + dr.select(keep, mi.UInt32(1), 0))
@@ -166,7 +164,7 @@ def _thinned(path: LightPath, y: StoredVertex, keep):
 def read_light_vertex(
     kernel: Kernel, path: LightPath, slot: mi.UInt32, active: mi.Bool | bool = True
 ) -> StoredVertex:
-    """The stored vertex ``slot``; zeros where not ``active``, whose slots hold anything."""
+    """Stored vertex ``slot``; zeros where not ``active``, since slots may be unset."""
     si = path.si.read(slot, active)
     rounding = path.rounding.read(slot, active)
     s = path.s.read(slot, active)

@@ -1,28 +1,27 @@
 """Multiple importance sampling of all strategies (s, t) by recursive partial sums.
 
-Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland
-University, 2012; equation numbers below are the report's. Each subpath carries
-two floats, ``d_vcm`` and ``d_vc``, from which the weight of any strategy follows at once:
+Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical report, Saarland University,
+2012; equation numbers are the report's. Each subpath carries two numbers, ``d_vcm`` and ``d_vc``, from which
+the weight of any strategy follows:
 
-* ``d_vcm`` stands for the *newest* alternative strategy: the one that makes the subpath's last
-  vertex from the other side. It has to be multiplied by the density with which that happens.
-* ``d_vc`` stands for all older alternatives. It has to be multiplied by that same density and by
-  the reverse density (solid angle) of the vertex before the last.
+* ``d_vcm``: the *newest* alternative strategy, which samples the subpath's last vertex from the other side.
+  It is multiplied by the density of doing so.
+* ``d_vc``: all older alternatives. It is multiplied by that density and by the reverse density (solid angle)
+  of the vertex before the last.
 
-Where vertices of isolated paths are merged (see `merging`) a third float, ``d_vm``, stands for the merges at
-older vertices, and is used like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies
-share one scale. ``d_vc`` has no eta in it: paths that are not isolated weigh what they weigh without merging.
+With vertex merging of SDS paths (see `merging`) a third number, ``d_vm``, stands for merges at older
+vertices, and is used like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies share
+one scale. ``d_vc`` does not contain eta: other paths keep their weights.
 
-What differs from the report: (1) each strategy class has a coefficient kappa with which it enters
-every weight, w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know yet which class its
-newest alternative will belong to, so the coefficient joins when a strategy is evaluated or when
-the term is folded into ``d_vc``, never when it is stored. (2) Sums are kept in linear units and
-combined by the heuristic (``a + b`` or ``hypot``); squares are never stored, so
-ratios of densities over 60 orders of magnitude stay finite. (3) The density of next-event
-estimation may depend on the vertex that is lit; see ``emitters``.
+Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
+w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
+applied when a strategy is evaluated or the term is folded into ``d_vc``, never when it is stored. (2) Sums
+are kept in linear units and combined by the heuristic (``a + b`` or ``hypot``); squares are never stored, so
+that ratios of densities over 60 orders of magnitude stay finite. (3) The density of next-event estimation may
+depend on the illuminated vertex; see ``emitters``.
 
-Everything here is arithmetic on floats of any width; it knows no scene. A coefficient or partial sum that
-is the Python number 0 belongs to classes that are not in use: nothing is computed for them.
+All functions are arithmetic on floats of any width, without a scene. The Python number 0 as a coefficient or
+partial sum marks classes that are not in use: nothing is computed for them.
 """
 
 from __future__ import annotations
@@ -38,16 +37,16 @@ from ..settings import HEURISTICS
 from .bsdf import Step
 
 if TYPE_CHECKING:
-    # One number, under `ByClass` one for each class; the Python number 0 for classes that are not in use.
-    # (Records that loops carry write it out: Dr.Jit evaluates their annotations.)
+    # One number, with `ByClass` one per class; the Python number 0 for classes that are not in use. Records
+    # carried by loops write it out: Dr.Jit evaluates their annotations.
     PartialSum = mi.Float | mi.Vector4f | int
     Coefficient = PartialSum
 
-# Classes whose coefficients a render may choose: s = 0, s = 1 (t >= 2), t <= 1, s and t >= 2.
+# Classes of strategies with a coefficient: s = 0, s = 1 (t >= 2), t <= 1, s and t >= 2.
 CLASSES = ("hit", "direct", "light", "inner")
 
-# A strategy beyond this ratio has a weight below 1e-37, the smallest that float32 tells from zero;
-# without the bound, infinity times a following reverse density of zero would be NaN.
+# Bound of ratios: weights beyond are below 1e-37, about the least normal float32. Without it infinity times a
+# reverse density of zero would be NaN.
 SATURATION = 1e37
 
 
@@ -62,10 +61,10 @@ class Partial:
 
 @dataclass
 class Merge:
-    """A merge at a vertex, or what else makes isolated paths there.
+    """A merge at a vertex, or another strategy that samples SDS paths there.
 
-    ``ratio``: the partial sum of it, kappa times the number of photons' subpaths times the area of the disc;
-    ``isolated``: the path up to the event there has no edge that a strategy in use joins.
+    ``ratio``: its partial sum, kappa times the number of photon subpaths times the area of the disc;
+    ``isolated``: no edge of the path up to the event there is connected by a strategy in use.
     """
 
     ratio: mi.Float | mi.Vector4f
@@ -73,7 +72,7 @@ class Merge:
 
 
 def is_joined(partial: Partial, coefficient: Coefficient):
-    """Mask: a strategy in use, of this ``coefficient``, joins the edge to the vertex of ``partial``."""
+    """Mask: a strategy with this ``coefficient`` connects the edge to the vertex."""
     if is_absent(coefficient):
         return mi.Bool(False)
     used = dr.max(coefficient) if isinstance(coefficient, mi.Vector4f) else coefficient
@@ -81,22 +80,22 @@ def is_joined(partial: Partial, coefficient: Coefficient):
 
 
 def is_absent(x: PartialSum) -> bool:
-    """Whether ``x`` stands for classes of strategies that are not in use."""
+    """Whether ``x`` is that of classes of strategies that are not in use."""
     return isinstance(x, (int, float)) and x == 0
 
 
 def choose(mask: mi.Bool, a: PartialSum, b: PartialSum) -> PartialSum:
-    """``dr.select`` of two coefficients or partial sums; 0 where both classes are not in use."""
+    """``dr.select`` of two coefficients or partial sums; 0 if neither class is in use."""
     return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
 
 
 def times(coefficient: Coefficient, pdf: mi.Float) -> PartialSum:
-    """A coefficient times a density (in any measure) that enter a partial sum together."""
+    """Product of a coefficient and a density (any measure) in a partial sum."""
     return 0 if is_absent(coefficient) else coefficient * pdf
 
 
 class Heuristic:
-    """How alternatives are combined: ``balance`` or ``power`` (exponent 2).
+    """Combination of alternatives: ``balance`` or ``power`` (exponent 2).
 
     Raises ``UsageError`` for any other name.
     """
@@ -110,11 +109,11 @@ class Heuristic:
         """Partial sum ``x`` times a density, a ratio of densities or a coefficient."""
         if is_absent(x) or is_absent(factor):
             return 0
-        # The factor as well: 0 times an infinite product of densities would be NaN.
+        # Also bounds the factor: 0 times an infinite product of densities would be NaN.
         return dr.minimum(x * dr.minimum(factor, SATURATION), SATURATION)
 
     def combine(self, a: PartialSum, b: PartialSum) -> PartialSum:
-        """Join two partial sums in linear units (``hypot`` for the power heuristic)."""
+        """Add two partial sums in linear units (``hypot`` for the power heuristic)."""
         if is_absent(a) or is_absent(b):
             return b if is_absent(a) else a
         total = dr.hypot(a, b) if self.name == "power" else a + b
@@ -125,11 +124,11 @@ class Heuristic:
         return mi.Float(0)
 
     def present(self, x: PartialSum) -> PartialSum:
-        """A partial sum to which classes in use may be added."""
+        """A partial sum to which classes in use can be added."""
         return self.zero() if is_absent(x) else x
 
     def start(self, inverse_pdf: mi.Float):
-        """Partial sum of one strategy whose ratio is ``inverse_pdf`` so far: 1 / a density in any measure."""
+        """Partial sum of one strategy of ratio ``inverse_pdf``, 1 / density (any measure)."""
         return dr.minimum(inverse_pdf, SATURATION)
 
     def weigh(
@@ -139,9 +138,9 @@ class Heuristic:
         camera_side: PartialSum,
         tr: mi.Float | None = None,
     ) -> tuple[mi.Float, mi.Vector4f | None]:
-        """`weight`, and the classes' shares of it, which only `ByClass` knows.
+        """`weight`, and the shares of the classes (only `ByClass`, else None).
 
-        ``tr``: T~ of the edge that the strategy joins, which the others sample; None without media.
+        ``tr``: T~ of the connected edge, which the other strategies sample; None without media.
         """
         if tr is not None:
             light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)
@@ -150,14 +149,14 @@ class Heuristic:
     def _weigh(
         self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
     ) -> tuple[mi.Float, mi.Vector4f | None]:
-        # The stubs take numbers and sums of entries for something else.
+        # The stubs have wrong types for arithmetic and sums of entries.
         return self.weight(coefficient, light_side, camera_side), None  # pyright: ignore[reportReturnType]
 
     def weight(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
-        """Weight of the strategy at hand, in [0, 1]; its own coefficient must be positive.
+        """Weight in [0, 1] of a strategy with a positive ``coefficient``.
 
-        ``light_side`` and ``camera_side`` are the combined ratios kappa_j p_j / p of all
-        alternatives with fewer and with more light vertices (eq. 37).
+        ``light_side`` and ``camera_side``: combined ratios kappa_j p_j / p of all alternatives with fewer and
+        with more light vertices (eq. 37).
         """
         others = self.combine(light_side, camera_side)
         if is_absent(others):
@@ -167,9 +166,9 @@ class Heuristic:
 
 
 class ByClass(Heuristic):
-    """The balance heuristic with partial sums split by classes of strategies: `CLASSES`, one entry each.
+    """The balance heuristic with partial sums split by class, one entry per `CLASSES`.
 
-    Coefficients are vectors with one entry that is not 0, so that every term finds its place.
+    Coefficients are one-hot vectors, which assign every term to its class.
     """
 
     def __init__(self):
@@ -181,7 +180,7 @@ class ByClass(Heuristic):
     def _weigh(
         self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
     ) -> tuple[mi.Float, mi.Vector4f | None]:
-        # The weight of the strategy at hand, and the share of each class in the sum of all strategies.
+        # The strategy's weight, and the share of each class in the sum of all strategies.
         total = self.combine(self.combine(light_side, camera_side), coefficient)
         shares = total / dr.sum(total)
         return dr.sum(coefficient) / dr.sum(total), shares  # pyright: ignore[reportReturnType]
@@ -190,12 +189,12 @@ class ByClass(Heuristic):
 def to_area(
     heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float, tr: mi.Float | None = None
 ) -> Partial:
-    """Convert to the area measure at a new vertex (the part of eqs. 31, 32, 34, 35 that is known there).
+    """Convert to the area measure at a new vertex (known part of eqs. 31, 32, 34, 35).
 
-    ``dist2`` squared length of the edge; 1 on the first edge of a light subpath, where ``d_vcm`` contains it
-    (from infinity there is none), and of a parallel sensor, whose density is one across the edge;
-    ``cos`` absolute geometric cosine at the new vertex; ``tr`` T~ of the edge, which this subpath sampled and
-    the newest alternative joins (None without media).
+    ``dist2``: squared length of the edge; 1 on the first edge of a light subpath, whose ``d_vcm`` contains it
+    (none from infinity), and of a parallel sensor, whose density is one across the edge; ``cos``: absolute
+    geometric cosine at the new vertex; ``tr``: T~ of the edge, sampled by this subpath and connected by the
+    newest alternative (None without media).
     """
     return Partial(
         d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),
@@ -207,21 +206,19 @@ def to_area(
 def scatter(
     heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step, merge: Merge | None = None
 ) -> Partial:
-    """Fold the newest alternative and take a sampled direction (eqs. 34, 35; delta events 53, 54).
+    """Fold the newest alternative and sample a direction (eqs. 34, 35; delta: 53, 54).
 
-    ``coefficient`` of the class to which the newest alternative belongs; ``step`` holds
-    ``pdf_fwd_w`` and ``pdf_rev_w`` (solid angle), ``cos_out`` (geometric) and the mask ``delta``; ``merge``
-    the one at this vertex, None where there are none.
+    ``coefficient`` of the newest alternative's class; ``step`` with ``pdf_fwd_w`` and ``pdf_rev_w`` (solid
+    angle), ``cos_out`` (geometric) and the mask ``delta``; ``merge`` at this vertex, or None.
     """
     older = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),
         heuristic.scale(partial.d_vc, step.pdf_rev_w),
     )
     # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its probabilities from either
-    # side are the same for Mitsuba's BSDFs and left out. So is the ratio of the solid angles on the two sides
-    # of a refraction, (eta_l/eta_c)^2 cos_l/cos_c: weights are those of densities that leave it out, the same
-    # ones whichever strategy asks, so they sum to 1 and nothing is biased; they are exactly the balance
-    # heuristic's for reflections and where these ratios multiply to 1.
+    # side are equal for Mitsuba's BSDFs and left out. So is the ratio of the solid angles on the two sides of
+    # a refraction, (eta_l/eta_c)^2 cos_l/cos_c: all strategies leave it out, so that weights sum to 1. They
+    # are the balance heuristic's for reflections and where these ratios multiply to 1.
     kept = 0
     if not is_absent(older):
         kept = dr.select(
@@ -237,7 +234,7 @@ def scatter(
 
 
 def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
-    """``d_vm`` after an event: the merges before it, and that at this vertex, which joins no delta event."""
+    """``d_vm`` after an event: earlier merges, and this vertex's unless delta."""
     merges = heuristic.combine(
         heuristic.scale(partial.d_vm, step.pdf_rev_w),
         merge.ratio,
@@ -253,11 +250,11 @@ def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge:
 def alternatives(
     heuristic: Heuristic, partial: Partial, coefficient: Coefficient, pdf_rev_w: mi.Float, pdf_a: mi.Float
 ) -> PartialSum:
-    """Combined ratios of all strategies that take vertices away from this subpath (eqs. 40, 41, 44-47).
+    """Combined ratios of all strategies that shorten this subpath (eqs. 40-41, 44-47).
 
-    ``coefficient`` of the newest alternative's class; ``pdf_rev_w`` solid-angle density of sampling
-    the vertex before the last from the last; ``pdf_a`` density of making the last vertex from the other
-    side, in the measure in which ``d_vcm`` is stored (area; solid angle at infinity).
+    ``coefficient`` of the newest alternative's class; ``pdf_rev_w``: solid-angle density of sampling the
+    vertex before the last from the last; ``pdf_a``: density of sampling the last vertex from the other side,
+    in the measure of ``d_vcm`` (area; solid angle at infinity).
     """
     total = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),

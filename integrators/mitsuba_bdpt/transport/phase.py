@@ -1,11 +1,11 @@
-"""Evaluation of Mitsuba's phase functions in both directions.
+"""Evaluates and samples Mitsuba's phase functions on both subpaths.
 
-A walk's throughput has the albedo of a volume vertex when it arrives there; what is left of sigma_s rho is
-the phase function rho, whose cosine is 1. ``wi`` is the direction that the subpath comes from. Phase
-functions are symmetric; that of microflakes is so together with the extinction along ``wi``, with whose
-density the subpath made the vertex: rho is asked with each subpath's own ``wi``, and no adjoint factor is
-needed. Media in which even that product is not symmetric (`asymmetry`; Mitsuba's ``blendphase`` of
-microflakes) get no light subpaths.
+A walk's throughput includes the albedo of a volume vertex on arrival; the rest of sigma_s rho is the phase
+function rho, with cosine 1. ``wi`` is the direction that the subpath comes from. Phase functions are
+symmetric; that of microflakes is symmetric together with the extinction along ``wi``, with whose density the
+subpath sampled the vertex: rho is evaluated with each subpath's own ``wi``, without an adjoint factor. Media
+for which even that product is not symmetric (`asymmetry`; Mitsuba's ``blendphase`` of microflakes) get no
+light subpaths.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from ..host.introspection import children
 from ..media.media import Media, interaction, probes, random_directions, symmetric_frame
 from .bsdf import Evaluation, Step, Target
 
-# Plugins whose density of the reverse is the same number.
+# Plugins with equal forward and reverse densities.
 _SYMMETRIC = frozenset(
     "IsotropicPhaseFunction HGPhaseFunction RayleighPhaseFunction TabulatedPhaseFunction".split()
 )
 
 
 def is_symmetric(phase: mi.PhaseFunction) -> bool:
-    """Whether its plugin is known to have the same density in reverse."""
+    """Whether the plugin is known to have equal forward and reverse densities."""
     if phase.class_name() == "BlendPhaseFunction":
         nested = [v for v in children(phase).values() if isinstance(v, mi.PhaseFunction)]
         return bool(nested) and all(map(is_symmetric, nested))
@@ -33,9 +33,9 @@ def is_symmetric(phase: mi.PhaseFunction) -> bool:
 
 
 def asymmetry(medium: mi.Medium) -> float:
-    """By how much sigma_t(w) rho(w -> w') and sigma_t(w') rho(w' -> w) differ: at random points, on average.
+    """Mean relative difference of sigma_t(w) rho(w, w') and sigma_t(w') rho(w', w).
 
-    Relative to their mean; 0 of plugins that are known (`is_symmetric`).
+    At random points; 0 for known plugins (`is_symmetric`).
     """
     phase = medium.phase_function()
     if is_symmetric(phase):
@@ -54,7 +54,7 @@ def asymmetry(medium: mi.Medium) -> float:
 
 
 def _evaluated(medium: mi.Medium, mei, wo, active):
-    """rho from ``mei.wi`` to ``wo`` (world), and the densities of ``wo`` and of the reverse."""
+    """rho from ``mei.wi`` to ``wo`` (world), and densities of ``wo`` and the reverse."""
     phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
     value, pdf = phase.eval_pdf(ctx, mei, wo, active)
     if is_symmetric(phase):
@@ -66,7 +66,7 @@ def _evaluated(medium: mi.Medium, mei, wo, active):
 
 
 def evaluate(media: Media, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
-    """The phase function of ``medium`` (its number) at ``si`` towards the local direction ``wo``."""
+    """Evaluate the phase function of ``medium`` (index) towards the local ``wo``."""
     mei = interaction(si.p, -si.to_world(si.wi), si)
     return Evaluation(*media.ask(medium, _evaluated, mei, si.to_world(wo), active))
 
@@ -74,7 +74,7 @@ def evaluate(media: Media, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bo
 def sample(
     media: Media, medium: mi.UInt32, si, u1, u2, active: mi.Bool, target: Target | None
 ) -> tuple[Step, Evaluation | None]:
-    """Continue a subpath from a volume vertex; with a ``target`` also its `Evaluation`, as `bsdf.sample`."""
+    """Continue a subpath from a volume vertex; results as in `bsdf.sample`."""
 
     def questions(medium: mi.Medium, mei, u1, u2, sampled, wo, evaluated, _):
         phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
@@ -86,12 +86,12 @@ def sample(
     mei = interaction(si.p, -si.to_world(si.wi), si)
     wo = si.to_world(target.wo) if target else mi.Vector3f(0, 0, 1)
     evaluated = target.active if target else mi.Bool(False)
-    # Subpaths that end here are joined all the same.
+    # Subpaths that end here are still connected.
     asked = active | evaluated
 
     d, weight, pdf, pdf_rev, joined = media.ask(medium, questions, mei, u1, u2, active, wo, evaluated, asked)
     step = Step(
-        # Its length would drift along subpaths: frames are made of directions.
+        # Otherwise its length would drift along subpaths: frames are built from directions.
         wo=dr.normalize(si.to_local(d)),
         weight=dr.select(pdf > 0, weight, 0),
         pdf_fwd_w=pdf,

@@ -1,4 +1,4 @@
-"""Which strategies a render uses."""
+"""The strategies of a render."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from ..emitters.emission_tables import EmissionTables
 
-# Numbers of light subpaths with which each camera subpath can be joined.
+# Numbers of light subpaths with which a camera subpath can be connected.
 JOINED = (1, 4)
 
-# Numbers of guided samples at a vertex among which a pilot chooses.
+# Numbers of guided samples per vertex among which a pilot chooses.
 GUIDED = (1, 4, 8)
 
 
@@ -17,15 +17,15 @@ GUIDED = (1, 4, 8)
 class Plan:
     """Strategy classes in use for one scene and sensor.
 
-    Classes: ``hit`` s=0, ``direct`` s=1 with t>=2, ``splat`` t=1 with s>=2, ``endpoints`` (1,1),
-    ``arrival`` t=0, ``inner`` s,t>=2. ``camera_paths_per_light_path``: camera subpaths per light subpath (S).
-    ``connections``: ``all``, ``one`` or ``none``. ``kappa_light``: kappa of t<=1 over its count;
-    ``kappa_direct``: kappa of s=1.
-    ``roulette``: whether small contributions may be dropped before their ray. ``skipped`` explains what is
-    left out. ``merging``: whether vertices of isolated paths are merged; ``guided``: by how many samples
-    s = 0 is guided at a vertex; ``guidable``: whether a pilot may say that it pays; ``emission``: what guides
-    that of light subpaths, ``teachable``: whether a pilot may say that it pays. ``joined``: number of light
-    subpaths (M) with whose vertices each camera subpath is joined; they serve M S camera subpaths.
+    * ``hit`` s=0, ``direct`` s=1 with t>=2, ``splat`` t=1 with s>=2, ``endpoints`` (1,1), ``arrival`` t=0;
+      ``connections`` s,t>=2: ``all``, ``one`` or ``none``.
+    * ``camera_paths_per_light_path``: camera subpaths per light subpath (S); ``joined``: light subpaths (M)
+      with which each camera subpath is connected, shared by M S camera subpaths.
+    * ``kappa_light``: kappa of t<=1 over its count; ``kappa_direct``: kappa of s=1.
+    * ``roulette``: small contributions play roulette before their shadow ray.
+    * ``merging``: vertex merging of SDS paths; ``guided``: guided samples per vertex; ``emission``: tables of
+      guided emission; ``guidable``, ``teachable``: a pilot may choose guided samples, and tables.
+    * ``skipped``: reasons for what is left out.
     """
 
     hit: bool
@@ -49,10 +49,10 @@ class Plan:
 
     @property
     def served(self) -> int:
-        """Camera subpaths that a lane serves."""
+        """Camera subpaths of a lane."""
         return self.camera_paths_per_light_path * self.joined
 
     @property
     def light(self) -> bool:
-        """Whether light subpaths are traced at all."""
+        """Whether light subpaths are traced."""
         return self.splat or self.arrival or self.connections != "none" or self.endpoints

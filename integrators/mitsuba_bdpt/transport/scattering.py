@@ -1,4 +1,4 @@
-"""What happens at a vertex: a BSDF on surfaces, a phase function in a medium."""
+"""Scattering at a vertex: a BSDF on surfaces, a phase function in a medium."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .bsdf import Evaluation, Target
 
 
 def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):
-    """Continue a subpath at ``vertex``: the `Step`, and the `Evaluation` of the ``target`` (None without)."""
+    """Continue a subpath: the `Step`, and the `Evaluation` of ``target`` or None."""
     take = bsdf.sample_adjoint if adjoint else bsdf.sample
     if vertex.volume is None:
         return take(vertex.bsdf, vertex.si, u1, u2, active, kernel.traits, target)
@@ -32,7 +32,7 @@ def _of(target: Target | None, mask: mi.Bool) -> Target | None:
 
 
 def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
-    """A camera vertex towards the local direction ``wo``, and both densities."""
+    """Evaluate a camera vertex towards the local ``wo``, with both densities."""
     if vertex.volume is None:
         return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active, kernel.traits)
     return _chosen(
@@ -46,7 +46,7 @@ def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
 
 
 def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio) -> Evaluation:
-    """A light vertex towards the local direction ``wo``; ``cos_ratio`` as of `bsdf.evaluate_adjoint`."""
+    """Evaluate a light vertex towards the local ``wo``, see `bsdf.evaluate_adjoint`."""
     if vertex.volume is None:
         return bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, active, kernel.traits, cos_ratio)
     return _chosen(
@@ -60,7 +60,7 @@ def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio
 
 
 def _chosen(kernel, vertex, medium, wo, active, surface) -> Evaluation:
-    """The ``surface``'s evaluation (a function of a mask) or the medium's, whichever ``vertex`` is in."""
+    """Evaluation by ``surface`` (a function of a mask) or by the vertex's medium."""
     media = kernel.space.media
     if not media.scatters:
         return surface(active & ~vertex.volume)

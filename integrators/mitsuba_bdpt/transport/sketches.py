@@ -1,14 +1,14 @@
-"""Sketches of how vertices scatter, from which the size of an inner connection is guessed without its BSDFs.
+"""Proxy vertices: approximate the size of an inner connection without its BSDFs.
 
-A lane that keeps the vertices of several light subpaths draws one of them for each camera vertex
-(`connections`). Evaluating both BSDFs for every candidate would take as long as is gained, so candidates are
-weighed by a guess that has the form of the contribution with its weight (eqs. 37, 40, 41),
+A lane that stores the vertices of several light subpaths draws one of them for each camera vertex
+(`connections`). Evaluating both BSDFs of every candidate would cost the gain, so candidates are weighed by an
+approximation of the weighted contribution (eqs. 37, 40, 41),
 
     f_z f_y cos_z cos_y / d^2 / (kappa + others_y p_z cos_y / d^2 + others_z p_y cos_z / d^2),
 
-with BSDFs that are diffuse, as bright as the true one is towards the normal, and of glossy ones a lobe about
-the mirror direction besides, as wide as its density there says (GGX: B. Walter et al. 2007, eq. 33). Whatever
-the guess is, the estimate is that of the one drawn over its probability.
+with diffuse BSDFs as bright as the true one towards the normal, and for glossy BSDFs a lobe about the mirror
+direction, as wide as its density there implies (GGX: B. Walter et al. 2007, eq. 33). The estimate divides the
+drawn contribution by its probability and is unbiased for any approximation.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ import mitsuba as mi
 
 from . import bsdf, scattering, spectra
 
-# What is left of a guess on a side to which the BSDF does not scatter: shading normals and bumps may. (Error
-# with 0.0002 over that with 0.002: `cornell_box` 0.96, elsewhere the same.)
+# Factor of an approximation on a side to which the BSDF does not scatter: shading normals and bumps may.
 WRONG_SIDE = 0.0002
 
-# Least cosine that densities over area are divided by.
+# Least cosine by which densities over area are divided.
 _LEAST_COS = 0.01
 
-# Of numbers whose sign tells something.
+# Least magnitude of numbers whose sign is a flag.
 _LEAST_SIZE = 1e-30
 
 # Bounds of the squared width of a lobe, and the least density and cosine that it is fitted to.
@@ -37,9 +36,9 @@ _NARROW, _LEAST_PDF, _LEAST_Z = 1e-5, 1e-3, 1e-3
 
 @dataclass
 class Lobes:
-    """A BSDF as brightness and density of a diffuse part, each over cos / pi, and of a lobe at its peak.
+    """A BSDF: brightness and density of a diffuse part, and of a lobe at its peak.
 
-    ``width2``: squared roughness of the lobe.
+    Diffuse ones over cos / pi; ``width2``: squared roughness of the lobe.
     """
 
     diffuse: mi.Float
@@ -50,18 +49,18 @@ class Lobes:
 
     @staticmethod
     def plain() -> Lobes:
-        """Of unit brightness, diffuse."""
+        """A diffuse BSDF of unit brightness."""
         return Lobes(mi.Float(1), mi.Float(1), mi.Float(0), mi.Float(0), mi.Float(1))
 
 
 @dataclass
 class Sketch:
-    """A vertex, as far as guesses ask.
+    """Proxy of a vertex.
 
-    Position ``p``; geometric normal ``n`` on the side from which it was reached, and whether it scatters to
-    ``both``; whether it is ``glossy``; its ``lobes``; directions ``wi`` to where it was reached from and
-    ``shading`` normal, in the world; ``others``: what other strategies make of its subpath, over the density
-    from the other side, of diffuse directions, and ``peak_others`` what the lobe adds at its peak.
+    ``p``: position; ``n``: geometric normal on the incident side; ``both``: scatters to both sides; ``wi``:
+    incident direction, ``shading``: shading normal, both in world space; ``others``: partial sums of the
+    other strategies over the density from the other side, for diffuse directions; ``peak_others``: the lobe's
+    addition at its peak.
     """
 
     p: mi.Point3f
@@ -76,9 +75,9 @@ class Sketch:
 
     @staticmethod
     def of(kernel, vertex, coefficient, active: mi.Bool, alone: bool) -> Sketch:
-        """That of a ``vertex``; ``coefficient`` of the class to which its newest alternative belongs.
+        """The proxy of ``vertex``; ``coefficient`` of its newest alternative's class.
 
-        ``alone``: whether guesses do not all have its brightness in common.
+        ``alone``: the brightness matters, as it is not common to all compared connections.
         """
         si, partial = vertex.si, vertex.partial
         wi, n = si.to_world(si.wi), mi.Vector3f(si.n)
@@ -98,7 +97,7 @@ class Sketch:
         )
 
     def towards(self, kernel, d: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
-        """Into the direction ``d``: brightness times cosine, density, ``others``, and the cosine."""
+        """For direction ``d``: brightness times cosine, density, ``others``, and cosine."""
         signed = dr.dot(self.n, d)
         cos = dr.abs(signed)
         part = cos * dr.inv_pi
@@ -126,7 +125,7 @@ class Sketch:
 
 
 def guess(kernel, z: Sketch, y: Sketch) -> mi.Float:
-    """A guess of what the connection of ``z`` and ``y`` adds, up to a factor that all at ``z`` share."""
+    """Approximate size of the connection of ``z`` and ``y``, up to a factor of ``z``."""
     between = y.p - z.p
     dist2 = dr.squared_norm(between)
     inverse = dr.rcp(dist2)
@@ -139,12 +138,12 @@ def guess(kernel, z: Sketch, y: Sketch) -> mi.Float:
 
 
 def _shape(cos2: mi.Float, width2: mi.Float) -> mi.Float:
-    """The distribution of microfacets over its peak; ``cos2`` of the half vector and the normal."""
+    """Microfacet distribution over its peak; ``cos2`` of half vector and normal."""
     return dr.square(width2 / (cos2 * (width2 - 1) + 1))
 
 
 def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lobes:
-    """From an evaluation towards the normal, and of glossy BSDFs one in the mirror direction."""
+    """Fit to evaluations towards the normal and, if glossy, in the mirror direction."""
     wi = vertex.si.wi
     up = mi.Vector3f(0, 0, dr.sign(wi.z))
     throughput = mi.unpolarized_spectrum(vertex.throughput)
@@ -176,17 +175,17 @@ def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lob
 
 
 def _intensity(f: bsdf.Evaluation) -> mi.UnpolarizedSpectrum:
-    """The value for light that is not polarized."""
+    """Value for unpolarized light."""
     return mi.unpolarized_spectrum(f.value)
 
 
 @dataclass
 class Sketches:
-    """Those of a lane's light vertices in local memory, but for the position, which is kept with the vertex.
+    """Proxies of a lane's light vertices in local memory, without positions.
 
-    No field is a Bool (these abort LLVM code generation). ``normal`` with the diffuse brightness, negative of
-    what scatters to both sides; ``others``, negative of glossy ones; of scenes that have some also ``lobe``:
-    peak, its density, squared width and ``peak_others``; ``wi`` with the diffuse density, ``shading``.
+    No field is a Bool (LLVM code generation aborts). ``normal`` with the diffuse brightness, negative if it
+    scatters to both sides; ``others``, negative if glossy; in scenes with glossy BSDFs ``lobe``: peak, its
+    density, squared width and ``peak_others``; ``wi`` with the diffuse density; ``shading``.
     """
 
     normal: dr.Local[mi.Vector4f]
@@ -197,7 +196,7 @@ class Sketches:
 
     @staticmethod
     def allocate(kernel, size: int) -> Sketches:
-        """Memory for so many."""
+        """Local memory for ``size`` proxies."""
         made = Sketches(dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Float, size))
         if kernel.traits.glossy:
             made.lobe, made.wi = dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Vector4f, size)
@@ -205,8 +204,8 @@ class Sketches:
         return made
 
     def write(self, y: Sketch, slot: mi.UInt32, keep: mi.Bool):
-        """Keep one."""
-        size, n = dr.maximum(y.lobes.diffuse, _LEAST_SIZE), y.n  # its sign tells something
+        """Store a proxy in ``slot`` where ``keep``."""
+        size, n = dr.maximum(y.lobes.diffuse, _LEAST_SIZE), y.n  # its sign is a flag
         self.normal.write(mi.Vector4f(n.x, n.y, n.z, dr.select(y.both, -size, size)), slot, keep)
         others = y.others
         if self.lobe is not None:
@@ -218,7 +217,7 @@ class Sketches:
         self.others.write(others, slot, keep)
 
     def read(self, p: mi.Point3f, slot: mi.UInt32) -> Sketch:
-        """The sketch in ``slot``, of a vertex at ``p``."""
+        """The proxy in ``slot`` of a vertex at ``p``."""
         normal, others = self.normal[slot], self.others[slot]
         lobes, wi, shading, peak_others = Lobes.plain(), mi.Vector3f(0), mi.Vector3f(0), mi.Float(0)
         lobes.diffuse = dr.abs(normal.w)

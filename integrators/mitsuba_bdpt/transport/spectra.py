@@ -1,4 +1,4 @@
-"""What is asked of spectra, Mueller matrices in polarized variants."""
+"""Reductions of spectra, Mueller matrices in polarized variants."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import mitsuba as mi
 
 
 def brightest(value: mi.Spectrum):
-    """The largest entry of a spectrum, in size; one that is NaN counts only where all others do."""
+    """Largest magnitude of a spectrum's entries; NaN only if all are NaN."""
     return dr.max(dr.abs(mi.unpolarized_spectrum(value)))
 
 
 def is_zero(value: mi.Spectrum):
-    """Mask: all entries of a spectrum are 0. NaN and infinity are not."""
+    """Mask: all entries of a spectrum are 0."""
     return dr.all(mi.unpolarized_spectrum(value) == 0)
 
 
 def is_finite(value: mi.Spectrum):
-    """Mask: no entry of a spectrum (of a Mueller matrix's first column) is NaN or infinite."""
+    """Mask: all entries of a spectrum (Mueller matrix: first column) are finite."""
     finite = dr.isfinite(mi.unpolarized_spectrum(value))
     if mi.is_polarized:
         for i in range(1, 4):

@@ -1,6 +1,6 @@
-"""The start of both subpaths: time and wavelengths, the endpoint, the first edge and its partial sums.
+"""Starts of both subpaths: time, wavelengths, endpoint, first edge, partial sums.
 
-What a subpath carries from there on is a `walk.Walk`; what stays the same along it a `walk.Side`.
+The state of a subpath is a `walk.Walk`; what is constant along it a `walk.Side`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .walk import Side, Walk, not_finite
 
 @dataclass
 class CameraSample:
-    """A camera sample: its start, random numbers and sample of the lens; ``covered``: mask, it exists."""
+    """A camera sample: start, random numbers, lens sample; ``covered``: it exists."""
 
     start: CameraStart
     stream: Stream
@@ -31,7 +31,7 @@ class CameraSample:
 
 
 def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
-    """Time and wavelengths of the subpaths of a lane, whose light subpath has this ``index``."""
+    """Time and wavelengths of a lane's subpaths; ``index`` of its light subpath."""
     sensor, points = kernel.camera.sensor, kernel.points
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -53,7 +53,7 @@ def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
 
 
 def emission(kernel: Kernel, stream, shared):
-    """y_0 and the first direction, an `emitters.Emission`."""
+    """Sample y_0 and the first direction, an `emitters.Emission`."""
     points = kernel.points
     e = kernel.emitters.sample_emission(
         points.draw_2d("light", stream, Purpose.EMISSION_POINT),
@@ -68,7 +68,7 @@ def emission(kernel: Kernel, stream, shared):
 
 
 def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
-    """A light subpath on its first edge; ``merges``: whether its weights contain merges at its vertices."""
+    """A light subpath on its first edge; ``merges``: its weights include merges."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
@@ -76,7 +76,7 @@ def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
     inverse_pdf = dr.rcp(e.pdf_first * e.pdf_second)
     ray = rays.spawn(e.anchor, e.d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    # s = 0 is an older alternative, that of making y_0 by a hit.
+    # s = 0, which samples y_0 by a hit, is an older alternative.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))
     edge = None
@@ -88,7 +88,7 @@ def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
 
 
 def light_side(kernel: Kernel, e, stream, shared, walk, guide=None) -> Side:
-    """What stays the same along a light subpath; ``guide`` see `Side`."""
+    """The `Side` of a light subpath."""
     return Side(
         "light",
         shared,
@@ -106,7 +106,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk, guide=None) -> Side:
 
 
 def camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> CameraSample:
-    """z_0 and the first direction."""
+    """Sample z_0 and the first direction."""
     points = kernel.points
     stream = points.stream("camera", place.index(slot))
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
@@ -135,7 +135,7 @@ def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
 
 
 def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False, guide=None) -> Side:
-    """What stays the same along a camera subpath; ``alpha`` and ``guide`` see `Side`."""
+    """The `Side` of a camera subpath."""
 
     def choose_emitter(z):
         return techniques.choose_emitter(kernel, z, sample.stream)
@@ -158,7 +158,7 @@ def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False,
 
 
 def _first_partial(kernel: Kernel, start):
-    """Partial sums of a camera subpath's first edge: t = 1 is its newest alternative, t = 0 an older one."""
+    """Partial sums of a camera subpath's first edge: t = 1 is newest, t = 0 older."""
     h = kernel.heuristic
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
@@ -167,13 +167,13 @@ def _first_partial(kernel: Kernel, start):
 
 
 def _no_merges(kernel: Kernel, asked: bool):
-    """``d_vm`` of a subpath that begins; the number 0 where it is not used, or not ``asked`` for."""
+    """Initial ``d_vm``; the number 0 where unused."""
     used = kernel.merging is not None or kernel.guide is not None
     return kernel.heuristic.zero() if asked and used else 0
 
 
 def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
-    """The first edge of a subpath in a scene with media, along ``ray``, which starts in ``medium``."""
+    """The first edge of a subpath along ``ray`` from ``medium``, in scenes with media."""
     points = kernel.points
 
     def u_channel():

@@ -1,9 +1,8 @@
-"""One function per class of strategies: the path it builds, its contribution and its weight.
+"""One function per class of strategies: its path, contribution and weight.
 
-All return a `Contribution`: the full *unweighted* estimate f / p of the strategy, divided by the
-class's count, with the weight beside it; the two are multiplied in `Contribution.weighted` alone.
-Densities and cosines are geometric, throughputs contain everything up to and including the edge to
-the vertex. Equation numbers: Georgiev 2012, see `mis`.
+All return a `Contribution`: the *unweighted* estimate f / p divided by the class's count, and the weight;
+only `Contribution.weighted` multiplies the two. Densities and cosines are geometric; throughputs contain
+everything up to and including the edge to the vertex. Equation numbers: Georgiev 2012, see `mis`.
 """
 
 from __future__ import annotations
@@ -27,46 +26,46 @@ from .walk import Vertex, Walk, is_lit, newest_coefficient, where_lit
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
-    """Mask: the camera subpath has hit an emitter that may be seen."""
+    """Mask: the camera subpath has hit a visible emitter."""
     active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
     if z.volume is not None:
         active &= ~z.volume
         if kernel.plan.hide_emitters:  # as in `volpath`
             active &= z.seen
-    elif kernel.plan.hide_emitters:  # as in `path`: the surroundings are behind null surfaces too
+    elif kernel.plan.hide_emitters:  # as in `path`: the environment is behind null surfaces too
         active &= z.hit | z.seen
     return active
 
 
 def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution:
-    """s = 0: the camera subpath has hit an emitter (eqs. 42, 43), or one that was ``guided`` there."""
+    """s = 0, or ``guided`` s = 0: the subpath has hit an emitter (eqs. 42, 43)."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
     active = sees_emitter(kernel, z)
     radiance = emitters.emitted(z.si, active)
     active &= ~spectra.is_zero(radiance)
-    # Area measure; of what is in the surroundings solid angle, and disk area: `Emitters.hit_densities`.
+    # Area measure; for the environment solid angle and disk area, see `Emitters.hit_densities`.
     pdf_connect, pdf_first, pdf_second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
     endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
-    if kernel.camera.parallel:  # (1,1) would need just this direction
+    if kernel.camera.parallel:  # (1,1) would need exactly this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
     direct = where_lit(kernel, kernel.kappa.direct, None if z.edge is None else z.edge.lit)
     newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
     older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
-    if kernel.plan.arrival:  # straight from infinity past all shapes no light subpath comes
+    if kernel.plan.arrival:  # no light subpath comes straight from infinity past all shapes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
     )
-    if kernel.merging is not None:  # on paths whose last edge is not joined either
+    if kernel.merging is not None:  # on paths whose last edge is not connected either
         emitted = kernel.merging.aim.density_at(z.hit, z.si.p, dr.normalize(z.previous - z.si.p), pdf_second)
         merges = h.scale(z.partial.d_vm, pdf_first * emitted)
         joined = mis.is_joined(z.partial, newest)
         camera_side = h.combine(camera_side, dr.select(joined, 0, merges))
     light_side = 0
-    if z.guided is not None:  # the other of the two ways to make this path with s = 0
+    if z.guided is not None:  # the alternative of unguided or guided s = 0
         joined = mis.is_joined(z.partial, newest)
         other = h.scale(dr.select(joined, 0, z.guided), kernel.kappa.hit)
         if kernel.without_isolated:
@@ -83,7 +82,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
 
 
 def _known(value, *pdfs):
-    """``value``, NaN where one of the ``pdfs`` of other strategies is not finite: no weight follows."""
+    """``value``, NaN where a density of another strategy is non-finite."""
     finite = mi.Bool(True)
     for pdf in pdfs:
         finite &= dr.isfinite(pdf)
@@ -93,7 +92,7 @@ def _known(value, *pdfs):
 def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, bsdf.Target]:
     """Sample an emitter for the camera vertex ``z``.
 
-    Returns an `emitters.Direct` and the `bsdf.Target` in which it lies.
+    Returns an `emitters.Direct` and its `bsdf.Target`.
     """
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
     if (lit := is_lit(kernel, z)) is not None:
@@ -104,7 +103,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
 
 
 def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
-    """s = 1: a camera vertex joined with the emitter point that `choose_emitter` sampled (eqs. 44, 45)."""
+    """s = 1: connect a camera vertex with a sampled emitter point (eqs. 44, 45)."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
     value = z.throughput * f.value * e.weight
@@ -141,7 +140,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
 
 
 def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
-    """(1,1): a sampled emitter point seen directly by the sensor."""
+    """(1,1): connect a sampled emitter point with the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
     join = kernel.camera.join(emission.si.p, *u)
@@ -157,7 +156,7 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
     geometry = cos / join.dist2
     value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
     active &= ~spectra.is_zero(value)
-    # s = 0: the camera hits the same point.
+    # s = 0: the camera subpath hits the same point.
     ratio = join.pdf_w * geometry / emission.pdf_first
     light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
     camera_side = 0
@@ -170,11 +169,11 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
     weight, shares = h.weigh(*sides)
 
     ray = rays.segment(emission.anchor, join.anchor, emission.si)
-    if kernel.space is not None:  # the sensor knows its medium in every direction
+    if kernel.space is not None:  # the sensor's medium is known in every direction
         ray = rays.segment(join.anchor, emission.anchor, emission.si)
-    # From the sensor into the distance, for light from infinity.
+    # From the sensor towards infinity, for light from infinity.
     away = rays.spawn(join.anchor, -join.d, emission.si)
-    away.maxt = join.reach  # camera rays see the surroundings behind the far plane
+    away.maxt = join.reach  # camera rays see the environment behind the far plane
     ray = dr.select(emission.infinite, away, ray)
     counted = Counters(shadow_t1=one(active))
     ends = mi.UInt32(1), mi.UInt32(1)
@@ -184,9 +183,9 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoin, bsdf.Target]:
-    """Join the light vertex ``y`` with the sensor.
+    """Sample a connection of the light vertex ``y`` with the sensor.
 
-    Returns what `Sensor.join` does, and the `bsdf.Target` in which that lies.
+    Returns the result of `Sensor.join` and its `bsdf.Target`.
     """
     active = y.hit & y.connectible() & (y.edges <= kernel.last_splat)
     join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.event))
@@ -199,7 +198,7 @@ def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoi
 
 
 def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
-    """t = 1: a light vertex joined with the sensor as `look_at_sensor` says (eqs. 46, 47)."""
+    """t = 1: connect a light vertex with `look_at_sensor`'s point (eqs. 46, 47)."""
     h, join, f = kernel.heuristic, y.endpoint, y.f
     to_area = y.cosine(join.d) / join.dist2
     estimate = polarization.extended(y.throughput, f.value, adjoint=True) * (join.importance / join.dist2)
@@ -225,15 +224,15 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     return seen(kernel, c, sight.numbered(kernel, stream, y.event))
 
 
-# Of distances, relative.
+# Relative rounding error of distances.
 _ROUNDING = 1e-4
 
 
 def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     """t = 0: the last edge of a light subpath hits the sensor.
 
-    ``walk`` before it arrived at ``y``. The vertex at the sensor takes the place of ``y``, whose densities
-    are those of the scene's surface behind.
+    ``walk`` as before its arrival at ``y``. The vertex on the sensor replaces ``y``, whose densities are
+    those of the scene's surface behind it.
     """
     h = kernel.heuristic
     directly = walk.edges == 1
@@ -250,14 +249,14 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     value = throughput * (z.importance * dr.rcp(kernel.count_light))
     active &= ~spectra.is_zero(value)
 
-    # (1,1) makes y_0 by emission, not by next-event estimation from z_0, and cannot make that of a beam.
+    # (1,1) samples y_0 by emission, not by next-event estimation from z_0, and cannot sample a beam's.
     completing = dr.select(emission.beam, 0, emission.pdf_first)
     before = replace(walk.partial, d_vcm=h.scale(walk.partial.d_vcm, dr.select(directly, completing, 1)))
     dist2 = dr.select(directly & emission.infinite, 1, z.dist2)
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
-    if walk.isolated is not None:  # merges or guided s = 0, on paths whose last edge is not joined either
+    if walk.isolated is not None:  # merges or guided s = 0, on paths whose last edge is not connected either
         merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
         if kernel.merging is not None:
             merges = h.scale(merges, kernel.merging.aim.density(emission) / emission.pdf_second)
@@ -271,7 +270,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
 
 
 def _reaching(walk: Walk, y: Vertex):
-    """``walk`` for `Sensor.hit`: in scenes with media its edge ends where ``y`` lies."""
+    """``walk`` for `Sensor.hit`: in scenes with media its edge ends at ``y``."""
     if y.landing is None:
         return walk
     return replace(walk, pi=_End(y.hit, dr.norm(y.si.p - walk.previous)))
@@ -279,7 +278,7 @@ def _reaching(walk: Walk, y: Vertex):
 
 @dataclass
 class _End:
-    """Where an edge ends, as `Sensor.hit` asks for it: whether, and the distance from the vertex before."""
+    """End of an edge for `Sensor.hit`: validity, and distance from the vertex before."""
 
     hit: mi.Bool
     t: mi.Float
@@ -289,9 +288,9 @@ class _End:
 
 
 def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active):
-    """Whether the sensor lies on the part of the edge that ``walk`` follows now, and its optical depth.
+    """Whether the sensor lies between ``walk.o`` and ``y``, and its optical depth.
 
-    That is between ``walk.o`` and ``y`` (rounding aside, which may be the sensor's own surface).
+    Up to rounding: ``y`` may be on the sensor's own surface.
     """
     distance = dr.sqrt(z.dist2) - z.near
     length = distance - dr.norm(walk.o - walk.previous)
@@ -302,14 +301,14 @@ def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active)
 
 
 def _hidden(kernel: Kernel, ray: mi.Ray3f, active):
-    """Mask: a surface is in the way of ``ray``."""
+    """Mask: a surface blocks ``ray``."""
     if kernel.space is None:
         return rays.occluded(kernel.scene, ray, active)
     return ~transmittance.between(kernel.space, ray, kernel.sensor_medium, active, None, mi.UInt32(0)).clear
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):
-    """The random points with which the light vertex ``edges`` is joined with the sensor."""
+    """Random points of the connection of light vertex ``edges`` with the sensor."""
     u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, edges)
     if not kernel.camera.needs_film_sample:
         return u_lens, None

@@ -1,4 +1,4 @@
-"""Whether a strategy's two ends see each other, and what passes between them."""
+"""Visibility and transmittance between the ends of a connection."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..sampling.points import Purpose, Stream
 from .contribution import Contribution, Counters
 from .inputs import Kernel
 
-# Optical depth up to which a join's transmittance is guessed before its ray is traced, from the medium that
-# it starts in: a join that in truth passes through less is drawn e^2 times too rarely at most.
+# Largest optical depth of a connection's approximate transmittance, in the medium that it starts in:
+# connections of less actual depth are drawn at most e^2 times too rarely.
 _GUESSED_DEPTH = 2.0
 
 
 @dataclass
 class Sight:
-    """The visibility ``ray`` of a join and what it ends at (`rays.Own` or None).
+    """The shadow ``ray`` of a connection and its end (`rays.Own` or None).
 
-    In scenes with media also the number of the ``medium`` in which the ray starts, and the ``word`` of its
-    random numbers; ``hidden``: emitters do not block it.
+    With media also the index of the ``medium`` in which the ray starts, and the first ``word`` of its random
+    numbers; ``hidden``: emitters do not block it.
     """
 
     ray: mi.Ray3f
@@ -33,14 +33,14 @@ class Sight:
     hidden: bool = False
 
     def numbered(self, kernel: Kernel, stream: Stream, event: mi.UInt32, number=0) -> Sight:
-        """With random numbers of the ``number``-th join at a vertex, whose ``event`` names them."""
+        """With random numbers of connection ``number`` at the vertex of ``event``."""
         if kernel.space is None or not kernel.space.media.grids:
             return replace(self, word=mi.UInt32(0))
         return replace(self, word=kernel.points.series(stream, Purpose.TRACKING, event, 1 + number))
 
 
 def seen(kernel: Kernel, c: Contribution, sight: Sight) -> Contribution:
-    """``c``, active where nothing blocks it; in media times the transmittance, and weighted with its T~."""
+    """Deactivate ``c`` if blocked; in media apply transmittance, and T~ in the weight."""
     if kernel.space is None:
         return replace(c, active=c.active & ~_blocked(kernel, sight, c.active))
     crossing = transmittance.between(
@@ -65,7 +65,7 @@ def _blocked(kernel: Kernel, sight: Sight, active):
 
 
 def guessed(kernel: Kernel, medium: mi.UInt32 | None, distance: mi.Float) -> mi.Float:
-    """A guess of the transmittance over a ``distance`` from a point in ``medium``, for draws."""
+    """Approximate transmittance over ``distance`` in ``medium``, for draws."""
     if kernel.space is None:
         return mi.Float(1)
     return dr.exp(-dr.minimum(kernel.space.media.mean(medium) * distance, _GUESSED_DEPTH))

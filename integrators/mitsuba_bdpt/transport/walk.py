@@ -1,7 +1,7 @@
-"""One random walk for both subpaths; which side it serves is data.
+"""One random walk for both subpaths; their differences are data (`Side`).
 
-A walk knows no strategy: at each vertex it calls ``visit``, which may build paths from it.
-Vertices are numbered as in the field: y_0 / z_0 is the endpoint, ``edges`` the index of the vertex.
+A walk has no strategies: at each vertex it calls ``visit``, which may connect it. y_0 / z_0 is the endpoint,
+``edges`` the index of a vertex.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from .mis import choose
 class Walk:
     """State of a subpath between two vertices.
 
-    ``pi`` the next hit, ``o`` and ``d`` of the ray that finds it; ``previous`` position of the last vertex
-    (for a camera subpath the pinhole or lens point, not the near plane where the ray starts);
-    ``throughput`` f cos / pdf, the edge to the next vertex included; ``partial`` partial sums in the
-    measure before that edge; ``eta`` product of relative indices of refraction (1 where nothing
-    refracts); ``edges`` number of edges up to the next vertex; ``seen``: an event other than null
-    happened; ``broken``: it ended for want of a finite throughput or shading frame; ``edge`` what it carries
-    along an edge in scenes with media, else None; ``isolated``: none of its edges is joined by a strategy in
-    use, see `merging` (None where vertices are neither merged nor s = 0 guided). Where s = 0 is guided (see
-    `guided_hits`), camera subpaths have in ``guided`` the other density of their last direction that was not
-    delta over its own, and light subpaths in ``only_delta`` whether all their events were delta.
+    * ``pi``: the next hit; ``o``, ``d`` of its ray; ``previous``: position of the last vertex (of a camera
+      subpath the lens point or pinhole, not the near plane); ``edges`` up to the next vertex.
+    * ``throughput`` f cos / pdf, including the edge to the next vertex; ``partial``: partial sums before that
+      edge; ``eta``: product of relative indices of refraction (1 if nothing refracts).
+    * ``seen``: a non-null event happened; ``broken``: ended by a non-finite throughput or shading frame;
+      ``edge``: its state along an edge, None without media.
+    * ``isolated``: no edge is connected by a strategy in use, see `merging` (None without merging and
+      guiding).
+    * With guiding (`guided_hits`): ``guided``, on camera subpaths, the other density of the last non-delta
+      direction over its own; ``only_delta``, on light subpaths: all events were delta.
 
-    What stays the same along a subpath is in `Side`: Dr.Jit records a loop twice whose state holds it.
+    Constants along a subpath are in `Side`: Dr.Jit records a loop twice if its state contains them.
     """
 
     pi: mi.PreliminaryIntersection3f
@@ -80,15 +80,15 @@ class Walk:
 
     @property
     def event(self) -> mi.UInt32:
-        """What names the random numbers of its next event: with media null events are counted too."""
+        """Index of the random numbers of its next event; with media includes null events."""
         return self.edges if self.edge is None else self.edge.event
 
     def traced(self) -> mi.UInt32:
-        """Closest-hit rays of a walk that has ended: its last step counts an edge but traces no ray."""
+        """Closest-hit rays of an ended walk, whose last step traces no ray."""
         return dr.maximum(self.edges if self.edge is None else self.edge.rays, 2) - 1
 
     def counted(self, active: mi.Bool) -> Counters:
-        """What the edges of a walk that has ended count, in lanes that were ``active`` at its start."""
+        """Counters of the edges of an ended walk, in lanes ``active`` at its start."""
         if self.edge is None:
             return Counters()
         segments, collisions = dr.select(active, self.traced(), 0), self.edge.collisions
@@ -101,11 +101,11 @@ class Walk:
 class Vertex:
     """A vertex that a walk has reached.
 
-    ``partial`` is in the area measure (camera subpaths that left the scene: solid angle). ``cos`` absolute
-    geometric cosine of the edge to it; ``anchor`` starts rays; ``hit`` is false in the surroundings;
-    ``endpoint`` with which it is to be joined and ``f`` the BSDF towards it (a `bsdf.Evaluation`), where
-    ``endpoint_active``, see `Side`; ``event`` names its random numbers. In scenes with media ``volume`` tells
-    whether it lies in one, ``landing`` how its edge ended; else they are None.
+    ``partial``: in the area measure (camera subpaths that left the scene: solid angle); ``cos``: absolute
+    geometric cosine of the edge to it; ``anchor``: starts rays; ``hit``: false in the environment;
+    ``endpoint`` of its connection and the BSDF ``f`` towards it (a `bsdf.Evaluation`), where
+    ``endpoint_active``, see `Side`; ``event``: index of its random numbers. In scenes with media ``volume``:
+    mask, in a medium; ``landing``: end of its edge; else None.
     """
 
     si: mi.SurfaceInteraction3f
@@ -122,17 +122,17 @@ class Vertex:
     event: mi.UInt32
     volume: mi.Bool | None = None
     landing: Any = None  # a `flight.Landing`
-    # Set where there is a `Side.join`, and nowhere else asked for: what it returns, and an `Evaluation`.
+    # Set with a `Side.join`: its result, and an `Evaluation`.
     endpoint: Any = None
     endpoint_active: Any = None
     f: Any = None
-    # Set where s = 0 is guided: `Walk.guided` on arrival, and a `guided_hits.Advice`.
+    # Set with guiding: `Walk.guided` on arrival, and a `guided_hits.Advice`.
     guided: Any = None
     advice: Any = None
 
     @property
     def edge(self) -> Any:
-        """The edge to it as it arrives, None in scenes without media."""
+        """Its incident edge; None in scenes without media."""
         return None if self.landing is None else self.landing.edge
 
     def cosine(self, d: mi.Vector3f) -> mi.Float:
@@ -140,17 +140,17 @@ class Vertex:
         return volume_cosine(self.si, d, self.volume)
 
     def connectible(self):
-        """Mask: its distribution of directions is not a delta distribution alone."""
+        """Mask: its distribution of directions is not purely delta."""
         of_surface = bsdf.connectible(self.bsdf)
         return of_surface if self.volume is None else of_surface | self.volume
 
     @property
     def medium(self) -> Any:
-        """The number of the medium in which it was reached."""
+        """Index of the medium of its incident edge."""
         return self.edge.medium
 
     def medium_towards(self, kernel: Kernel, d: mi.Vector3f) -> mi.UInt32 | None:
-        """The number of the medium in which ``d`` leaves it; None in scenes without media."""
+        """Index of the medium in direction ``d``; None in scenes without media."""
         if self.landing is None:
             return None
         beyond = kernel.space.media.number(self.si.target_medium(d))
@@ -158,26 +158,26 @@ class Vertex:
 
 
 def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool | None) -> mi.Float:
-    """D of the geometry term: the absolute geometric cosine of ``d``, 1 where ``volume`` holds."""
+    """Factor D of the geometry term: absolute geometric cosine, 1 in a ``volume``."""
     cos = dr.abs(dr.dot(si.n, d))
     return cos if volume is None else dr.select(volume, 1, cos)
 
 
 @dataclass(frozen=True)
 class Side:
-    """What distinguishes the two kinds of subpath, and what stays the same along one.
+    """Constants of a subpath, which distinguish the two kinds.
 
-    ``shared`` has its time and wavelengths, roulette compares the throughput with ``reference``.
+    ``shared``: time and wavelengths; ``reference``: throughput that roulette compares with; ``adjoint``:
+    light travels with the walk; ``coefficient``: kappa of the class of the newest alternative at vertex 1
+    (next-event estimation on the light side, t = 1 on the camera side); ``alpha``: the film needs to know
+    whether a non-null event happened; ``parallel``: the first edge has one direction, with density one across
+    it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false. Functions:
 
-    ``adjoint``: light travels with the walk. ``coefficient``: kappa of the class to which the newest
-    alternative at vertex 1 belongs (next-event estimation on the light side, t = 1 on the camera side).
-    ``complete``: called with the first vertex of a light subpath, returns the density of next-event
-    estimation that completes ``d_vcm`` there. ``alpha``: the film asks whether an event other than null
-    happened. ``parallel``: the first edge has one direction, its density is one across it. ``join``: called
-    with each vertex, returns the endpoint of the other side with which it is to be joined (`emitters.Direct`,
-    or what `Sensor.join` returns) and the `bsdf.Target` in which that lies; None where no strategy does so.
-    ``isolated``, ``only_delta``: the subpath ends as soon as it is not, see `Walk`. ``guide``: called with
-    each vertex, the walk before it and the step after it, returns its `guided_hits.Advice`.
+    * ``complete``, of the first vertex of a light subpath: density of next-event estimation that completes
+      ``d_vcm``.
+    * ``join``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
+      `Sensor.join`) and its `bsdf.Target`; None if no strategy does so.
+    * ``guide``, of each vertex, the walk before it and the step after it: its `guided_hits.Advice`.
     """
 
     name: str
@@ -196,9 +196,9 @@ class Side:
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
-    """The walk's gate. Mask: active subpaths that end because ``throughput`` or a direction is not finite.
+    """Mask: active subpaths that end with a non-finite ``throughput`` or direction.
 
-    Whatever finds a density from which no weight follows makes the throughput NaN (`bsdf._step`, `_vertex`).
+    Densities from which no weight follows make the throughput NaN (`bsdf._step`, `_vertex`).
     """
     finite = spectra.is_finite(throughput)
     for direction in directions:
@@ -208,16 +208,16 @@ def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3
 
 @dr.syntax
 def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
-    """Follow ``walk`` to its end; returns ``state`` and the walk as it ended.
+    """Follow ``walk`` to its end; returns ``state`` and the ended walk.
 
-    ``visit(vertex, state, walk)`` returns the new state; ``walk`` as it was before it arrived.
+    ``visit(vertex, state, walk)`` returns the new state; ``walk`` as before its arrival.
     """
     kernel.observer.started(kernel, side, walk, stream)
     while dr.hint(
         walk.active,
-        # Dr.Jit's kernel cache does not tell sizes of local memory apart; the label does.
+        # Dr.Jit's kernel cache does not distinguish sizes of local memory; the label does.
         label=f"{side.name} subpath, {kernel.store_size} stored",
-        exclude=[kernel, side, stream, visit],  # what stays the same, see `Walk`
+        exclude=[kernel, side, stream, visit],  # constants, see `Walk`
     ):
         vertex = _vertex(kernel, side, walk, stream)
         step = _interact(kernel, side, walk, vertex, stream)
@@ -228,27 +228,27 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
 
 
 def is_lit(kernel: Kernel, vertex):
-    """Mask: next-event estimation is allowed at ``vertex``; None where it is everywhere."""
+    """Mask: next-event estimation is allowed at ``vertex``; None if everywhere."""
     if kernel.space is None or kernel.space.media.all_lit:
         return None
     return ~vertex.volume | kernel.space.media.is_lit(vertex.medium)
 
 
 def where_lit(kernel: Kernel, direct: mis.Coefficient, lit) -> mis.Coefficient:
-    """The coefficient ``direct`` of next-event estimation where it is allowed, see `is_lit`; else 0."""
+    """Coefficient of next-event estimation where it is allowed (`is_lit`), else 0."""
     return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
 
 
 def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
-    """kappa of the newest alternative's class at vertex ``edges``, for all s >= 1.
+    """kappa of the newest alternative's class at vertex ``edges``, for s >= 1.
 
-    s = 0 differs, see `techniques.hit_emitter`. ``first`` is that at vertex 1, see `Side`.
+    s = 0 differs, see `techniques.hit_emitter`. ``first``: kappa at vertex 1, see `Side`.
     """
     return choose(edges == 1, first, kernel.kappa.inner)
 
 
 def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
-    """The vertex at the end of the walk's edge; densities go over to the area measure."""
+    """The vertex at the end of the edge; converts densities to the area measure."""
     h = kernel.heuristic
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
     landing = tr = volume = None
@@ -268,7 +268,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     if side.complete is not None:
         first = hit & (walk.edges == 1)
         pdf_connect = dr.select(first, side.complete(si, first), 1)
-        # No weight follows from such a density.
+        # No weight follows from a non-finite density.
         throughput = dr.select(dr.isfinite(pdf_connect), throughput, dr.nan)
         partial = replace(partial, d_vcm=h.scale(partial.d_vcm, pdf_connect))
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
@@ -278,7 +278,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     hit &= cos > 0
     in_area = mis.to_area(h, partial, dist2, cos, tr)
     d_vcm = partial.d_vcm
-    if tr is not None:  # the surroundings are a strategy's other end too
+    if tr is not None:  # the environment is also the other end of a strategy
         d_vcm = h.scale(d_vcm, dr.rcp(tr))
     partial = mis.Partial(
         choose(hit, in_area.d_vcm, d_vcm),
@@ -310,7 +310,7 @@ def _anchor(kernel: Kernel, si, ray, volume: mi.Bool | None) -> rays.Anchor:
 
 
 def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream) -> flight.Landing:
-    """Where the walk's edge ends in a scene with media."""
+    """End of the walk's edge in a scene with media."""
     start = flight.Landing(walk.o, walk.pi, mi.Float(0), mi.Bool(False), walk.edge, walk.throughput)
     word = kernel.points.series(stream, Purpose.TRACKING, walk.event)
     hidden = None
@@ -320,7 +320,7 @@ def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream) -> flight.Land
 
 
 def _landed(landing: flight.Landing, ray, active) -> mi.SurfaceInteraction3f:
-    """The surface at the end of an edge, or a point in the medium as one without normal and shape."""
+    """The surface at the end of an edge; in a medium a point without normal and shape."""
     si = landing.pi.compute_surface_interaction(ray, renamed.hit_flags(), active & ~landing.collided)
     point = dr.zeros(mi.SurfaceInteraction3f)
     point.p, point.t, point.time, point.wavelengths = ray(landing.t), landing.t, ray.time, ray.wavelengths
@@ -329,8 +329,8 @@ def _landed(landing: flight.Landing, ray, active) -> mi.SurfaceInteraction3f:
 
 
 def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
-    """Sample the direction of the next edge, and put into ``vertex`` what joins it with an endpoint."""
-    if not kernel.scatters:  # a virtual call needs somebody to call
+    """Sample the next direction, and connect ``vertex`` with an endpoint."""
+    if not kernel.scatters:  # a virtual call needs a target
         return None
     points = kernel.points
     target = None
@@ -351,10 +351,11 @@ def _goes_on(side: Side, walk: Walk, vertex: Vertex):
 
 
 def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
-    """`path` samples at the last vertex too: alpha is 1 unless that event is null.
+    """Whether to sample at this vertex.
 
-    In scenes with media null events are no edges, so that subpaths go on after them. `volpath` has alpha 1
-    where something in a medium may scatter again.
+    `path` samples at the last vertex too: alpha is 1 unless that event is null. With media null events are no
+    edges, so that subpaths go on after them; `volpath` has alpha 1 where something in a medium may scatter
+    again.
     """
     if vertex.volume is not None:
         return vertex.hit & (~vertex.volume | (walk.edges < side.last_edge))
@@ -382,7 +383,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
     eta = walk.eta * step.eta if kernel.refracts else 1
     brightest = spectra.brightest(throughput)
-    # To BSDFs a shading frame that is not finite (vertex normals) is a wrong side, which is black.
+    # BSDFs take a non-finite shading frame (vertex normals) for a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
     if side.isolated and isolated is not None:
@@ -391,7 +392,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         active &= step.delta
     if walk.only_delta is not None:
         only_delta = walk.only_delta & step.delta
-    # Roulette as in `path`; the weights ignore it (it is not part of any density).
+    # Roulette as in `path`; weights ignore it.
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
     # In scenes with media as in `volpath`.
@@ -425,7 +426,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
 def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, isolated):
     """The `mis.Merge` at ``vertex``; ``isolated``: `Walk.isolated` after its event.
 
-    Where s = 0 is guided, on light subpaths what stands for it: the density of the direction they came from.
+    With guiding, on light subpaths its equivalent: the density of the direction they came from.
     """
     if mis.is_absent(walk.partial.d_vm):
         return None
@@ -435,14 +436,14 @@ def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, isolated):
 
 
 def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
-    """`Walk.isolated` after the event at ``vertex``; ``coefficient`` of what joins the edge to it."""
+    """`Walk.isolated` after the event; ``coefficient``: class that connects the edge."""
     if walk.isolated is None:
         return None
     return walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
 
 
 def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
-    """`Walk.guided` after the event at ``vertex``: delta events are made alike whatever led to them."""
+    """`Walk.guided` after the event at ``vertex``; delta events do not change it."""
     if walk.guided is None or vertex.advice is None:  # guided subpaths follow delta events only
         return walk.guided
     other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
@@ -450,10 +451,10 @@ def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
 
 
 def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
-    """Mask: an SDS path may have its diffuse ``vertex`` here, if the other subpath ends likewise.
+    """Mask: the diffuse ``vertex`` of an SDS path, if the other subpath matches.
 
-    No edge up to the vertex is connected by a strategy in use, its event is not delta, and the path may have
-    a further edge. ``first`` as of `newest_coefficient`; ``walk`` as it was before it arrived.
+    No edge up to it is connected by a strategy in use, its event is not delta, and the path may have a
+    further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
     """
     joined = mis.is_joined(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
     possible = vertex.hit & vertex.connectible() & ~joined & (vertex.edges < kernel.max_depth)
@@ -461,7 +462,7 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Ve
 
 
 def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:
-    """``walk`` on its next edge, along ``ray``; null events (``passes``, or None) are no edges."""
+    """``walk`` on its next edge along ``ray``; null events, ``passes``, are no edges."""
     return replace(
         walk,
         pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=walk.active),
@@ -471,7 +472,7 @@ def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:
 
 
 def _past_null(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, after: Walk, passes, stream):
-    """``after`` in a scene with media, and its ray: where it ``passes``, the edge goes on."""
+    """``after`` and its ray, with media; the edge goes on where it ``passes``."""
     medium = vertex.medium_towards(kernel, after.d)
     u = kernel.points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
     edge = vertex.edge.onwards(passes, vertex.landing.t, medium, is_lit(kernel, vertex), u)

@@ -1,7 +1,7 @@
-"""Photons: light subpaths traced before the samples and kept in memory, and what is done with them.
+"""Photons: stored vertices of light subpaths traced before the samples.
 
-`photon_pass` traces them. `merging` merges camera vertices with them (vertex merging, photon mapping), within
-`merge_radius`. `photon_guide` makes of them a density of directions, from which `guided_hits` samples
-(photon-guided BSDF sampling); `guiding_benefit` predicts what that gains. `aim` chooses their first
-directions. All of them serve SDS paths: specular-diffuse-specular paths, which no connection can make.
+`photon_pass` traces them. `merging` merges camera vertices with them (vertex merging, photon mapping) within
+`merge_radius`. `photon_guide` builds a density of directions from them, from which `guided_hits` samples
+(photon-guided BSDF sampling); `guiding_benefit` predicts the gain. `aim` samples their first directions. All
+serve SDS paths (specular-diffuse-specular), which no connection can sample.
 """

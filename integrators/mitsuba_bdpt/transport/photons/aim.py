@@ -1,12 +1,10 @@
-"""First directions of photon subpaths: half of them are aimed at shapes with delta lobes.
+"""First directions of photon subpaths: half of them are aimed at delta surfaces.
 
-Most SDS paths begin with delta events, and an emitter's own density samples few directions towards a small
-shape of glass. So half of the first directions are uniform in cones about bounding spheres of the shapes with
-delta lobes (over the whole sphere of directions from within one). The density is that of the mixture. Light
-from infinity is not aimed: the disks from which it is emitted cover details by themselves (`emitters.disks`).
-Uniform environments emit no photons: s = 0 samples their light well.
-
-Light subpaths are not aimed: merges are the only strategy with `Aim.density` in place of the emitter's.
+Most SDS paths begin with delta events, but an emitter's own density samples few directions towards a small
+shape of glass. Half of the first directions are uniform in cones about bounding spheres of the shapes with
+delta lobes (over all directions from within one); the density is that of the mixture. Light from infinity is
+not aimed: its emission disks cover details (`emitters.disks`). Uniform environments emit no photons: s = 0
+samples their light well. Light subpaths are not aimed: only merges use `Aim.density`, not the emitter's.
 """
 
 from __future__ import annotations
@@ -40,11 +38,11 @@ class Sphere:
     radius: mi.Float
 
     def cone(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
-        """The cone from ``p``: its axis, and 1 - cos of its half angle; 2 from within the sphere."""
+        """The cone from ``p``: axis, and 1 - cos of its half angle (2 inside the sphere)."""
         between = self.center - p
         dist2 = dr.squared_norm(between)
         sin2 = dr.square(self.radius) / dist2
-        # Small angles have no digits in 1 - cos.
+        # 1 - cos of small angles would cancel.
         width = dr.select(sin2 < 1, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2)
         axis = dr.select(dist2 > 0, mi.Vector3f(between) * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
         return axis, width
@@ -98,7 +96,7 @@ class Aim:
         return dr.select(e.infinite & ~e.delta, 0, mixed) if self.no_sky else mixed
 
     def density_at(self, hit: mi.Bool, p, d, pdf_second: mi.Float) -> mi.Float:
-        """`density` at ``p``, a point that a camera subpath ``hit``, else the environment; ``d`` from it."""
+        """`density` at ``p`` in direction ``d``; the environment where not ``hit``."""
         return dr.select(hit, self._mixed(p, d, pdf_second), mi.Float(0) if self.no_sky else pdf_second)
 
     def _mixed(self, p, d, pdf_second, number=None):

@@ -1,13 +1,13 @@
-"""Photon-guided BSDF sampling: one more way to make SDS paths by hitting an emitter (s = 0).
+"""Photon-guided BSDF sampling: samples SDS paths by hitting an emitter (s = 0).
 
-An SDS path from an emitter with area is made by s = 0 and t = 0 alone, and by s = 0 only if a sampled
-direction happens to lead to the emitter by delta events. At the path's diffuse vertex z, the last whose event
-is not delta, a second direction is sampled from the density p_g of a `photon_guide.Guide`, and followed
-through delta events only. All densities but those of the direction cancel::
+Only s = 0 and t = 0 sample an SDS path from an emitter with area, and s = 0 only if a sampled direction
+happens to lead to the emitter by delta events. At the path's diffuse vertex z, the last whose event is not
+delta, a second direction is sampled from the density p_g of a `photon_guide.Guide` and followed through delta
+events only. All densities but those of the direction cancel::
 
     guided s = 0 over s = 0 = p_g / p_bsdf
 
-Both have a weight, which contains that ratio, and so does t = 0, which evaluates p_g at the same vertex: the
+The weights of both contain that ratio, and so does that of t = 0, which evaluates p_g at the same vertex: the
 first of the light subpath that is not delta.
 """
 
@@ -27,16 +27,16 @@ from ..inputs import Kernel
 from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
 from . import photon_guide
 
-# Seed by which random numbers of guided subpaths differ from those of the camera subpath they branch off.
+# Seed that separates random numbers of guided subpaths from those of their camera subpath.
 _SEED = 0x5BD1E995
 
 
 @dataclass
 class Advice:
-    """The guide at a vertex: ``active`` where s = 0 can be guided, ``found`` the index of its photons.
+    """The guide at a vertex: ``active`` where s = 0 can be guided.
 
-    ``other``: the guide's density of the walk's own direction (solid angle, times the number of guided
-    samples).
+    ``found``: index of its photons; ``other``: density of the walk's own direction by the guide (solid angle,
+    times the number of guided samples).
     """
 
     active: mi.Bool
@@ -45,13 +45,13 @@ class Advice:
 
 
 def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
-    """The random numbers of the guided subpath of this ``number`` at the vertex of this ``event``."""
+    """Random numbers of guided subpath ``number`` at the vertex of ``event``."""
     seed = sobol.mix(stream.seed ^ sobol.mix(_SEED + event) ^ number)
     return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED))
 
 
 def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """The guide at the camera vertex ``z``; ``walk`` as it was before it arrived."""
+    """The guide at the camera vertex ``z``; ``walk`` as before its arrival."""
     return _evaluated(kernel, z, z.si.to_world(step.wo), is_sds_vertex(kernel, kernel.kappa.splat, walk, z))
 
 
@@ -65,7 +65,7 @@ def look_back(kernel: Kernel, y: Vertex, walk: Walk, step) -> Advice:
 
 
 def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """Like `advise`, of a guide whose density of the walk's own direction is that of the BSDF."""
+    """Like `advise`, for a guide with the BSDF's density of the walk's direction."""
     possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
     return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
 
@@ -86,10 +86,10 @@ def _density(kernel: Kernel, p, found, d) -> mi.Float:
 
 
 def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
-    """Trace guided subpaths from ``z`` where the guide is active; returns the ``state`` after that.
+    """Trace guided subpaths from ``z`` where the guide is active.
 
-    ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and the counts of non-finite
-    values, `Counters.aimed` and `Counters.guided`.
+    ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and the numbers of non-finite
+    values, `Counters.aimed` and `Counters.guided`. Returns the new state.
     """
     return dr.if_stmt(
         (z, *state),
@@ -128,7 +128,7 @@ def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
     side = Side(
         "camera",
         shared,
-        spectra.brightest(walk.throughput),  # roulette compares the throughput with it
+        spectra.brightest(walk.throughput),  # reference of roulette
         False,
         kernel.max_depth,
         kernel.kappa.splat,

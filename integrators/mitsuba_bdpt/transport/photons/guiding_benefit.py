@@ -1,14 +1,14 @@
-"""Estimate of what photon-guided BSDF sampling gains: second moments of s = 0 on SDS paths, from photons.
+"""Predicts the gain of photon-guided BSDF sampling from photons.
 
-The samples of a pilot rarely hit an emitter behind glass, and each hit is a firefly. So the light that
-arrives at a camera vertex z where s = 0 can be guided (see `guided_hits`) is estimated by the photons in a
-disc of radius R about it, as in `merging`. With the throughput T of z, a photon's flux Phi, N photon subpaths
-and the estimate f / p_0 of s = 0 of the path through the photon::
+A pilot's samples rarely hit an emitter behind glass, and each hit is a firefly. So the light that arrives at
+a camera vertex z where s = 0 can be guided (see `guided_hits`) is estimated from the photons in a disc of
+radius R about it, as in `merging`. With the throughput T of z, a photon's flux Phi, N photon subpaths and the
+estimate f / p_0 of s = 0 of the path through the photon::
 
     second moment of s = 0          sum over photons of  T f / |n.d| Phi / (N pi R^2) * f / p_0
     the same with n guided samples  ... / (1 + n p_g / p_bsdf)
 
-The photons of the guide are independent of those that estimate.
+The photons of the guide are independent of those of the estimate.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ MOMENTS = 2 + len(GUIDED)
 
 @dataclass
 class Estimator:
-    """``photons`` that estimate, of ``count`` subpaths, and the ``guide`` whose benefit is estimated.
+    """``photons`` of ``count`` subpaths, and the ``guide`` whose benefit is estimated.
 
-    ``most``: estimates of s = 0 beyond ``most`` times the light that arrives are left out.
+    ``most``: estimates of s = 0 beyond ``most`` times the arriving light are dropped.
     """
 
     photons: Guide
@@ -65,7 +65,7 @@ def nothing() -> Found:
 
 
 def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, add):
-    """Trace the camera subpaths of a pilot along SDS paths, and evaluate the ``estimator`` at their vertices.
+    """Evaluate the ``estimator`` at the SDS vertices of a pilot's camera subpaths.
 
     ``add(lane, position, found)`` accumulates the sum of a lane's `Found`.
     """
@@ -88,7 +88,7 @@ def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, ad
 
 
 def estimate(kernel: Kernel, estimator: Estimator, z: Vertex, walk: Walk, stream: Stream) -> Found:
-    """Estimate the moments at the camera vertex ``z``; ``walk`` as it was before it arrived."""
+    """Estimate the moments at the camera vertex ``z``; ``walk`` as before its arrival."""
     possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
 
     def measure(z):
@@ -101,8 +101,7 @@ def estimate(kernel: Kernel, estimator: Estimator, z: Vertex, walk: Walk, stream
         cos = dr.abs(dr.dot(z.si.n, y.d))
         value = _mean(z.throughput * f.value * y.flux) / cos
         active &= (value > 0) & (f.pdf_fwd_w > 0) & dr.isfinite(value)
-        # Of all photons in the disc, which this one represents. In double precision: squares of radiance, in
-        # any unit, overflow or underflow in single.
+        # All photons in the disc, represented by the drawn one. Double precision: radiance is squared.
         arriving = mi.Float64(value / size_of(y.flux) * total / (estimator.count * dr.pi * dr.square(radius)))
         by_hit = mi.Float64(value / (y.older * f.pdf_fwd_w))
         by_hit = dr.select(by_hit <= estimator.most * arriving, by_hit, 0)
@@ -123,9 +122,9 @@ def _mean(colours: mi.Spectrum) -> mi.Float:
 
 @dr.syntax
 def _draw(photons: Guide, z: Vertex, place: mi.UInt32, word: mi.UInt32, most: mi.UInt32):
-    """Draw one of the photons near ``z`` with at most ``most`` edges, in proportion to its flux.
+    """Draw a photon near ``z`` with at most ``most`` edges, in proportion to its flux.
 
-    Returns its number in the window, the total flux, and R: the geometric mean of the window's distances.
+    Returns its index in the window, the total flux, and R: the geometric mean of the window's distances.
     """
     k, logs = mi.UInt32(0), mi.Float(0)
     while dr.hint(k < len(WINDOW), label="distances of a window", exclude=[photons, z, place]):

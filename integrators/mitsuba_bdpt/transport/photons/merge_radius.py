@@ -1,4 +1,4 @@
-"""How near to each other the vertices lie that are merged: a function of position alone."""
+"""The radius of vertex merging: a function of position alone."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from ...geometry.boxes import scene_box
 from ...geometry.rounding import OFFSET_ULPS, offset_at
 from ...host.introspection import world_matrix
 
-# Camera rays by which a scene is asked for the size of its pixels: so many columns and rows of them.
+# Columns and rows of camera rays that measure the size of pixels in the scene.
 _PROBES = 64
 
-# The radius is between these multiples of its median over what camera rays meet first.
+# Bounds of the radius in multiples of its median over the first hits of camera rays.
 _LOWEST, _HIGHEST = 1 / 8, 8
 
-# Without pixels to measure (meters, a sensor of one's own, nothing in view): of the scene's diagonal.
+# Radius in diagonals of the scene where no pixels can be measured (meters, custom sensors, empty views).
 _OF_DIAGONAL = 1 / 512
 
-# Radii of passes: that of the i-th over the first is i^((alpha - 1) / 2), with this alpha (C. Knaus and
-# M. Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
+# Exponent alpha: the radius of pass i is that of the first times i^((alpha - 1) / 2) (C. Knaus and M.
+# Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
 SHRINKING = 2 / 3
 
-# Most change of the radius per distance: the widths of cells allow for it (`merging.cell_at`).
+# Most change of the radius per distance, which the widths of cells allow for (`merging.cell_at`).
 _STEEPEST = 0.5
 
-# Most change of the rounding error of a position, the least radius, per distance.
+# Most change per distance of the rounding error of a position, the least radius.
 _STEEPEST_ROUNDING = OFFSET_ULPS * 2.0**-24
 
 
 @dataclass
 class Radius:
-    """``base`` + ``angle`` times the distance from ``centre``, between ``low`` and ``high`` (scene units).
+    """``base`` + ``angle`` * distance from ``centre``, within ``low`` and ``high``.
 
-    At least the rounding error of the position: smaller discs contain too few photons, or too many. All
-    opaque, so that passes of any radius are one kernel. Photons and camera vertices find the same at the same
-    place, or weights would not sum to 1.
+    In scene units; at least the rounding error of the position, since smaller discs contain too few photons,
+    or too many. Fields are opaque, so that passes share one kernel. A function of position only: otherwise
+    weights of photons and camera vertices would not sum to 1.
     """
 
     centre: mi.Point3f
@@ -61,7 +61,7 @@ class Radius:
 
 @dataclass(frozen=True)
 class Footprints:
-    """The size of pixels in a scene: ``base`` + ``angle`` times the distance from ``centre``; ``median``."""
+    """Size of pixels: ``base`` + ``angle`` times distance from ``centre``; ``median``."""
 
     centre: tuple[float, float, float]
     base: float
@@ -69,7 +69,7 @@ class Footprints:
     median: float
 
     def radius(self, factor: float) -> Radius:
-        """The radius that is ``factor`` pixels."""
+        """The radius of ``factor`` pixels."""
         angle = min(self.angle * factor, _STEEPEST)
         low, high = self.median * factor * _LOWEST, self.median * factor * _HIGHEST
         radius = Radius(
@@ -80,7 +80,7 @@ class Footprints:
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> Footprints:
-        """Measured by camera rays and their differentials, where the sensor has some."""
+        """Measure pixels by camera rays, with differentials where available."""
         grid = (np.arange(_PROBES) + 0.5) / _PROBES
         film = mi.Point2f(np.tile(grid, _PROBES), np.repeat(grid, _PROBES))
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))
@@ -91,7 +91,7 @@ class Footprints:
         spread = dr.norm(ray.d_x - ray.d)
         size = np.array(dr.norm(ray.o_x - ray.o + (ray.d_x - ray.d) * si.t))
         median, angle = float(np.median(size[found])), float(np.median(np.array(spread)))
-        if not isinstance(sensor, mi.ProjectiveCamera) or angle == 0:  # of one size, or from several places
+        if not isinstance(sensor, mi.ProjectiveCamera) or angle == 0:  # of one size, or from several origins
             return Footprints((0.0, 0.0, 0.0), median, 0.0, median)
         centre = world_matrix(sensor)[:3, 3]
         return Footprints(tuple(centre.tolist()), 0.0, angle, median)

@@ -1,20 +1,18 @@
-"""Vertex merging (photon mapping) of SDS paths: photons near a camera vertex represent paths through it.
+"""Vertex merging (photon mapping) of SDS paths.
 
-Source: Georgiev 2012, see `mis`; here restricted to paths that no connection can make. An edge is *joined* if
-a strategy in use makes paths by connecting its ends: neither end is a delta event, and the strategy's class
-has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to the sensor, inner
+Source: Georgiev 2012, see `mis`; here restricted to paths that no connection can sample. An edge is *joined*
+if a strategy in use connects its ends: neither end is a delta event, and the strategy's class has a
+coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to the sensor, inner
 connections for the others). An *SDS path* (specular-diffuse-specular) has no joined edge: lamp, glass, wall,
-glass, camera. Only s = 0, t = 0 and merging make it: the light subpath and the camera subpath are traced up
-to the same diffuse vertex, and a photon within a radius of the camera vertex counts as if it were there.
+glass, camera. Only s = 0, t = 0 and merging sample it: both subpaths are traced up to the same diffuse
+vertex, and a photon within a radius of the camera vertex counts as if it were there.
 
 With n photon subpaths, discs of radius r(x) about camera vertices, area measure, p-> densities of the light
 subpath and p<- of the camera subpath::
 
     n p_m = eta prod_{i<=m} p->_i prod_{m<=i<k} p<-_i,    eta = n pi r(x_m)^2
 
-and kappa n p_m in the weights.
-
-The estimate is consistent, not unbiased: photons within r are taken to lie at the vertex.
+and kappa n p_m in the weights. The estimate is consistent, not unbiased.
 """
 
 from __future__ import annotations
@@ -42,18 +40,18 @@ from .wavelength_sets import SET_BITS, WavelengthSets
 BUCKET_BITS = 18
 _CELL_BITS = 20
 
-# Distance of a photon from the tangent plane of the camera vertex, over the radius, up to which it is merged.
+# Most distance of a merged photon from the tangent plane of the camera vertex, over the radius.
 _FLAT = 0.25
 
 
 @dataclass
 class Merging:
-    """Merging in one pass.
+    """Vertex merging in one pass.
 
-    ``radius`` of the discs; ``count``: number of photon subpaths that can be merged with a camera subpath;
-    ``kappa``: coefficient of merges in all weights, see `coefficient`; ``aim`` of the photons, an `Aim`;
-    ``photons``: `Photons`, None while they are traced; ``wavelengths``: a `WavelengthSets` in spectral
-    variants, where photons merge with camera subpaths of the same set. Numbers are opaque ``Float``.
+    ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:
+    coefficient of merges in all weights, see `coefficient`; ``aim`` of the photons, an `Aim`; ``photons``:
+    `Photons`, None while they are traced; ``wavelengths``: `WavelengthSets` in spectral variants, where
+    photons merge with camera subpaths of the same set. Numbers are opaque ``Float``.
     """
 
     radius: Radius
@@ -68,22 +66,22 @@ class Merging:
         return self.count * dr.pi * dr.square(self.radius.at(p))
 
     def weighed(self, p: mi.Point3f) -> mi.Float:
-        """`eta` with its coefficient, as it enters weights."""
+        """`eta` with its coefficient, as in weights."""
         return self.kappa * self.eta(p)
 
 
 def coefficient(samples: float, radius: float) -> float:
-    """kappa of merges in discs of ``radius`` pixels, where ``samples`` samples per pixel share photons.
+    """kappa of merges in discs of ``radius`` pixels.
 
-    One over the number of camera vertices that share the photons of a disc: their merges are correlated, and
-    weights by densities alone would count them as independent.
+    One over the number of camera vertices that share the photons of a disc, with ``samples`` samples per
+    pixel: their merges are correlated, and weights by densities alone would treat them as independent.
     """
     return min(1.0, 1 / (samples * math.pi * radius**2))
 
 
 @dataclass
 class Photons:
-    """The photons of a pass, ``found`` (a `Photon` of arrays), one after the other by the buckets of cells.
+    """The photons of a pass, ``found`` (a `Photon` of arrays), sorted by bucket.
 
     ``cell`` of each, see `cell_at`; ``starts``: the first photon of each bucket, and the end of the last.
     """
@@ -94,17 +92,16 @@ class Photons:
 
 
 def level_of(radius: Radius, r: mi.Float) -> mi.UInt32:
-    """Which of the grids, whose cells double in size, is that of photons with the radius ``r``."""
+    """Level of the grid for photons of radius ``r``; cell sizes double by level."""
     return mi.UInt32(dr.maximum(dr.floor(dr.log2(r / radius.low)), 0))
 
 
 def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None, corner=None) -> mi.UInt64:
-    """The number of the cell at ``p`` in the grid ``level``, of this set of wavelengths (or None).
+    """Index of the cell at ``p`` in the grid ``level``, for a set of wavelengths.
 
-    Cells are at least as wide as the discs of the photons in it and of camera vertices near to them, so that
-    a disc meets two at most in each direction: ``corner`` (0 to 7) chooses among those that the one at ``p``
-    meets. Coordinates are taken modulo 2^20: cells of the same number lie far apart, and so do those of the
-    same number that are of different sets.
+    Cells are at least as wide as the discs of nearby camera vertices and of their photons, so that a disc
+    overlaps at most two per direction; ``corner`` (0 to 7) chooses among these. Coordinates are taken modulo
+    2^20: cells of equal index lie far apart, also those of different sets.
     """
     width = radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(4) << level)
     if corner is not None:
@@ -127,9 +124,9 @@ def bucket_of(cell: mi.UInt64) -> mi.UInt32:
 
 
 def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
-    """The camera vertex ``z`` merged with a photon near it, drawn by its flux for all of them.
+    """Merge the camera vertex ``z`` with one photon near it, drawn by flux.
 
-    Of those of its ``wavelength_set``, see `inputs.Shared`.
+    Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.
     """
     h, merging = kernel.heuristic, kernel.merging
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
@@ -138,14 +135,14 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
     photon = merging.photons.found.at(chosen, active)
     f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)
     eta = merging.eta(z.si.p)
-    # Per area of the surface: what the disc receives, f |cos| being per solid angle.
+    # Per area of the surface: irradiance on the disc, since f |cos| is per solid angle.
     estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * dr.abs(dr.dot(z.si.n, photon.d))))
     value = z.throughput * f.value * estimate
     active &= ~spectra.is_zero(value)
     light_side = h.scale(photon.older, f.pdf_fwd_w)
-    # Of longer paths t = 0, the oldest alternative of the camera's side, makes none.
+    # t = 0, the oldest alternative of the camera's side, does not sample longer paths.
     older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)
-    older = h.scale(older, photon.aim)  # and not as photons are aimed
+    older = h.scale(older, photon.aim)  # t = 0 starts with the emitter's density, not the photons'
     camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
     weight, shares = h.weigh(h.start(merging.weighed(z.si.p)), light_side, camera_side)
     return Contribution(value, weight, photon.edges + 1, z.edges, active, shares, "merge")
@@ -153,7 +150,7 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
 
 @dr.syntax
 def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
-    """Draw one of the photons in the disc at ``z`` in proportion to its flux: its place, and their total."""
+    """Draw a photon in the disc at ``z`` by flux; returns its index and total flux."""
     radius, photons = kernel.merging.radius, kernel.merging.photons
     r = radius.at(z.si.p)
     lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
@@ -192,7 +189,7 @@ def _is_near(photon: Photon, z: Vertex, r: mi.Float) -> mi.Bool:
     """Mask: the ``photon`` counts as if it were at ``z``."""
     off = photon.p - z.si.p
     height = dr.abs(dr.dot(off, z.si.n))
-    # Each of the two positions may lie off its surface by the rounding error of its hit.
+    # Each position may lie off its surface by the rounding error of its hit.
     beyond_rounding = dr.maximum(height - 2 * z.anchor.offset, 0)
     within = dr.squared_norm(off) - dr.square(height) + dr.square(beyond_rounding) < dr.square(r)
     return within & (beyond_rounding < _FLAT * r) & same_surface(photon.n, z.si.n)

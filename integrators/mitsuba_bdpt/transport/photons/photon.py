@@ -1,4 +1,4 @@
-"""The record of a photon, and whether a photon lies on the surface of another vertex."""
+"""The record of a photon, and whether two points lie on one surface."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-# Least cosine between the geometric normals of two points of one surface: light on the other side of an edge
-# or of a thin wall belongs to another one.
+# Least cosine between geometric normals of two points of one surface: excludes edges and thin walls.
 SAME_SURFACE = 0.8
 
 
 @dataclass
 class Photon:
-    """A light vertex that is kept in memory, or arrays of many.
+    """A stored light vertex, or arrays of many.
 
-    ``p`` position, ``d`` unit direction towards the light's side, ``n`` geometric normal; ``flux``:
-    throughput of its subpath, not divided by the number of subpaths; ``older``: the partial sum of all
+    ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal; ``flux``:
+    throughput of its subpath, not divided by the number of subpaths; ``older``: partial sum of all
     alternatives with fewer light vertices (area measure); ``aim``: the emitter's own density of the first
     direction over that of `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index
     of its subpath.
@@ -36,9 +35,9 @@ class Photon:
 
     @staticmethod
     def types() -> tuple[Any, ...]:
-        """The types of the fields in the present variant, in their order.
+        """Types of the fields in the current variant, in order.
 
-        Dr.Jit takes the types of a record's fields for those of the first variant that asked.
+        Dr.Jit would keep the types of the first variant in use.
         """
         return (
             *(mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum),
@@ -51,10 +50,10 @@ class Photon:
         return Photon(*(dr.zeros(kind, count) for kind in Photon.types()))
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
-        """The photons of these indices."""
+        """The photons at ``index``."""
         return Photon(*(dr.gather(type(field), field, index, active) for field in vars(self).values()))
 
 
 def same_surface(a: mi.Normal3f, b: mi.Normal3f):
-    """Mask: points with the geometric normals ``a`` and ``b`` are taken to lie on one surface."""
+    """Mask: points with geometric normals ``a`` and ``b`` count as on one surface."""
     return dr.dot(a, b) > SAME_SURFACE

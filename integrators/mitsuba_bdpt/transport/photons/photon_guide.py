@@ -1,11 +1,10 @@
-"""The density of directions that photons define at a point, for photon-guided BSDF sampling.
+"""The density of directions that photons define, for photon-guided BSDF sampling.
 
-Source of the idea: H. W. Jensen, "Importance Driven Path Tracing Using the Photon Map", 1995. The photons are
-the first vertices of light subpaths that are not delta, sorted along a Morton (Z-order) curve. A query takes
-a window of photons about the point's place on the curve, dense next to it and sparse farther off: some are
-near the point however few photons there are. Each photon of the window has a lobe about its direction; the
-density is the mean of the lobes. Photons are independent of the samples that use the density, so that guiding
-is unbiased for any density.
+After H. W. Jensen, "Importance Driven Path Tracing Using the Photon Map", 1995. The photons are the first
+non-delta vertices of light subpaths, sorted along a Morton (Z-order) curve. A query takes a window of photons
+about the point's place on the curve, dense near it and sparse farther off, so that some are near the point
+however few photons there are. Each photon of the window has a lobe about its direction; the density is the
+mean of the lobes. Photons are independent of the samples that use the density, so that guiding is unbiased.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import mitsuba as mi
 
 from .photon import Photon
 
-# Offsets of the photons of a window from the point's place among them.
+# Offsets of a window's photons from the point's place among them.
 _NEAR = 4
 _FAR = (6, 12, 25, 60)
 WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
@@ -27,21 +26,20 @@ WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
 _BETWEEN = [b - a for a, b in pairwise(WINDOW)]
 STANDS_FOR = tuple((a + b) / 2 for a, b in pairwise([_BETWEEN[0], *_BETWEEN, _BETWEEN[-1]]))
 
-# Bits of each coordinate of a place on the curve, and of the index of a subpath: 64 together.
+# Bits of each coordinate of a place on the curve, and of a subpath's index: 64 together.
 _BITS, _LANE_BITS = 15, 19
 
-# Width of a lobe (tangent of the half angle that contains half of its directions) over the photon's slope
-# times its distance from the point; least width; width from which on a photon has no lobe.
+# Lobe width (tangent of the half angle that contains half of its directions) over the photon's slope times
+# its distance from the point; least width; width from which on a photon has no lobe.
 _WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
 
 
 @dataclass
 class Guide:
-    """``photons`` in the order of their ``place`` on the curve, ``count`` of them; and its box.
+    """``photons`` sorted by ``place`` on the curve, ``count`` of them; and the box.
 
-    ``slope`` of each: by how much directions change over a distance (1 / scene unit), see `_slopes`.
-    ``low`` corner of the box, ``scale`` places over length; ``offsets`` see `WINDOW`, ``stands_for`` see
-    `STANDS_FOR`.
+    ``slope`` of each: change of direction per distance (1 / scene unit), see `_slopes`; ``low``: corner of
+    the box; ``scale``: places over length; ``offsets``: see `WINDOW`; ``stands_for``: see `STANDS_FOR`.
     """
 
     photons: Photon
@@ -55,14 +53,14 @@ class Guide:
 
     @staticmethod
     def of(photons: Photon, count: int) -> Guide:
-        """The guide of the first ``count`` of the ``photons``, at least one."""
+        """The guide of the first ``count`` (at least one) of ``photons``."""
         index = dr.arange(mi.UInt32, count)
         found = photons.at(index)
         low = mi.Point3f(*(dr.min(x) for x in found.p))
         extent = dr.max(mi.Vector3f(*(dr.max(x) for x in found.p)) - low)
         scale = dr.select(extent > 0, ((1 << _BITS) - 1) / extent, 0)
         place = _place(found.p, low, scale)
-        # By the subpath where places are the same, an order that does not depend on threads.
+        # By subpath at equal places: independent of the order of threads.
         order = dr.argsort((place << _LANE_BITS) | mi.UInt64(found.lane))
         guide = Guide(
             found.at(order),
@@ -81,10 +79,10 @@ class Guide:
 
 @dr.syntax
 def _slopes(guide: Guide) -> mi.Float:
-    """The slope of each photon: the third least to others in its window.
+    """Slope of each photon: the third least to others in its window.
 
-    The third least, since light may be focused from several sides: the photons nearest in direction come from
-    the same one. With fewer others 1 over the length of the last edge.
+    Light may be focused from several sides: photons nearest in direction come from the same one. With fewer
+    others 1 over the length of the last edge.
     """
     index = dr.arange(mi.UInt32, dr.width(guide.place))
     own = guide.photons.at(index)
@@ -102,7 +100,7 @@ def _slopes(guide: Guide) -> mi.Float:
 
 
 def _place(p: mi.Point3f, low: mi.Point3f, scale: mi.Float) -> mi.UInt64:
-    """The place of ``p`` on the curve: the bits of its coordinates by turns."""
+    """Morton code of ``p``: the interleaved bits of its coordinates."""
     place = mi.UInt64(0)
     for axis in range(3):
         x = dr.clip((p[axis] - low[axis]) * scale, 0, (1 << _BITS) - 1)
@@ -111,7 +109,7 @@ def _place(p: mi.Point3f, low: mi.Point3f, scale: mi.Float) -> mi.UInt64:
 
 
 def _spread(x: mi.UInt64) -> mi.UInt64:
-    """The lowest 21 bits of ``x``, each at three times its place."""
+    """Spread the lowest 21 bits of ``x`` to every third bit."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -125,9 +123,9 @@ def _spread(x: mi.UInt64) -> mi.UInt64:
 
 @dr.syntax
 def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
-    """The index of the first photon at or behind the place of ``p``.
+    """Index of the first photon at or behind the place of ``p``.
 
-    Not `dr.binary_search`, which is unrolled to the bound of all guides: 1.6 times the time of this loop.
+    `dr.binary_search` is unrolled to the bound of all guides and slower.
     """
     place = _place(p, guide.low, guide.scale)
     low, high = mi.UInt32(0), mi.UInt32(guide.count)
@@ -140,24 +138,24 @@ def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
 
 
 def number(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> mi.UInt32:
-    """The index of the ``k``-th photon of the window about the index ``found``."""
+    """Index of the ``k``-th photon of the window about index ``found``."""
     index = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
     return mi.UInt32(dr.clip(index, 0, mi.Int32(guide.count) - 1))
 
 
 def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
-    """The ``k``-th photon of the window about the index ``found``."""
+    """The ``k``-th photon of the window about index ``found``."""
     return guide.photons.at(number(guide, found, k, active), active)
 
 
 def exists(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.Bool:
-    """Mask: the window has a ``k``-th photon; beyond the first and last of all it repeats them."""
+    """Mask: the window has a ``k``-th photon; at the array's ends it repeats photons."""
     number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k)
     return (number >= 0) & (number < mi.Int32(guide.count))
 
 
 def _lobe(guide: Guide, p: mi.Point3f, found: mi.UInt32, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
-    """The lobe at ``p`` of the ``k``-th photon of the window: its axis, and width^2 / 2, 0 if it has none."""
+    """Axis of the ``k``-th photon's lobe at ``p``, and width^2 / 2 (0 without a lobe)."""
     index = number(guide, found, k, True)
     photon = guide.photons.at(index)
     width = _WIDTH * dr.norm(photon.p - p) * dr.gather(mi.Float, guide.slope, index)
@@ -165,7 +163,7 @@ def _lobe(guide: Guide, p: mi.Point3f, found: mi.UInt32, k: mi.UInt32) -> tuple[
 
 
 def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Point2f):
-    """Sample a unit direction at ``p``; returns it and a mask: whether the photon drawn has a lobe."""
+    """Sample a unit direction at ``p``; returns it, and a mask: the photon has a lobe."""
     k = dr.minimum(mi.UInt32(u1 * len(WINDOW)), len(WINDOW) - 1)
     axis, a = _lobe(guide, p, found, k)
     m = dr.minimum(2 * u2.x * a / (a + 2 * (1 - u2.x)), 2)  # 1 - cos of the angle
@@ -177,7 +175,7 @@ def draw(guide: Guide, p: mi.Point3f, found: mi.UInt32, u1: mi.Float, u2: mi.Poi
 
 @dr.syntax
 def density(guide: Guide, p: mi.Point3f, found: mi.UInt32, d: mi.Vector3f) -> mi.Float:
-    """The density (solid angle) of sampling the unit direction ``d`` at ``p`` by `draw`."""
+    """Density (solid angle) of sampling the unit direction ``d`` at ``p`` with `draw`."""
     k, total = mi.UInt32(0), mi.Float(0)
     while dr.hint(k < len(WINDOW), label="photons of a window", exclude=[guide, p, found, d]):
         axis, a = _lobe(guide, p, found, k)

@@ -18,18 +18,17 @@ from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, level_of
 from .photon import Photon
 from .photon_guide import Guide
 
-# Photons per subpath for which memory is allocated at first.
+# Initial memory, in photons per subpath.
 _CAPACITY = 0.5
 
-# Camera samples per photon subpath, of a render's guide and of a pass with merging; bounds of the number of
-# photon subpaths.
+# Camera samples per photon subpath of a guide and of a merging pass; bounds of the number of photon subpaths.
 SAMPLES_PER_PHOTON, SAMPLES_PER_MERGED = 4, 8
 FEWEST_PHOTONS, MOST_PHOTONS = 1 << 12, 1 << 18
 
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Bits of the edges and of the subpath's index in the key by which photons are sorted.
+# Bits of the edges and of the subpath's index in the sort key of photons.
 _EDGES_BITS, _LANE_BITS = 12, 32
 
 
@@ -39,24 +38,21 @@ def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
 
 
 def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
-    """Number of photon subpaths of a pass with merging of ``pixels`` pixels, for a ``radius`` in pixels."""
+    """Number of photon subpaths of a pass with merging; ``radius`` in pixels."""
     most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
     return min(photons_of(samples, SAMPLES_PER_MERGED), most)
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
-    """Trace ``count`` photon subpaths from ``points``; returns ``merging`` with their photons.
-
-    Also `Counters.summed`.
-    """
+    """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
     photons, found, counters = _all(_kernel(kernel, points, merging), merging.aim, count)
     return replace(merging, photons=_sorted(merging, photons, found)), counters
 
 
 def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
-    """Trace ``count`` photon subpaths from ``points``; returns the guide of their photons.
+    """Trace ``count`` photon subpaths; returns their guide and counters.
 
-    None if there is no photon. Also `Counters.summed`. First directions are sampled by ``aim``.
+    The guide is None without photons. ``aim`` samples first directions.
     """
     photons, found, counters = _all(_kernel(kernel, points, None), aim, count)
     return Guide.of(photons, found) if found else None, counters
@@ -70,7 +66,7 @@ def _kernel(kernel: Kernel, points: Points, merging: Merging | None) -> Kernel:
 
 
 def _all(kernel: Kernel, aim: Aim, count: int) -> tuple[Photon, int, mi.UInt64]:
-    """Trace as `_traced`, again with more memory if the photons exceed it: none is dropped."""
+    """Like `_traced`, again with more memory if the photons exceed it."""
     capacity = max(int(count * _CAPACITY), 1)
     while True:
         photons, found, counters = _traced(kernel, aim, count, Photon.zeros(capacity))
@@ -80,10 +76,10 @@ def _all(kernel: Kernel, aim: Aim, count: int) -> tuple[Photon, int, mi.UInt64]:
 
 
 def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, int, mi.UInt64]:
-    """Store photons in ``out``; returns it, their number, which may exceed its size, and counts.
+    """Store photons in ``out``; returns it, their number (may exceed it), counters.
 
-    With merging all diffuse vertices of SDS paths; for a guide the first vertex of a subpath that is not
-    delta, if s = 0 can make the path through it.
+    With merging all diffuse vertices of SDS paths; for a guide the first non-delta vertex of a subpath, if s
+    = 0 can sample the path through it.
     """
     capacity = dr.width(out)
     kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
@@ -104,7 +100,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, 
     def visit(y, counters, walk):
         older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
         keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
-        # Otherwise estimates of all vertices near it would be NaN; the walk counts it.
+        # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         if not merges:
             keep &= older > 0
@@ -123,8 +119,8 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, 
 
 
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
-    """Sort the first ``count`` photons by bucket, subpath and edge: an order that no thread changes."""
-    index = dr.arange(mi.UInt32, max(count, 1))  # one that is in no bucket where there is none
+    """Sort the first ``count`` photons by bucket, subpath and edge: deterministic."""
+    index = dr.arange(mi.UInt32, max(count, 1))  # without photons one in no bucket
     found = photons.at(index)
     radius = merging.radius
     sets = merging.wavelengths
