@@ -455,7 +455,7 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
         mi.render(scene, integrator=method, spp=8)
         assert method.statistics["unbiased"] != used
         text = method.explain(scene, spp=8)
-        assert ("used: merging" in text) == used
+        assert ("used: vertex merging" in text) == used
         assert ("skipped (not worth its cost here): merging" in text) != used
 
 

@@ -226,13 +226,13 @@ def test_a_cornell_box_is_joined_and_less_noisy():
     """Expected: the pilot's 1/16 with one connection becomes four at a time, as `explain` says; the error
     falls to 0.8 or less (measured: 0.6), over eight seeds.
     """
-    scene = cornell(32)
-    reference = np.mean([rendered(scene, 1024, 50 + i)[0] for i in range(4)], axis=0)
+    scene = cornell()
     _, method = rendered(scene)
     (decision,) = method.statistics["decisions"]
     assert decision["light_paths"] == 1 / 16 and decision["joined"] == 4
     assert "each of which is joined with 4 of them" in method.explain(scene, spp=64)
-    errors = []
+    scene, errors = cornell(32), []
+    reference = np.mean([rendered(scene, 1024, 50 + i)[0] for i in range(4)], axis=0)
     for joined in (4, 1):
         again = json.dumps([decision | {"joined": joined}])
         found = [rendered(scene, 64, i, decisions=again)[0] for i in range(8)]

@@ -69,5 +69,5 @@ def test_lanes_that_skip_vertices_keep_their_own():
     some five standard errors of the difference.
     """
     edit = 'd["small-box"]["bsdf"] = {"type": "dielectric"}; d["large-box"]["bsdf"] = {"type": "conductor"}'
-    a, b = means(edit, [{"max_depth": 6}, {"max_depth": 6, "light_paths": 0}])
+    a, b = means(edit, [({"max_depth": 6}, 6), ({"max_depth": 6, "light_paths": 0}, 6)])
     assert a == pytest.approx(b, rel=0.03)
