@@ -1,7 +1,7 @@
-"""What Mitsuba imports to find the plugin ``bdpt``: the entry point ``bdpt`` of the group ``mitsuba``.
+"""Entry point ``bdpt`` of the group ``mitsuba``: Mitsuba finds the plugin by it.
 
-Mitsuba does so for everybody who has the package, whichever variant they use. Where the package cannot be
-used (no LLVM library, for example) that must not cost them Mitsuba: who loads the plugin is told why.
+Mitsuba imports it in every variant. If the package cannot be used (no LLVM library, for example), the import
+succeeds, and loading the plugin raises the error.
 """
 
 from importlib import import_module
@@ -11,7 +11,7 @@ __all__ = ["register"]
 
 
 def register() -> None:
-    """Register ``bdpt``, or in its place what says why it cannot be used."""
+    """Register ``bdpt``, or a plugin that raises the error of the failed import."""
     try:
         import mitsuba_bdpt  # noqa: F401
     except ImportError as error:

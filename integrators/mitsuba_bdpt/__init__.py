@@ -1,8 +1,8 @@
 """Bidirectional path tracing for Mitsuba 3.
 
-``import mitsuba_bdpt`` chooses the LLVM library that Dr.Jit loads (see `llvm`) and registers the
-integrator plugin ``bdpt`` for the current variant and all later ones. Import it before ``mitsuba``
-and ``drjit``: which LLVM they use is settled when they are first imported.
+``import mitsuba_bdpt`` selects the LLVM library that Dr.Jit loads (see `llvm`) and registers the plugin
+``bdpt`` for the current variant and all later ones. Import it before ``mitsuba`` and ``drjit``, which load
+LLVM when first imported.
 """
 
 import sys as _sys
@@ -40,7 +40,7 @@ failure: ImportError | None = None
 
 
 def _runs_own_command(arguments: list[str]) -> bool:
-    """Whether this process is ``python -m mitsuba_bdpt`` or the script ``mitsuba-bdpt``."""
+    """Return whether this process runs the package's own command."""
     module = "-m" in arguments and arguments[arguments.index("-m") :][1:2] == [__name__]
     return module or any(_Path(argument).stem == "mitsuba-bdpt" for argument in arguments[:2])
 
@@ -55,8 +55,8 @@ try:
 
     _register()
 except ImportError as _error:
-    # Python imports the package before its __main__. The command must outlive the failure, for
-    # `doctor` is there to explain it; __main__ reports it for every other command.
+    # Python imports the package before its __main__. The command continues, since `doctor` explains the
+    # failure; __main__ reports it for every other command.
     if not _runs_own_command(_sys.orig_argv):
         raise
     failure = _error

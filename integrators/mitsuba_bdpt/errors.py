@@ -1,4 +1,4 @@
-"""Errors that the user can mend, and what a mistyped name may have meant."""
+"""Errors that a user can fix, and suggestions for mistyped names."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 
 class UsageError(ValueError):
-    """A value that the user gave cannot be used. The message names it and says what to do instead."""
+    """A value given by the user is invalid; the message names it and a remedy."""
 
     prefix = "bdpt: "
 
@@ -15,29 +15,29 @@ class UsageError(ValueError):
 
 
 class UsageTypeError(UsageError, TypeError):
-    """A value that the user gave is of a type that cannot be used."""
+    """A value given by the user has an invalid type."""
 
 
 class UnsupportedError(NotImplementedError):
-    """The method does not support what was asked for; the message says what to use instead."""
+    """The method does not support a request; the message names an alternative."""
 
     def __str__(self) -> str:
         return UsageError.prefix + super().__str__()
 
 
 class CommandError(UsageError):
-    """A mistake in the arguments of a command, or in a file that they name."""
+    """An invalid argument of a command, or an invalid file that it names."""
 
     prefix = ""
 
 
 class FailureError(RuntimeError):
-    """A command or a measurement failed for a reason that is not in its arguments, such as a full disk."""
+    """A command or measurement failed for other reasons than its arguments."""
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The question for the most similar of the ``known`` names, and a space; empty if none is similar."""
-    import difflib  # which takes 5 ms, and only mistakes need it
+    """Return a question with the most similar ``known`` name, or an empty string."""
+    import difflib  # takes 5 ms, and is rarely needed
 
     by_case = {other.lower(): other for other in known}
     near = difflib.get_close_matches(name.lower(), by_case, 1)
@@ -45,15 +45,15 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def behind(error: BaseException, *kinds: type[BaseException]) -> BaseException | None:
-    """The exception of these ``kinds`` that ``error`` is, or that was wrapped into it; None if none was.
+    """Return the exception of these ``kinds`` that ``error`` is or wraps, or None.
 
-    Mitsuba and Dr.Jit make a ``RuntimeError`` of all that is raised while they render or record.
+    Mitsuba and Dr.Jit convert exceptions raised while rendering or recording to ``RuntimeError``.
     """
     return next((found for found in chain(error) if isinstance(found, kinds)), None)
 
 
 def chain(error: BaseException) -> Iterator[BaseException]:
-    """Yield ``error`` and the exceptions that were wrapped into it, see `behind`."""
+    """Yield ``error`` and the exceptions that it wraps, see `behind`."""
     found: BaseException | None = error
     while found is not None:
         yield found
@@ -61,9 +61,9 @@ def chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def message(error: BaseException) -> str:
-    """The text of `error`, or of the user's mistake that is behind it.
+    """Return the text of `error`, or of the user's mistake that it wraps.
 
-    Of a Python traceback that Mitsuba has put into it, the last line only.
+    A Python traceback within the text is reduced to its last line.
     """
     error = behind(error, UsageError, UnsupportedError) or error
     before, traceback, rest = str(error).partition("Traceback (most recent call last):")

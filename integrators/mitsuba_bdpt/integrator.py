@@ -1,4 +1,4 @@
-"""The integrator plugin ``bdpt``: its manual and its class."""
+"""The integrator plugin ``bdpt``: its documentation and its class."""
 
 from __future__ import annotations
 
@@ -67,9 +67,10 @@ class that is not Mitsuba's has no t = 1), it is skipped, and ``explain`` says s
 
 
 def _without_gradients(method):
-    """``method``, undisturbed by parameters with gradients, be they of other scenes.
+    """Suspend gradients within ``method``.
 
-    Virtual calls visit these too, and Dr.Jit cannot differentiate local memory.
+    Virtual calls also visit objects of other scenes, whose parameters may have gradients, and Dr.Jit cannot
+    differentiate local memory.
     """
 
     @wraps(method)
@@ -78,7 +79,7 @@ def _without_gradients(method):
             try:
                 return method(*args, **kwargs)
             except RuntimeError as error:
-                if not isinstance(error, NotImplementedError):  # refusals, which say all
+                if not isinstance(error, NotImplementedError):  # errors of ours need no hint
                     _hint_at_others(error, (*args, *kwargs.values()))
                 raise
 
@@ -86,7 +87,7 @@ def _without_gradients(method):
 
 
 def _hint_at_others(error: RuntimeError, arguments):
-    """Say with an ``error`` that it may come from the emitter of a scene that is not among ``arguments``."""
+    """Add a note to ``error`` if emitters of other scenes may have caused it."""
     scene = next((value for value in arguments if isinstance(value, mi.Scene)), None)
     count = third_party_elsewhere(scene) if scene is not None else 0
     if count:
@@ -97,10 +98,10 @@ def _hint_at_others(error: RuntimeError, arguments):
 
 
 class BDPTIntegrator(metaclass=ABCMeta):
-    """The integrator that ``mi.load_dict({"type": "bdpt", ...})`` returns, in every variant.
+    """The integrator of ``mi.load_dict({"type": "bdpt", ...})``, in every variant.
 
-    Its members besides those of ``mi.SamplingIntegrator``. Mitsuba's base class differs between variants, so
-    each variant has a class of its own; ``isinstance`` accepts the objects of all of them.
+    Lists the members beside those of ``mi.SamplingIntegrator``. Mitsuba's base class differs between
+    variants, so each variant has its own class; ``isinstance`` accepts the objects of all of them.
     """
 
     settings: Settings
@@ -142,7 +143,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         evaluate: bool = True,
         start: Snapshot | None = None,
     ) -> mi.TensorXf:
-        """Render an image; the arguments are those of ``mi.Integrator.render``, and ``start``.
+        """Render an image; arguments as ``mi.Integrator.render``, and ``start``.
 
         ``start``: a snapshot of the same scene from which the render continues. The image is that of the
         uninterrupted render up to rounding. Raises ``UsageError`` and ``UnsupportedError``.
@@ -170,14 +171,14 @@ class BDPTIntegrator(metaclass=ABCMeta):
         return _result(sensor.film(), develop, evaluate)
 
     def cancel(self):
-        """Stop the current render after its next pass; called by ``on_pass`` or from another thread."""
+        """Stop the render after its current pass; called by ``on_pass`` or another thread."""
         self._cancelled = True
 
     @_without_gradients
     def explain(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, spp: int | None = None) -> str:
-        """Describe which strategies a render of ``scene`` uses and which it skips, and why.
+        """Describe which strategies a render of ``scene`` uses and skips, and why.
 
-        With ``spp`` the pilot of such a render runs too, and the text has its result.
+        With ``spp``, the pilot of such a render runs and the text includes its result.
         """
         check_made_for(self, scene)
         sensor = resolve_sensor(scene, sensor)
@@ -199,11 +200,10 @@ class BDPTIntegrator(metaclass=ABCMeta):
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:
-        """Run the pilot alone and return the decisions of such a render, as in ``statistics["decisions"]``.
+        """Run the pilot alone and return its decisions, as in ``statistics["decisions"]``.
 
-        The list is empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the
-        reason. As JSON it is the value of the parameter ``decisions`` of other renders. Decisions do not
-        depend on ``seed``.
+        Empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the reason. As JSON,
+        the list is a value of the parameter ``decisions``. Decisions do not depend on ``seed``.
         """
         check_made_for(self, scene)
         sensor = resolve_sensor(scene, sensor)
@@ -223,9 +223,9 @@ class BDPTIntegrator(metaclass=ABCMeta):
         develop: bool = True,
         evaluate: bool = True,
     ) -> mi.TensorXf:
-        """Return the image of a snapshot, as `render` would have.
+        """Return the image of a snapshot, as `render` would.
 
-        The snapshot may be joined from several (`Snapshot.joined`) of integrators with the same parameters.
+        The snapshot may be merged from several (`Snapshot.joined`) of integrators with equal parameters.
         """
         check_made_for(self, scene)
         if not isinstance(snapshot, Snapshot):
@@ -240,7 +240,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         return _result(sensor.film(), develop, evaluate)
 
     def aov_names(self) -> list[str]:
-        """Names of the film's layers beside colours and alpha."""
+        """Return the names of the film's layers beside colours and alpha."""
         settings = self.settings
         depth, merges = settings.strategy_depth, settings.merge_images
         names = feature_names(settings.aovs)
@@ -265,7 +265,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         raise UnsupportedError(NO_DERIVATIVES)
 
     def to_string(self) -> str:
-        """The parameters, one a line."""
+        """Return the parameters, one per line."""
         values = {name: getattr(self.settings, name) for name in PARAMETERS} | {"max_depth": self.max_depth}
         lines = "".join(f"  {k} = {v},\n" for k, v in values.items())
         return f"BDPTIntegrator[\n{lines}]"
@@ -278,7 +278,7 @@ NO_DERIVATIVES = (
 
 
 def _result(film, develop: bool, evaluate: bool) -> mi.TensorXf:
-    """What ``mi.Integrator.render`` returns."""
+    """Return the result of ``mi.Integrator.render``."""
     if develop:
         result = film.develop()
         dr.schedule(result)
@@ -295,9 +295,9 @@ _classes = {}
 
 
 def _class_of_variant():
-    """The plugin's class for the current variant.
+    """Return the plugin's class for the current variant.
 
-    Mitsuba's base class is another one in each variant, and allows no second base.
+    Mitsuba's base class differs between variants, and allows no second base.
     """
     apart = ("__dict__", "__weakref__", "__abstractmethods__", "_abc_impl")
     own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in apart}
@@ -308,9 +308,9 @@ def _class_of_variant():
 
 
 def register():
-    """Register the plugin ``bdpt`` for the current variant, for all that are set later, and for scalar_rgb.
+    """Register ``bdpt`` for the current variant, all later ones, and scalar_rgb.
 
-    Mitsuba's parser queries the type of every plugin in scalar_rgb, whatever the current variant.
+    Mitsuba's parser instantiates every plugin in scalar_rgb to query its type.
     """
 
     def register_variant(old=None, new=None):

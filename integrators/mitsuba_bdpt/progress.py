@@ -1,11 +1,11 @@
-"""What a render shows of its progress: a bar, lines for a log, or nothing.
+"""Displays of a render's progress: a bar, lines of a log, or nothing.
 
 A display is a function that a render calls with a `run.rendering.PassReport` after each pass::
 
     integrator.on_pass = mitsuba_bdpt.Bar()  # on a terminal or in a notebook
     mi.render(scene, integrator=integrator, spp=4096)
 
-Each knows by ``limit`` (seconds; None without one) when a render will be stopped for time.
+``limit``: seconds after which the render stops; None if unlimited.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import sys
 import time
 from typing import TYPE_CHECKING, Protocol, TextIO
 
-# Not here: the command declares its options, and `doctor` runs, where rich is missing.
+# Not at run time: the command declares its options, and `doctor` runs, without rich.
 if TYPE_CHECKING:
     from rich.console import Console
 
-# Seconds between two lines of a log, at least, and as a share of those that the render has taken.
+# Minimum interval between two lines of a log: seconds, and share of the elapsed time.
 EVERY, SHARE = 10.0, 0.02
 
 
 class Report(Protocol):
-    """What displays ask of a `PassReport`."""
+    """Attributes of a `PassReport` that displays read."""
 
     @property
     def spp_done(self) -> int: ...
@@ -37,7 +37,7 @@ class Report(Protocol):
 
 
 def share_done(report: Report, limit: float | None = None) -> float:
-    """Share of the render that is done, of its samples or of the time that limits it, from 0 to 1."""
+    """Return the finished share of the samples, or of the time limit, from 0 to 1."""
     done = report.spp_done / report.spp_total
     if limit:
         done = max(done, report.seconds / limit)
@@ -45,18 +45,18 @@ def share_done(report: Report, limit: float | None = None) -> float:
 
 
 def seconds_left(report: Report, limit: float | None = None) -> float:
-    """Seconds that the rest of the render is expected to take."""
+    """Return the expected remaining seconds."""
     left = report.seconds * (report.spp_total / max(report.spp_done, 1e-9) - 1)
     return max(0.0, min(left, limit - report.seconds)) if limit else left
 
 
 def in_words(report: Report, limit: float | None = None, open_ended: bool = False) -> str:
-    """Samples per pixel, rays per second, what is left, and the estimated error if there is one.
+    """Describe samples per pixel, rays per second, remaining time and estimated error.
 
-    ``open_ended``: the total is not what somebody asked for.
+    ``open_ended``: the total number of samples is not what the user asked for, and is not shown.
     """
     text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp"
-    if report.rays:  # of other integrators they are not known
+    if report.rays:  # unknown for other integrators
         text += f", {readable(report.rays / max(report.seconds, 1e-9))} rays/s"
     if limit or not open_ended:
         text += f", {seconds_left(report, limit):.0f} s left"
@@ -65,7 +65,7 @@ def in_words(report: Report, limit: float | None = None, open_ended: bool = Fals
 
 
 def readable(number: float) -> str:
-    """A number to three digits with a unit prefix."""
+    """Format a number with three digits and a unit prefix."""
     for limit, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if number >= limit:
             return f"{number / limit:.3g}{unit}"
@@ -73,7 +73,7 @@ def readable(number: float) -> str:
 
 
 def _say(line: str, stream: TextIO | None) -> None:
-    """Print a ``line``, as long as somebody listens: the render must not end with them."""
+    """Print a ``line``; a closed stream must not end the render."""
     if stream is not None:
         with contextlib.suppress(OSError, ValueError):
             print(line, file=stream, flush=True)
@@ -82,7 +82,7 @@ def _say(line: str, stream: TextIO | None) -> None:
 class Display:
     """Shows nothing.
 
-    ``open_ended``: time or an error ends the render, not its total of samples.
+    ``open_ended``: time or an error ends the render, not its number of samples.
     """
 
     def __init__(self, limit: float | None = None, open_ended: bool = False):
@@ -92,13 +92,13 @@ class Display:
         """Show the ``report`` of a pass."""
 
     def close(self) -> None:
-        """Take away what is shown."""
+        """Remove the display."""
 
 
 class Bar(Display):
-    """A bar on standard error of a terminal, or under the cell of a notebook; shows nothing elsewhere.
+    """A bar on a terminal's standard error, or in a notebook; shows nothing elsewhere.
 
-    ``console``: another place. The last pass of a render takes the bar off a terminal, and so does `close`.
+    ``console``: another output. The bar disappears after the last pass, and by `close`.
     """
 
     def __init__(
@@ -110,10 +110,10 @@ class Bar(Display):
         super().__init__(limit, open_ended)
         console = console or Console(stderr=True)
         columns = BarColumn(), TextColumn("{task.description}")
-        # In notebooks rich draws with ipywidgets, which a plain Jupyter does not have: `_CellOutput` does it.
+        # rich draws in notebooks with ipywidgets, which plain Jupyter lacks; `_CellOutput` replaces it.
         self._cell = _CellOutput() if console.is_jupyter else None
         shown = console.is_terminal and not console.is_jupyter
-        # Nothing is drawn between passes: a thread would go on for ever after a render that was interrupted.
+        # Draws at passes only: a refresh thread would survive an interrupted render.
         self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not shown)
         self._task = self._bar.add_task("rendering", total=1.0)
         self._begun = False
@@ -125,7 +125,7 @@ class Bar(Display):
 
     @property
     def completed(self) -> float:
-        """Share of the bar that is filled."""
+        """Filled share of the bar."""
         return self._bar.tasks[0].completed
 
     def __call__(self, report: Report) -> None:
@@ -145,21 +145,21 @@ class Bar(Display):
         if self._begun:
             self._bar.stop()
         if self._cell is not None:
-            self._cell = _CellOutput()  # the next render's, of another cell
+            self._cell = _CellOutput()  # for the next render, in another cell
         self._begun = False
 
 
 class _CellOutput:
-    """One output of a notebook's cell, which is replaced by the next that is shown.
+    """One output of a notebook cell, which is updated in place.
 
-    By IPython's display identifiers, which Jupyter, Colab and editors support without an extension.
+    Uses IPython's display identifiers, which Jupyter, Colab and editors support.
     """
 
     def __init__(self):
         self._handle = None
 
     def show(self, shown: object) -> None:
-        """Show an object, as IPython displays it, in the place of the one before."""
+        """Show an object in place of the previous one."""
         if self._handle is None:
             from IPython.display import display
 
@@ -169,10 +169,10 @@ class _CellOutput:
 
 
 class Lines(Display):
-    """A line for a log now and then: time, samples, share, what is left.
+    """Lines for a log: elapsed time, samples, share, remaining time.
 
-    The first after `EVERY` seconds, so that short renders are silent; later ones after `SHARE` of the time
-    that the render has taken.
+    The first after `EVERY` seconds, so that short renders print nothing; then after `SHARE` of the elapsed
+    time.
     """
 
     def __init__(
@@ -203,7 +203,7 @@ KINDS = ("auto", "bar", "lines", "none")
 
 
 def display(kind: str, limit: float | None = None, open_ended: bool = False) -> Display:
-    """The `Display` of this name; ``auto``: a bar on a terminal, lines elsewhere."""
+    """Return the `Display` of this name; ``auto``: a bar on a terminal, else lines."""
     if kind == "auto":
         kind = "bar" if sys.stderr is not None and sys.stderr.isatty() else "lines"
     return {"bar": Bar, "lines": Lines, "none": Display}[kind](limit, open_ended)

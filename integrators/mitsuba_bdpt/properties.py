@@ -1,4 +1,4 @@
-"""Reading and checking the plugin's parameters and the arguments of a render."""
+"""Reads and checks the plugin's parameters and the arguments of a render."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from .image.stokes import POLARIZED
 from .planning.configuration import read_decisions
 from .settings import LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
-# What numbers that are arguments of a render mean, for messages; of parameters see `settings.PARAMETERS`.
+# Meaning of numeric arguments of a render, for messages; for parameters see `settings.PARAMETERS`.
 ARGUMENTS = {
     "spp": f"samples per pixel, at most {UNLIMITED}, 0 for the sampler's sample_count",
     "seed": "any number from 0 to 2^32 - 1",
 }
 
-# Parameters that are not ours but could be taken for it, and what to do. Mitsuba's upgrade of old scene files
-# writes those of its version 0.6 with underscores.
+# Remedies for parameters that are mistaken for ours. Mitsuba's upgrade of scene files of version 0.6 writes
+# those of its old integrators with underscores.
 _LIGHT_IMAGE = (
     "it is of Mitsuba 0.6's bdpt; here light subpaths always reach the camera, weighted with all other "
     "strategies; leave it out, or set light_paths=0 to leave out light tracing"
@@ -46,7 +46,7 @@ REMEDIES = {
 
 
 def integer(value, name: str, low: float, high: float = UNLIMITED) -> int:
-    """``value`` as an int within [low, high]; raises ``UsageTypeError`` and ``UsageError``."""
+    """Return an int in [low, high]; raises ``UsageTypeError`` and ``UsageError``."""
     what = ARGUMENTS[name] if name in ARGUMENTS else PARAMETERS[name].what
     number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
     if not number or not math.isfinite(value) or value != int(value):
@@ -57,12 +57,12 @@ def integer(value, name: str, low: float, high: float = UNLIMITED) -> int:
 
 
 def is_index(value) -> bool:
-    """Whether ``value`` is a whole number of Python or NumPy, and no boolean."""
+    """Return whether ``value`` is an integer of Python or NumPy, and no boolean."""
     return isinstance(value, Integral) and not isinstance(value, (bool, np.bool_))
 
 
 def _shown(value) -> str:
-    """``value`` in one line, for messages."""
+    """Format ``value`` in one line, for messages."""
     return " ".join(repr(value).split())
 
 
@@ -80,7 +80,7 @@ def _number(value, name: str) -> float:
     parameter = PARAMETERS[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
         raise UsageTypeError(f"{name}={value!r} must be a number: {parameter.what}")
-    # Without bounds infinity is a number like any other.
+    # Without a lower bound, infinity is valid.
     if not parameter.low <= value or (parameter.low > -math.inf and value == math.inf):
         raise UsageError(f"{name}={value!r} is out of range; it is {parameter.what}")
     return float(value)
@@ -113,7 +113,7 @@ def _light_paths(value, name: str) -> float | str:
         raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
     if value == "auto":
         return value
-    from fractions import Fraction  # which takes 3 ms, and the default does not need it
+    from fractions import Fraction  # takes 3 ms, and the default does not need it
 
     try:
         number = float(Fraction(value))
@@ -135,7 +135,7 @@ def _aovs(value, name: str) -> str:
     return value
 
 
-# Parameters that more is to be said of than their kind and bounds.
+# Readers of parameters with their own syntax.
 _READERS = {
     "max_depth": _max_depth,
     "light_paths": _light_paths,
@@ -174,7 +174,7 @@ def _not_a_parameter(name: str, value) -> str:
 
 
 def read_settings(props) -> Settings:
-    """The plugin's parameters, checked; raises ``UsageError`` and ``UsageTypeError``."""
+    """Return the checked parameters; raises ``UsageError`` and ``UsageTypeError``."""
     given = {name: props[name] for name in props.keys()}
     for name, value in given.items():
         if name not in PARAMETERS:
@@ -189,7 +189,7 @@ def read_settings(props) -> Settings:
 
 
 def _check_together(settings: Settings):
-    """Raise ``UsageError`` for parameters that contradict each other."""
+    """Raise ``UsageError`` for contradictory parameters."""
     if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
         depth = -1 if settings.max_depth == UNLIMITED else settings.max_depth
         raise UsageError(
@@ -215,7 +215,7 @@ def _check_together(settings: Settings):
 
 
 def check_variant(variant: str | None = None):
-    """Raise ``UnsupportedError`` for a variant (default: the current one) that is scalar or untested."""
+    """Raise ``UnsupportedError`` for a scalar or untested variant (default: current)."""
     variant = variant or mi.variant() or "none"
     if variant.startswith("scalar"):
         raise UnsupportedError(
@@ -240,7 +240,10 @@ def check_not_frozen():
 
 
 def check_merging(sensor, settings: Settings, media: bool):
-    """Raise ``UnsupportedError`` where vertices cannot be merged; ``media``: whether the scene has some."""
+    """Raise ``UnsupportedError`` where vertex merging is not possible.
+
+    ``media``: whether the scene has participating media.
+    """
     if not settings.merging:
         return
     if sensor.shutter_open_time() > 0:
@@ -255,7 +258,7 @@ def check_merging(sensor, settings: Settings, media: bool):
 
 
 def check_film(sensor, settings: Settings):
-    """Check that the film can have the layers asked for; returns its colours.
+    """Check the film against the requested layers; returns its colours.
 
     Raises ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without pixels
     or too large.

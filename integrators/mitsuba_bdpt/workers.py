@@ -1,4 +1,4 @@
-"""Calls on the workers of a ``dask.distributed`` scheduler."""
+"""Calls on workers of a ``dask.distributed`` scheduler."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ one_at_a_time = threading.Lock()
 
 
 class Cluster:
-    """A connection to the scheduler at ``address``, by a ``distributed.Client``."""
+    """A ``distributed.Client`` of the scheduler at ``address``."""
 
     def __init__(self, address: str):
         self.address, self.client = address, _client(address)
 
     def reconnect(self) -> None:
-        """Connect to a scheduler that was restarted, which knows nothing of what the former one had.
+        """Connect to a restarted scheduler, which has no state of the previous one.
 
-        Raises ``OSError`` if none comes within `RETURNS_WITHIN`.
+        Raises ``OSError`` if none answers within `RETURNS_WITHIN`.
         """
         print(f"warning: the scheduler {self.address} is gone; waiting for another one", file=sys.stderr)
         self.close()
@@ -48,7 +48,7 @@ class Cluster:
                 time.sleep(1)
 
     def close(self) -> None:
-        """End the connection, also to a scheduler that is gone."""
+        """Close the connection, even if the scheduler is gone."""
         with contextlib.suppress(Exception):
             self.client.close(timeout=3)
 
@@ -61,9 +61,9 @@ def _client(address: str) -> Any:
 
 
 def _check_answers(address: str) -> None:
-    """Raise ``OSError`` if nothing at ``address`` speaks.
+    """Raise ``OSError`` if no scheduler answers at ``address``.
 
-    A scheduler does so when it is connected to; for one that does not, a ``Client`` waits for ever.
+    A scheduler sends first. Without an answer, ``Client`` would wait forever.
     """
     from distributed.comm.addressing import parse_address, parse_host_port
 
@@ -81,11 +81,11 @@ def _check_answers(address: str) -> None:
 
 
 def results(cluster: Cluster, function, arguments):
-    """Index and result of ``function(*arguments[index])``, each index once, as they come from the workers.
+    """Yield index and result of ``function(*arguments[index])`` as workers finish.
 
-    A worker has one call at a time; where none are left to begin, idle ones take over calls that others still
-    have, so that one slow machine does not hold up the rest: a call has to give the same wherever it runs.
-    That of a lost worker is made by another one; those of a scheduler that is gone are made anew by the next.
+    Each index is yielded once. A worker runs one call at a time. Idle workers repeat unfinished calls, so
+    that a slow machine does not delay the end; results must not depend on the worker. Calls of a lost worker
+    move to another one; calls of a lost scheduler are repeated by the next.
     """
     from distributed import as_completed
 
@@ -98,7 +98,7 @@ def results(cluster: Cluster, function, arguments):
         pending.add(future)
 
     def fill():
-        workers = max(1, worker_count(cluster.client))  # none for a moment: another one may come
+        workers = max(1, worker_count(cluster.client))  # may be 0 for a moment
         while len(running) < workers and to_do:
             submit(to_do.popleft())
         for index in [i for i in running.values() if i not in done]:
@@ -135,12 +135,12 @@ def results(cluster: Cluster, function, arguments):
             except _gone():
                 recover()
     finally:
-        with contextlib.suppress(Exception):  # of a scheduler that is gone
+        with contextlib.suppress(Exception):  # the scheduler may be gone
             cluster.client.cancel(list(running), force=True)
 
 
 def _gone() -> tuple[type[BaseException], ...]:
-    """What is raised where a scheduler is gone."""
+    """Return the exceptions raised when a scheduler is gone."""
     from distributed.client import ClosedClientError
 
     return CancelledError, ClosedClientError
@@ -157,16 +157,16 @@ def _result(future, index: int):
 
 
 def worker_count(client) -> int:
-    """Workers that the scheduler of a ``distributed.Client`` has now."""
+    """Return the number of workers of a ``distributed.Client``."""
     return len(client.scheduler_info(n_workers=-1)["workers"])
 
 
 @contextmanager
 def connected(address: str):
-    """The `Cluster` of the scheduler at ``address``.
+    """Yield the `Cluster` of the scheduler at ``address``.
 
     Raises ``CommandError`` if distributed is not installed or the scheduler has no worker, ``OSError`` if
-    there is no such scheduler, after `ANSWERS_WITHIN`.
+    there is no scheduler within `ANSWERS_WITHIN`.
     """
     try:
         import distributed  # noqa: F401
