@@ -1,1 +1,1 @@
-"""Files: scene files and what they name, images, files that are whole or not there."""
+"""Scene files and the files that they name, images, atomic writes."""

@@ -1,4 +1,4 @@
-"""Image files: EXR with a PNG beside it, layers of an EXR."""
+"""Image files: an EXR with a PNG beside it, layers of an EXR."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ MOST_CHANNELS = 1023
 
 
 def check_channels(film: mi.Film, layers: list[str]) -> None:
-    """Raise ``CommandError`` for more ``layers``, names of channels, than a file can hold.
+    """Raise ``CommandError``, before the render, if a file cannot hold the ``layers``.
 
-    Before the render: writing would find it out after it.
+    ``layers``: names of channels.
     """
     if len(layers) + film.base_channels_count() > MOST_CHANNELS // 2:
         count = film.prepare(layers)
@@ -40,7 +40,7 @@ def check_channels(film: mi.Film, layers: list[str]) -> None:
 
 
 def check_png(film: mi.Film) -> None:
-    """Raise ``CommandError`` for an image that no PNG can hold, which would come out after the render."""
+    """Raise ``CommandError``, before the render, for an image too large for a PNG."""
     width, height = film.crop_size()
     if max(width, height) > PNG_SIDE:
         raise CommandError(
@@ -50,7 +50,7 @@ def check_png(film: mi.Film) -> None:
 
 
 def prepare_output(output: Path) -> None:
-    """Refuse an `output` that cannot be written in the end, which may be in hours; create its directory."""
+    """Create the folder of `output`; raise an error, before the render, if not writable."""
     if output.suffix.lower() != ".exr":
         raise CommandError(
             f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."
@@ -68,7 +68,7 @@ def prepare_output(output: Path) -> None:
 
 
 def attribute(path: Path, name: str) -> str | None:
-    """A text in the header of an EXR file; None if it is not there, or the file is none."""
+    """Return a text of an EXR header; None if it is missing, or the file is no EXR."""
     if not path.is_file():
         return None
     try:
@@ -79,7 +79,7 @@ def attribute(path: Path, name: str) -> str | None:
 
 
 def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
-    """Write the film as an EXR with these header `attributes`, and as a PNG beside it."""
+    """Write the film as an EXR with header `attributes`, and as a PNG beside it."""
     bitmap = film.bitmap()
     names = [channel.name for channel in bitmap.struct_()]
     # Mitsuba's own conversion loses the names of channels beyond the image's.
@@ -93,12 +93,12 @@ def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exp
 
 
 def write_png(film: mi.Film, bitmap: mi.Bitmap, path: Path, exposure: float) -> None:
-    """Write the picture for a screen of the ``film``'s ``bitmap``."""
+    """Write the tone-mapped image of the ``film``'s ``bitmap``."""
     write_whole(developed(screen_image(film, bitmap), exposure), path, mi.Bitmap.FileFormat.PNG)
 
 
 def screen_image(film: mi.Film, bitmap: mi.Bitmap) -> mi.Bitmap:
-    """What of a ``film``'s ``bitmap`` is shown on screens: its colours, denoised if they are, or `grey`."""
+    """Return the colours to display: denoised if present, or `grey` without colours."""
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         return grey(np.array(bitmap)[..., : film.base_channels_count()])
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
@@ -109,26 +109,25 @@ def screen_image(film: mi.Film, bitmap: mi.Bitmap) -> mi.Bitmap:
 
 
 def grey(bands: np.ndarray) -> mi.Bitmap:
-    """Grey image of a film without colours, for a screen: the mean of its `bands`.
+    """Return a grey image, the mean of `bands`, of a film without colours.
 
-    Their units are the user's own; it is so bright that one pixel in a hundred is white.
+    Units of bands are arbitrary; the exposure makes 1 % of the pixels white.
     """
     mean = np.mean(bands, axis=-1, dtype=np.float32, keepdims=True)
     return mi.Bitmap(mean / max(np.quantile(mean, 0.99), 1e-30), mi.Bitmap.PixelFormat.Y)
 
 
 def developed(bitmap: mi.Bitmap, exposure: float) -> mi.Bitmap:
-    """The picture for a screen: exposure, clipping to [0, 1] and the sRGB curve."""
+    """Tone-map: exposure, clipping to [0, 1], sRGB curve."""
     rgb = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     bright = mi.Bitmap(mi.TensorXf(rgb) * 2.0**exposure, mi.Bitmap.PixelFormat.RGB)
     return bright.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True)
 
 
 def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat) -> None:
-    """Write an image by `replacing`.
+    """Write an image by `replacing`, and check that all of it was written.
 
-    Mitsuba's own files are closed without a look at what could not be written: on a full disk the end of a
-    PNG is missing, and nobody hears of it.
+    Mitsuba does not report failed writes: on a full disk the end of a PNG is missing.
     """
     stream = mi.MemoryStream()
     with two_threads():
@@ -139,7 +138,7 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
 
 @contextmanager
 def two_threads():
-    """Within, Dr.Jit has two threads at least: with one, Mitsuba waits for ever at an EXR."""
+    """Within, Dr.Jit has at least two threads: with one, Mitsuba deadlocks at an EXR."""
     before = dr.thread_count()
     if before < 2:
         dr.set_thread_count(2)
@@ -151,11 +150,10 @@ def two_threads():
 
 
 def check_output(path: Path, suffix: str) -> None:
-    """Refuse an output that cannot or must not be written, before anything is rendered.
+    """Raise an error, before the render, if an output cannot be written.
 
-    That is one of another ``suffix``, one that cannot be written, and one that would overwrite an image of
-    another format. The output's folder is made. With an EXR goes a PNG of its name, as from the command
-    ``render``.
+    That is an output of another ``suffix``, not writable, or one that would overwrite an image of another
+    format (the EXR, or the PNG of its name). Creates the output's folder.
     """
     if suffix == ".exr":
         prepare_output(path)
@@ -168,7 +166,7 @@ def check_output(path: Path, suffix: str) -> None:
 
 
 def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
-    """An EXR of layers {prefix: (height, width, 3)}, written by `replacing`."""
+    """Write an EXR of layers {prefix: (height, width, 3)}, by `replacing`."""
     channels = {
         f"{layer}{c}": np.ascontiguousarray(pixels[..., i]).astype(dtype)
         for layer, pixels in layers.items()
@@ -177,21 +175,21 @@ def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
-        temporary.touch()  # OpenEXR does not say what hinders it
+        temporary.touch()  # OpenEXR does not report the cause
         file.write(str(temporary))
         try:
             read_layers(temporary, *layers)
-        except CommandError as error:  # nor that a disk is full
+        except CommandError as error:  # OpenEXR does not report a full disk
             why = "could not be written whole; is the disk full?"
             raise OSError(errno.ENOSPC, why, str(path)) from error
 
 
 def read_layers(path: Path, *layers: str):
-    """Images (height, width, 3) of an EXR's layers, and its header.
+    """Return images (height, width, 3) of an EXR's layers, and its header.
 
-    ``layers`` are the prefixes of `write_layers`. Raises ``CommandError`` for another file.
+    ``layers``: prefixes as in `write_layers`. Raises ``CommandError`` for other files.
     """
-    with path.open("rb") as file:  # OpenEXR does not say what hinders it
+    with path.open("rb") as file:  # OpenEXR does not report the cause
         start = file.read(4)
     if start != MAGIC[".exr"]:
         raise CommandError(f"{str(path)!r} is not an EXR")
@@ -202,7 +200,7 @@ def read_layers(path: Path, *layers: str):
     with opened as file:
         try:
             channels, header = file.channels(), dict(file.header())
-        except ValueError as error:  # of a file that ends in the middle
+        except ValueError as error:  # a truncated file
             raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
         missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
         if missing:

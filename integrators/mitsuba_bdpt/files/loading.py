@@ -1,4 +1,4 @@
-"""From a command line to a scene and the integrator that renders it."""
+"""Loads a scene and its integrator from command-line options."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ AROUND = ("aov", "stokes", *NOT_CARRIED)
 LISTED = 8
 """Names that a message lists, at most."""
 
-# What files in other encodings than UTF-8 begin with: a byte order mark, or the first "<" of a file without.
-# Of two that fit the first counts.
+# First bytes of files in other encodings than UTF-8: a byte order mark, or the first "<". The first match
+# counts.
 _STARTS = (
     (codecs.BOM_UTF32_LE, "utf-32"),
     (codecs.BOM_UTF32_BE, "utf-32"),
@@ -61,17 +61,17 @@ _STARTS = (
 
 
 def elements(file: Path) -> list[ElementTree.Element]:
-    """All elements of a scene file, in its order; raises ``CommandError`` if it is not XML."""
+    """Return all elements of a scene file in order; raises ``CommandError`` if not XML."""
     text = _decoded(file.read_bytes())
     try:
-        # Mitsuba takes comments that hold two hyphens, XML does not.
+        # Mitsuba accepts "--" within comments, XML does not.
         return list(ElementTree.fromstring(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)).iter())
     except (ElementTree.ParseError, ValueError) as error:
         raise CommandError(f"{str(file)!r} is not well-formed XML: {error}") from error
 
 
 def _decoded(data: bytes) -> str:
-    """The text of a scene file, whose encoding Mitsuba tells by its first bytes."""
+    """Decode a scene file; its first bytes give the encoding, as in Mitsuba."""
     if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)[\"']", data, re.IGNORECASE):
         return data.decode("latin-1")
     encoding = next((name for start, name in _STARTS if data.startswith(start)), "utf-8-sig")
@@ -79,18 +79,17 @@ def _decoded(data: bytes) -> str:
 
 
 def in_proportion(scene: Path, definitions: dict) -> dict:
-    """``definitions`` with the ``resolution_y`` that keeps the image's proportions.
+    """Add to ``definitions`` a ``resolution_y`` that keeps the aspect ratio.
 
-    It is the height that belongs to the ``resolution`` among them, added if the scene file has such defaults
-    and it is not given.
+    Only if ``resolution`` is defined, ``resolution_y`` is not, and the scene file has defaults for both.
     """
     if "resolution" not in definitions or "resolution_y" in definitions:
         return definitions
     try:
         defaults = [element for element in elements(scene) if element.tag == "default"]
-    except ValueError:  # Mitsuba, which takes more for XML, has the last word
+    except ValueError:  # Mitsuba's parser accepts more, and decides
         return definitions
-    # Of several with one name Mitsuba takes the first.
+    # Mitsuba takes the first of several with one name.
     known = {element.get("name"): element.get("value", "") for element in reversed(defaults)}
     texts = str(definitions["resolution"]), known.get("resolution", ""), known.get("resolution_y", "")
     if not all(text.strip().isdecimal() for text in texts) or not int(texts[1]):
@@ -100,7 +99,7 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
 
 
 class Loaded(NamedTuple):
-    """A scene and the integrator to render it with; ``used`` says in words which one that is, and why."""
+    """A scene and its integrator; ``used`` describes the choice of the integrator."""
 
     scene: mi.Scene
     integrator: mi.Integrator
@@ -143,7 +142,7 @@ def load(options: Namespace) -> Loaded:
 
 
 def _load(options: Namespace) -> Loaded:
-    """`load`, of a scene file that exists and with the variant set."""
+    """Like `load`, for an existing scene file and with the variant set."""
     overrides = dict(options.properties)
     if options.time is not None:
         overrides["timeout"] = options.time
@@ -157,9 +156,9 @@ def _load(options: Namespace) -> Loaded:
     _check_film_sizes(state)
     for film in _films_of_images(state):
         set_film_size(film.props, options.size, options.crop)
-    if len(_meters(state)) > 1:  # equal ones would become one, which Mitsuba refuses on a second shape
+    if len(_meters(state)) > 1:  # equal ones would be merged, and rejected on a second shape
         config.merge_equivalent = False
-    # Nodes are in the order of the file: an integrator comes before those nested in it.
+    # Nodes are in file order: an integrator precedes those nested in it.
     node = next((node for node in state.nodes if node.type == mi.ObjectType.Integrator), None)
     own = node.props.plugin_name() if node is not None else None
     used = asked or own or "bdpt"
@@ -178,7 +177,7 @@ def _load(options: Namespace) -> Loaded:
     kept = {} if node is None else replace_integrator(state.nodes, node, asked, overrides)
     said = _in_place_of(own, used, kept, asked)
     mi.parser.transform_all(config, state)
-    # The stub says object; `_check_root` has seen that it is a scene.
+    # The stub says object; `_check_root` has verified that it is a scene.
     scene: mi.Scene = mi.parser.instantiate(config, state)  # pyright: ignore[reportAssignmentType]
     _check_no_meter(scene, options)
     if node is not None:
@@ -190,9 +189,9 @@ def _load(options: Namespace) -> Loaded:
 
 
 def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: str | None) -> str:
-    """Which integrator is ``used``, and what it replaces.
+    """Describe which integrator is ``used``, and what it replaces.
 
-    ``own``: the scene file's; ``kept``: its parameters that the other one takes over; ``asked``: by
+    ``own``: the scene file's; ``kept``: its parameters that the new one takes over; ``asked``: value of
     ``--integrator``, None for the file's own.
     """
     if own is None:
@@ -207,9 +206,9 @@ def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: 
 
 
 def _check_kind(name: str) -> None:
-    """Raise ``CommandError`` if the plugin ``name`` is known to be no integrator.
+    """Raise ``CommandError`` if the plugin ``name`` is known not to be an integrator.
 
-    What those in Python are is known when they are made, and what is no plugin is answered then.
+    Plugins in Python, and unknown names, are checked when they are instantiated.
     """
     kind = mi.PluginManager.instance().plugin_type(name)
     if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
@@ -221,7 +220,7 @@ def _no_integrator(name: str, what: str) -> str:
 
 
 def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
-    """Raise ``CommandError`` if the file ``scene`` holds one object that is no scene."""
+    """Raise ``CommandError`` if the root of the file ``scene`` is not a scene."""
     root = state.nodes[0]
     if root.type != mi.ObjectType.Scene:
         held = f"{root.type.name.lower()} {root.props.plugin_name()}"
@@ -232,12 +231,12 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
 
 
 def _films(state: mi.parser.ParserState) -> list:
-    """The nodes of all films."""
+    """Return the nodes of all films."""
     return [node for node in state.nodes if node.type == mi.ObjectType.Film]
 
 
 def _meters(state: mi.parser.ParserState) -> list:
-    """The nodes of all sensors that measure at a point, along a ray or on a shape, and make no image."""
+    """Return the nodes of sensors without image: at a point, along a ray, on a shape."""
     return [node for node in state.nodes if node.type == mi.ObjectType.Sensor and _is_meter(node)]
 
 
@@ -246,7 +245,7 @@ def _is_meter(node: mi.parser.SceneNode) -> bool:
 
 
 def _films_of_images(state: mi.parser.ParserState) -> list:
-    """The nodes of all films but those of meters."""
+    """Return the nodes of all films but those of meters."""
     held: set[int] = set()
     for node in _meters(state):
         values = [node.props[name] for name in node.props]
@@ -261,7 +260,7 @@ def _films_of_images(state: mi.parser.ParserState) -> list:
 
 
 def _check_no_meter(scene: mi.Scene, options: Namespace) -> None:
-    """Raise ``CommandError`` if ``--size`` or ``--crop`` is given for a sensor that is a meter."""
+    """Raise ``CommandError`` if ``--size`` or ``--crop`` is given for a meter."""
     given = next((name for name in ("size", "crop") if getattr(options, name)), None)
     if given is None:
         return
@@ -276,7 +275,7 @@ def _check_no_meter(scene: mi.Scene, options: Namespace) -> None:
 
 
 def _check_film_sizes(state: mi.parser.ParserState) -> None:
-    """Raise ``CommandError`` for films without pixels, of which Mitsuba says that they see too much."""
+    """Raise ``CommandError`` for films without pixels; Mitsuba's message misleads."""
     for node in _films(state):
         for name in ("width", "height"):
             if isinstance(size := node.props.get(name, 1), int) and size < 1:
@@ -284,9 +283,9 @@ def _check_film_sizes(state: mi.parser.ParserState) -> None:
 
 
 def set_film_size(film: mi.Properties, size: Sequence[int] | None, crop: Sequence[int] | None) -> None:
-    """Give a ``film`` another ``size`` (width, height), and a ``crop`` window (x, y, width, height).
+    """Set a ``film``'s ``size`` (width, height) and ``crop`` (x, y, width, height).
 
-    Raises ``CommandError`` if the window is not within the image, or was made for another size.
+    Raises ``CommandError`` if the window exceeds the image, or was set for another size.
     """
     of_scene = [name for name in CROP if name in film]
     if size is not None:
@@ -298,7 +297,7 @@ def set_film_size(film: mi.Properties, size: Sequence[int] | None, crop: Sequenc
         film["width"], film["height"] = size
     if crop is None:
         return
-    # Mitsuba's own size where a film names none.
+    # Mitsuba's default size.
     width, height = int(film.get("width", 768)), int(film.get("height", 576))
     if crop[0] + crop[2] > width or crop[1] + crop[3] > height:
         raise CommandError(
@@ -316,7 +315,7 @@ def check_file(scene: Path) -> None:
 
 
 def _scenes_near(scene: Path) -> str:
-    """What there is in place of the ``scene`` file that does not exist."""
+    """Suggest files in place of a ``scene`` file that does not exist."""
     folder = scene if scene.is_dir() else scene.parent
     if not folder.is_dir():
         return f"there is no folder {str(folder)!r}"
@@ -329,13 +328,13 @@ def _scenes_near(scene: Path) -> str:
 
 
 def _files_near(scene: Path, name: str) -> str:
-    """Where Mitsuba looked for a file of the ``scene`` that does not exist, and what it may be.
+    """Describe where Mitsuba searched for a missing file, and suggest others.
 
-    Empty if the scene file itself does not have this ``name``, of which Mitsuba may tell the last part only.
+    Empty if the scene file does not contain ``name``; Mitsuba may report its last part only.
     """
     try:
         texts = [element.get("value", "") for element in elements(scene)]
-    except ValueError:  # Mitsuba takes more for XML
+    except ValueError:  # Mitsuba accepts more than XML
         return ""
     files = [scene.parent / text for text in texts if text == name or Path(text).name == name]
     if not files:
@@ -348,7 +347,7 @@ def _files_near(scene: Path, name: str) -> str:
 
 
 def _in_words(error: str, options: Namespace) -> str | None:
-    """What to say instead of Mitsuba's ``error`` about a name that it does not know: one that is alike.
+    """Return a message for Mitsuba's ``error`` about an unknown name, with a suggestion.
 
     None for other errors.
     """
@@ -391,9 +390,9 @@ def _in_words(error: str, options: Namespace) -> str | None:
 
 
 def _unused_parameters(error: str, options: Namespace) -> str | None:
-    """What to say of Mitsuba's ``error`` about parameters of the scene file that a plugin does not have.
+    """Return a message for Mitsuba's ``error`` about unused parameters of a plugin.
 
-    None for other errors, and for names that resemble none of the plugin's.
+    None for other errors, and for names that resemble no parameter of the plugin.
     """
     found = re.search(r'Found \d+ unreferenced \w+ in \w+ plugin of type "([^"]*)"', error)
     names = re.findall(r'^  - \w+ "([^"]*)"', error, re.MULTILINE) if found else []
@@ -404,7 +403,7 @@ def _unused_parameters(error: str, options: Namespace) -> str | None:
 
 
 def words_of(plugin: str) -> list[str]:
-    """Words in the library of one of Mitsuba's plugins, among them most names of its parameters.
+    """Return words in the library of a plugin, most of its parameter names among them.
 
     Mitsuba cannot list parameters that are not given. Empty for plugins in Python.
     """
@@ -414,7 +413,7 @@ def words_of(plugin: str) -> list[str]:
 
 
 def _rejected(error: str, options: Namespace) -> str | None:
-    """What to say of Mitsuba's ``error`` about a value, if it comes from the command line; else None."""
+    """Return a message for Mitsuba's ``error`` about a value of ``-D``; else None."""
     found = re.search(
         r'could not parse ([\w ]+) value "([^"]*)".*|Property "\w+": value (\S+) is out of.*', error
     )
@@ -426,15 +425,15 @@ def _rejected(error: str, options: Namespace) -> str | None:
         return None
     place = re.search(r"\(line \d+, col \d+\)", error)
     where = f" {place[0]}" if place else ""
-    # Where several have the value, Mitsuba does not tell which of them it is.
+    # If several have the value, Mitsuba does not name the parameter.
     return f"{' or '.join(given)}: {found[0].rstrip('.')}, in {str(options.scene)!r}{where}; give it another"
 
 
 def parameters(scene: Path) -> dict[str, str]:
-    """The parameters that ``-D`` can set in a scene file, with their defaults.
+    """Return the parameters that ``-D`` can set in a scene file, with their defaults.
 
-    Those that the file, or one that it includes, uses: Mitsuba takes a default that nothing uses for a
-    mistake of the command line's. A default is empty if there is none.
+    Only parameters that the file, or an included one, uses: Mitsuba rejects unused ones. A missing default is
+    empty.
     """
     found, used, files, done = {}, set(), [scene], set()
     while files:
@@ -444,7 +443,7 @@ def parameters(scene: Path) -> dict[str, str]:
         done.add(file)
         try:
             there = elements(file)
-        except ValueError:  # Mitsuba takes more for XML
+        except ValueError:  # Mitsuba accepts more than XML
             continue
         for element in there:
             names = [name for value in element.attrib.values() for name in re.findall(r"\$(\w+)", value)]
@@ -459,7 +458,7 @@ def parameters(scene: Path) -> dict[str, str]:
 
 
 def plugins() -> list[str]:
-    """Names of the plugins of Mitsuba and of this package; others may have been registered too."""
+    """Return the names of plugins of Mitsuba and of this package."""
     modules = [module.name for module in pkgutil.iter_modules(mi.ad.integrators.__path__)]
     files = (Path(mi.__file__).parent / "plugins").iterdir()
     return ["bdpt", *modules, *sorted(path.stem for path in files)]
@@ -468,13 +467,12 @@ def plugins() -> list[str]:
 def replace_integrator(
     nodes: Sequence, node, kind: str | None, overrides: Mapping[str, bool | int | float | str]
 ) -> dict[str, object]:
-    """Give the integrator ``node``, one of ``nodes``, another ``kind`` if that is set, and ``overrides``.
+    """Set the ``kind`` of the integrator ``node``, if given, and ``overrides``.
 
-    Returns the parameters of the replaced one that stay.
+    Returns the parameters of the replaced integrator that are kept.
 
-    Of integrators around another one (`AROUND`), with their layers, `bdpt` takes the place of all of them,
-    for it has layers of its own; others take the place of the innermost. Raises ``CommandError`` for layers
-    that cannot be kept.
+    `bdpt` replaces integrators around another (`AROUND`) as a whole, since it has their layers; others
+    replace the innermost integrator. Raises ``CommandError`` for layers that cannot be kept.
     """
     given, layers = node.props, {}
     if kind == "bdpt" and given.plugin_name() in AROUND:
@@ -488,9 +486,9 @@ def replace_integrator(
 
 
 def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
-    """Properties of the innermost integrator of ``node``, and what `bdpt` takes over from those around it.
+    """Return the innermost properties, and what `bdpt` takes from outer integrators.
 
-    The latter are layers, named as in Mitsuba's film, and the outermost ``timeout``, which counts there.
+    The latter are layers, named as in Mitsuba's film, and the outermost ``timeout``, which applies there.
     """
     aovs, carried, prefix = [], {}, ""
     while (kind := node.props.plugin_name()) in AROUND:
@@ -519,7 +517,7 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
 
 
 def _nested(nodes: Sequence, node) -> tuple[str, object]:
-    """Name and node of the one integrator inside of ``node``, which is around it."""
+    """Return name and node of the single integrator nested in ``node``."""
     held = {key: node.props[key] for key in node.props.keys()}
     held = {key: value for key, value in held.items() if isinstance(value, mi.Properties.ResolvedReference)}
     found = [(key, nodes[reference.index()]) for key, reference in held.items()]
@@ -537,7 +535,7 @@ def _nested(nodes: Sequence, node) -> tuple[str, object]:
 def integrator_properties(
     given: mi.Properties, kind: str | None, overrides: Mapping[str, bool | int | float | str]
 ) -> mi.Properties:
-    """The `given` properties with `overrides`, for an integrator of another `kind` if it is set."""
+    """Return the `given` properties with `overrides`, for a plugin of `kind` if set."""
     if kind is None or kind == given.plugin_name():
         properties = mi.Properties(given)
     else:
@@ -549,7 +547,7 @@ def integrator_properties(
         for key in KEPT:
             if key in given:
                 properties[key] = given[key]
-                # Not every integrator has all of them; that is no mistake of the user's.
+                # Not every integrator has all of them, which is no error.
                 properties.mark_queried(key)
     for key, value in overrides.items():
         properties[key] = value
@@ -557,7 +555,7 @@ def integrator_properties(
 
 
 def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
-    """The sensor with this `index`."""
+    """Return the sensor with this `index`."""
     sensors = scene.sensors()
     if not sensors:
         raise CommandError("The scene has no sensor; add one to the scene file.")

@@ -11,11 +11,10 @@ from .loading import elements
 def named_files(
     scene: Path, definitions: Iterable[tuple[str, str]] = (), folders: Iterable[Path] = ()
 ) -> list[Path]:
-    """Files that a scene file names, and those that named scene files name, each once.
+    """Return existing files that a scene file, or an included one, names.
 
-    Meshes, textures, spectra and scene files, as far as they exist; raises ``CommandError`` if one of the
-    scene files is not XML. ``definitions`` of parameters, for names that hold some; ``folders`` in which
-    Mitsuba looks too.
+    Each once. ``definitions``: parameters within names; ``folders``: additional search folders. Raises
+    ``CommandError`` if a scene file is not XML.
     """
     found = {}
     _note_files(scene, dict(definitions), [Path(), *folders], found)
@@ -23,10 +22,10 @@ def named_files(
 
 
 def _note_files(scene: Path, values: dict, folders: list[Path], found: dict[Path, None]) -> None:
-    """Add to ``found``, a set in the order of the files, what a scene file names.
+    """Add to ``found``, an ordered set, the files that a scene file names.
 
-    Looked for as Mitsuba does: beside it, then in ``folders``. ``values`` of parameters, to which its own
-    defaults are added.
+    Searches like Mitsuba: beside the scene file, then in ``folders``. The file's defaults are added to
+    ``values``.
     """
     folders = [scene.parent, *folders]
 
@@ -50,7 +49,7 @@ def _note_files(scene: Path, values: dict, folders: list[Path], found: dict[Path
 
 
 def _substituted(text: str, values: dict) -> str:
-    """``text`` with the values of its parameters, longer names first, as one may begin with another."""
+    """Substitute parameters in ``text``, longest names first (one may be a prefix)."""
     for key in sorted(values, key=len, reverse=True):
         text = text.replace(f"${key}", values[key])
     return text

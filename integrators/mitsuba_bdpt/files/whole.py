@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Atomic writes of files, and checks before them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def _temporary(path: Path) -> Path:
 
 
 def check_format(path: Path, output: Path) -> None:
-    """Raise ``CommandError`` if ``path`` is a file of another format than its suffix names.
+    """Raise ``CommandError`` if ``path`` exists in another format than its suffix.
 
-    ``path`` goes with ``output``; an image of the format that the suffix names may be replaced.
+    ``output``: the user's path, for the message. An image of the suffix's format may be replaced.
     """
     kind = path.suffix.lower()
-    if kind not in MAGIC or not path.is_file():  # of a pipe nothing must be read
+    if kind not in MAGIC or not path.is_file():  # a pipe must not be read
         return
     with path.open("rb") as file:
         start = file.read(4)
@@ -34,15 +34,15 @@ def check_format(path: Path, output: Path) -> None:
 
 
 def check_own(path: Path, mark: str, remedy: str) -> None:
-    """Raise ``CommandError`` with the ``remedy`` if ``path`` is a text without the command's own ``mark``."""
+    """Raise ``CommandError`` with the ``remedy`` if the text at ``path`` lacks ``mark``."""
     if path.is_file() and mark not in (text := path.read_text(errors="replace")) and text.strip():
         raise CommandError(f"{str(path)!r} exists and was made by something else; {remedy}")
 
 
 def check_writable(path: Path) -> None:
-    """Raise ``OSError`` now if `replacing` could not write `path` later.
+    """Raise ``OSError`` if `replacing` could not write `path` later.
 
-    Raises ``CommandError`` if `path` is something else than a file.
+    Raises ``CommandError`` if `path` is not a file.
     """
     if path.exists() and not path.is_file():
         raise CommandError(f"{str(path)!r} is no file; name another output.")
@@ -55,9 +55,9 @@ def check_writable(path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path):
-    """Name of a file beside `path` that takes its place at the end.
+    """Yield a temporary path that replaces `path` at the end.
 
-    Whoever looks at `path` never sees half a file, and an error leaves what was there.
+    Readers never see a partial file; an exception leaves the old file.
     """
     temporary = _temporary(path)
     try:
