@@ -1,8 +1,8 @@
 """The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
 
-``render`` renders a scene file; ``explain`` says what such a render would do and what it would leave out;
-``doctor`` explains what the installation found and whether it works; `measuring` declares those that measure.
-What needs Mitsuba is imported inside `main`, because `doctor` has to run where that cannot be imported.
+``render`` renders a scene file; ``explain`` describes such a render; ``doctor`` checks the installation;
+`measuring` declares the commands that measure. Mitsuba is imported inside `main`, because `doctor` has to run
+where that import fails.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line `arguments` (default: the process's own) and return its exit status."""
+    """Run a command line (default: the process's own) and return its exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)
     if options.command == "doctor":
@@ -47,17 +47,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that takes whole words only, and asks whether another command or option was meant."""
+    """A parser without abbreviations, which suggests commands and options."""
 
     def __init__(self, **settings):
         self._options: list[str] = []
         self._commands: dict[str, Parser] = {}
         self._subparsers_action = None
-        # Half of an option may be another one in the next version.
+        # An abbreviation may become ambiguous in the next version.
         super().__init__(allow_abbrev=False, **settings)
 
     def add_argument(self, *names, **settings):
-        """Declare an argument as argparse does."""
+        """Declare an argument, like argparse."""
         self._options += [name for name in names if name.startswith("-")]
         return super().add_argument(*names, **settings)
 
@@ -73,7 +73,7 @@ class Parser(argparse.ArgumentParser):
         super().error(f"{message}; {question}".rstrip("; "))
 
     def _question(self, name: str, command: bool) -> str:
-        """What may be meant by an unknown ``name``, of a ``command`` or an option."""
+        """Suggest a ``command``, or an option, for an unknown ``name``."""
         known = [*self._options, *self._commands]
         known += [name for parser in self._commands.values() for name in parser._options]
         if name in known:
@@ -83,7 +83,7 @@ class Parser(argparse.ArgumentParser):
         return removed.remedy(name) or did_you_mean(name, known)
 
     def add_command(self, name: str, help_text: str) -> Parser:
-        """The parser of a new command."""
+        """Return the parser of a new command."""
         if self._subparsers_action is None:
             self._subparsers_action = self.add_subparsers(dest="command", required=True, metavar="COMMAND")
         made = self._subparsers_action.add_parser(
@@ -93,12 +93,12 @@ class Parser(argparse.ArgumentParser):
         return made
 
     def _commands_with(self, option: str) -> list[str]:
-        """The commands that have this ``option``."""
+        """Return the commands that have this ``option``."""
         return [name for name, parser in self._commands.items() if option in parser._options] or [self.prog]
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+    """Return the parser of all commands."""
     parser = Parser(
         prog="mitsuba_bdpt",
         description="Bidirectional path tracing for Mitsuba 3.",
@@ -124,7 +124,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _versions() -> str:
-    """Versions of this package, Mitsuba and Dr.Jit, as far as they are installed."""
+    """Return the installed versions of this package, Mitsuba and Dr.Jit."""
     found = []
     for name in ("mitsuba", "drjit"):
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -133,7 +133,7 @@ def _versions() -> str:
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what ``render`` and ``explain`` need of a scene; ``-D``, ``-m`` and ``-s`` as in Mitsuba."""
+    """Declare the scene arguments; ``-D``, ``-m`` and ``-s`` as in Mitsuba."""
     add = parser.add_argument
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")

@@ -1,4 +1,4 @@
-"""Checkpoints of ``python -m mitsuba_bdpt render``: what a render that was killed goes on from."""
+"""Checkpoints of ``python -m mitsuba_bdpt render``, to resume a killed render."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ CONTENT = "bdptContent"
 
 
 def path_of(output: Path) -> Path:
-    """Where the checkpoint of an image lies: beside it."""
+    """Return the path of an image's checkpoint, beside the image."""
     return output.with_suffix(".checkpoint.npz")
 
 
 def digest(options: Namespace) -> str:
-    """Of a scene file, the files that it names, definitions on the command line, sensor and film."""
+    """Hash the scene file, files that it names, definitions, sensor and film."""
     film = [options.size, options.crop] if options.size or options.crop else []
     found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor, *film]).encode())
     for path in (options.scene, *named_files(options.scene, options.defines, options.append)):
@@ -40,13 +40,13 @@ def digest(options: Namespace) -> str:
 
 
 def content(options: Namespace) -> str:
-    """What determines the image of a command line but for its noise, as a hash."""
+    """Hash what determines the expected image of a command line."""
     names = "variant", "integrator", "properties", "denoise", "exposure"
     return _hash([digest(options), versions(), *(getattr(options, name) for name in names)])
 
 
 def identity(options: Namespace, spp: int) -> str:
-    """What determines the image of a command line with ``spp`` samples per pixel, as a hash."""
+    """Hash what determines the image of a command line with ``spp`` samples per pixel."""
     return _hash([content(options), spp, options.seed, options.time, options.target_error])
 
 
@@ -55,13 +55,13 @@ def _hash(values: list) -> str:
 
 
 def attributes(options: Namespace, output: Path) -> dict[str, str]:
-    """Attributes of an image for renders that are resumed beside it."""
+    """Return header attributes of an image whose render can be resumed."""
     is_needed = options.checkpoint is not None or path_of(output).exists()
     return {CONTENT: content(options)} if is_needed else {}
 
 
 def samples_of_image(options: Namespace, output: Path) -> int:
-    """Samples per pixel of the image that a resumed render would replace; 0 if it is of other content."""
+    """Return samples per pixel of the existing image; 0 if it has other content."""
     is_resumed = options.checkpoint is not None and options.resume != "never" and path_of(output).exists()
     if not is_resumed or attribute(output, CONTENT) != content(options):
         return 0
@@ -76,9 +76,9 @@ def check(options: Namespace, output: Path) -> None:
 
 
 def start(options: Namespace, output: Path) -> Snapshot | None:
-    """The snapshot to go on from, None to begin; raises ``CommandError`` for one of another scene.
+    """Return the snapshot to continue from, or None.
 
-    Also if there has to be one and there is none.
+    Raises ``CommandError`` for a snapshot of another scene, or for a missing one that is required.
     """
     path = path_of(output)
     if options.checkpoint is None or options.resume == "never":
@@ -103,22 +103,22 @@ def start(options: Namespace, output: Path) -> Snapshot | None:
 
 
 class Checkpoints:
-    """Writes the checkpoints of one render: `after_pass` every so many minutes, `write` at once."""
+    """Checkpoints of one render: `after_pass` at intervals, `write` at once."""
 
     def __init__(self, options: Namespace, output: Path):
         self.path, self._seconds, self._scene = path_of(output), 60 * options.checkpoint, digest(options)
         self._last, self._report = time.monotonic(), None
 
     def after_pass(self, report) -> None:
-        """To be called with every ``PassReport``."""
+        """Called with every ``PassReport``."""
         self._report = report
         if time.monotonic() - self._last >= self._seconds:
             self.write()
 
     def write(self) -> None:
-        """Write what the last report knows, if there was one.
+        """Write the state of the last report, if any.
 
-        A full disk must not cost the render: it is said on standard error, and the former checkpoint stays.
+        A full disk does not end the render: it is reported, and the previous checkpoint is kept.
         """
         if self._report is None:
             return
@@ -128,7 +128,7 @@ class Checkpoints:
             with replacing(self.path) as temporary, temporary.open("wb") as file:
                 file.write(whole.to_bytes())
                 file.flush()
-                # Before the name, which would stand for half a file after a power cut.
+                # Before renaming, or a power cut could leave a truncated file.
                 os.fsync(file.fileno())
         except OSError as error:
             why = f"{error.strerror or error}; the render goes on"
@@ -136,5 +136,5 @@ class Checkpoints:
         self._last = time.monotonic()
 
     def remove(self) -> None:
-        """The render is finished and its image written: there is nothing to go on from."""
+        """Remove the checkpoint, after the finished image has been written."""
         self.path.unlink(missing_ok=True)

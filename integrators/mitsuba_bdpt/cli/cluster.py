@@ -1,8 +1,8 @@
-"""One render on many machines: parts with seeds of their own on the workers of ``dask.distributed``.
+"""One render on many machines: parts with different seeds on ``dask.distributed``.
 
-The client asks the pilot once; its decisions go to all. Each part is an independent render whose raw sums
-come back as a `Snapshot`; they are added in the order of the parts, so the image does not depend on which
-worker made which, nor on whether one of them was lost.
+The client runs the pilot once and sends its decisions to all workers. Each part is an independent render,
+returned as a `Snapshot`. Sums are added in the order of the parts, so the image does not depend on the
+workers.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from ..run.snapshot import Snapshot
 from ..run.statistics import RAYS
 from ..workers import connected, one_at_a_time, results, worker_count
 
-# Parts for each worker: the last one that is waited for then takes a quarter of what a worker does in all.
+# Bounds the wait for the last part to a quarter of a worker's work.
 PARTS_PER_WORKER = 4
 
-# Samples per pixel of a part at least: shorter point sequences are worse, and `variance` needs 8.
+# Minimum samples per pixel of a part: short point sequences converge slower, and `variance` needs 8.
 LEAST_SPP = 16
 
-# Between seeds of the parts, 2^32 / golden ratio: renders whose own seeds are neighbours share none.
+# Stride of the parts' seeds, 2^32 / golden ratio: renders with adjacent seeds share none.
 STRIDE = 0x9E3779B9
 
 
 def check_settings(settings) -> None:
-    """Raise ``CommandError`` for parameters that would mean something else in each part."""
+    """Raise ``CommandError`` for parameters whose meaning differs in a part."""
     for name in ("timeout", "target_error"):
         value = getattr(settings, name)
         if value > 0 or (name == "timeout" and value == 0):
@@ -50,19 +50,19 @@ def check_settings(settings) -> None:
 
 
 def parts_of(spp: int, count: int, seed: int) -> list[tuple[int, int]]:
-    """Seed and samples per pixel of ``count`` parts, fewer if they would be shorter than `LEAST_SPP`."""
+    """Return seed and samples per pixel of at most ``count`` parts, see `LEAST_SPP`."""
     count = max(1, min(count, spp // LEAST_SPP))
     return [((seed + i * STRIDE) % 2**32, spp // count + (i < spp % count)) for i in range(count)]
 
 
 class Merged:
-    """Snapshots of parts added up in the order of the parts, whatever the order in which they come."""
+    """Sums snapshots in the order of the parts, in whatever order they arrive."""
 
     def __init__(self):
         self.snapshot, self._next, self._waiting = None, 0, {}
 
     def add(self, index: int, snapshot: Snapshot) -> None:
-        """Add the part number ``index``; a part that came before is ignored."""
+        """Add part ``index``; ignores a part that was added before."""
         if index >= self._next:
             self._waiting[index] = snapshot
         while self._next in self._waiting:
@@ -70,7 +70,7 @@ class Merged:
             self._next += 1
 
     def close(self) -> None:
-        """Add the parts behind one that will not come, in their order."""
+        """Add the parts after a missing one, in order."""
         for index in sorted(self._waiting):
             self._join(index)
 
@@ -80,23 +80,22 @@ class Merged:
 
     @property
     def count(self) -> int:
-        """Parts that have come."""
+        """Number of parts that have arrived."""
         return self._next + len(self._waiting)
 
 
 def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]):
-    """Render as the command line ``options`` say on a cluster, into the sensor's film.
+    """Render on the cluster ``options.scheduler``, into the sensor's film.
 
-    The cluster is that of ``options.scheduler``; ``on_part`` is called after each part. Returns the
-    statistics, whose seconds are those of the pilot and all parts together, and what ended the render early,
-    None if nothing did: Ctrl-C, a scheduler that is gone, a part that failed. Then they are of the parts
-    that had come. Raises what `connected` does, and what ends the render before the first part.
+    ``on_part`` is called after each part. Returns the statistics (seconds: sum of the pilot and all parts),
+    and what ended the render early, else None: Ctrl-C, a lost scheduler, a failed part. The statistics then
+    cover the parts that arrived. Raises errors of `connected`, and those before the first part.
     """
     started, merged = time.perf_counter(), Merged()
     ended: BaseException | None = None
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
-        of_pilot = integrator.statistics  # before the parts, whose own take their place
+        of_pilot = integrator.statistics  # before the parts replace them
         count = options.parts or PARTS_PER_WORKER * worker_count(workers.client)
         parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
         try:
@@ -120,9 +119,9 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
 
 
 def _with_pilot(parts: dict, of_pilot: dict) -> dict:
-    """Statistics of the ``parts`` together with those ``of_pilot``.
+    """Add the statistics ``of_pilot`` to those of the ``parts``.
 
-    The parts know the pilot's decisions alone. Nothing is added where decisions were given by hand.
+    The parts contain the decisions only. Nothing is added to decisions that were given.
     """
     if not of_pilot:
         return parts
@@ -134,29 +133,29 @@ def _with_pilot(parts: dict, of_pilot: dict) -> dict:
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:
-    """What a worker needs to know of each part, as JSON.
+    """Return what a worker needs for each part, as JSON.
 
-    The scene file by its absolute path, the options that `loading.load` reads, the pilot's decisions.
+    The absolute path of the scene file, the options of `loading.load`, and the pilot's decisions.
     """
     properties, settings = dict(options.properties), integrator.settings
-    if settings.decisions is None:  # an empty list where there is nothing to choose
+    if settings.decisions is None:  # an empty list if there is no choice
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")
     kept = {name: getattr(options, name) for name in names}
     kept["append"] = [str(folder.resolve()) for folder in options.append]
-    kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last one
+    kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last render
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
 
 
 def render_part(job: str, seed: int, spp: int) -> bytes:
-    """Render one part of a `_job` on a worker; returns it as `Snapshot.to_bytes`.
+    """Render one part of a `_job` on a worker; returns `Snapshot.to_bytes`.
 
-    A process renders one part at a time, for each takes all cores.
+    A process renders one part at a time, on all cores.
     """
     with one_at_a_time:
         options, scene, integrator = _loaded(job)
-        mi.set_variant(options.variant)  # of this thread
+        mi.set_variant(options.variant)  # per thread
         reports = []
         integrator.on_pass = reports.append
         integrator.render(scene, options.sensor, seed, spp, develop=False)
@@ -166,7 +165,7 @@ def render_part(job: str, seed: int, spp: int) -> bytes:
 
 @lru_cache(maxsize=1)
 def _loaded(job: str):
-    """Options, scene and integrator of a `_job`; a worker loads them once."""
+    """Return options, scene and integrator of a `_job`, loaded once per worker."""
     options = Namespace(**json.loads(job))
     options.scene, options.append = Path(options.scene), [Path(folder) for folder in options.append]
     scene, integrator, _ = load(options)

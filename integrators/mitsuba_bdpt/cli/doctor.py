@@ -1,7 +1,7 @@
-"""``python -m mitsuba_bdpt doctor``: what is installed, and whether it works.
+"""``python -m mitsuba_bdpt doctor``: checks the installation.
 
-Only the standard library and `llvm` are imported here: the report must come out where Mitsuba
-cannot be imported. Whatever may fail or abort the process runs in a child.
+Imports only the standard library and `llvm`, since Mitsuba may be missing. What may fail or abort runs in a
+child process.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Finding:
 
 
 def run(variant: str) -> int:
-    """Print the report for `variant`; 0 if bdpt works with it, 1 if not."""
+    """Print the report for `variant`; returns 0 if bdpt works with it, else 1."""
     findings = [*versions(), llvm_library(), kernel_cache()]
     for finding in findings:
         print(finding, flush=True)
@@ -71,7 +71,7 @@ def run(variant: str) -> int:
 
 
 def versions() -> list[Finding]:
-    """Versions of Python, the platform, this package and those it uses."""
+    """Report versions of Python, the platform, this package and its dependencies."""
     system = f"{platform.system()} {platform.machine()}"
     findings = [
         Finding("ok", "python", f"{platform.python_version()}, {sys.executable}"),
@@ -82,7 +82,7 @@ def versions() -> list[Finding]:
         try:
             findings.append(Finding("ok", package, importlib.metadata.version(package)))
         except importlib.metadata.PackageNotFoundError:
-            # The LLVM wheel exists for one platform only; `llvm_library` says if that matters.
+            # The LLVM wheel exists for one platform only; `llvm_library` reports whether it is needed.
             needed = package != llvm.WHEEL
             text = f"not installed; mend it with: python -m pip install {package}"
             state = "FAIL" if needed else "note"
@@ -91,7 +91,7 @@ def versions() -> list[Finding]:
 
 
 def llvm_library() -> Finding:
-    """Which LLVM library was chosen and why, or why the package cannot be imported."""
+    """Report the LLVM library and the reason for it, or why the import failed."""
     failure, choice = mitsuba_bdpt.failure, mitsuba_bdpt.llvm_choice
     if failure is not None or choice is None:
         subject = "LLVM" if isinstance(failure, llvm.LLVMNotFoundError) else "import"
@@ -103,7 +103,7 @@ def llvm_library() -> Finding:
 
 
 def kernel_cache() -> Finding:
-    """Whether Dr.Jit can keep compiled kernels for the next process."""
+    """Report whether Dr.Jit can store compiled kernels."""
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or Path.home() / ".drjit")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -117,7 +117,7 @@ def kernel_cache() -> Finding:
 def render_in_child(
     variant: str, start: Callable[..., subprocess.CompletedProcess] = subprocess.run
 ) -> list[Finding]:
-    """Render 16x16 pixels of the Cornell box in a child process and judge how it ended."""
+    """Render 16x16 pixels of the Cornell box in a child process; report its outcome."""
     command = [sys.executable, "-c", PROBE, variant]
     try:
         child = start(command, capture_output=True, text=True, timeout=TIME_LIMIT)
@@ -132,9 +132,9 @@ def render_in_child(
 
 
 def variants(installed: list[str], backends: list[str]) -> Finding:
-    """Which of the ``installed`` variants bdpt can render with on this machine, and why not with the others.
+    """Report which ``installed`` variants bdpt can use, and why not the others.
 
-    ``backends``: ``LLVM`` or ``CUDA``, where Dr.Jit finds its library, or a device with a driver.
+    ``backends``: ``LLVM`` or ``CUDA``, if its library or driver and device are found.
     """
     reasons: dict[str, list[str]] = {}
     for name in installed:
@@ -146,7 +146,7 @@ def variants(installed: list[str], backends: list[str]) -> Finding:
 
 
 def why_not(variant: str, backends: list[str]) -> str:
-    """Why bdpt cannot render with a ``variant``; empty if it can."""
+    """Return why bdpt cannot render with ``variant``; empty if it can."""
     if variant.startswith("scalar"):
         return "bdpt has no scalar variant"
     if variant.startswith("metal"):
@@ -157,7 +157,7 @@ def why_not(variant: str, backends: list[str]) -> str:
 
 
 def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Finding:
-    """Put the end of the `child`, which printed `report`, into words."""
+    """Report the outcome of the `child`, which printed `report`."""
     last = (child.stderr.strip().splitlines() or ["it printed no error"])[-1]
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
@@ -168,7 +168,7 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Fin
     if child.returncode > 0:
         return Finding("FAIL", "test image", last)
     mean = report.get("mean", float("nan"))
-    # The box reflects less than its lamp emits, and no part of it is black.
+    # Bounds: the box reflects less than its lamp emits, and no part of it is black.
     if not 0.01 < mean < 10:
         return Finding("FAIL", "test image", f"rendered with {variant}, but its mean is {mean:g}")
     with_llvm = f", LLVM {report['llvm']}" if report.get("llvm") else ""
@@ -176,7 +176,7 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Fin
 
 
 def crash_remedy() -> str:
-    """What to do after a crash: another LLVM."""
+    """Return the remedy after a crash: another LLVM."""
     named, choice = os.environ.get(llvm.VARIABLE), mitsuba_bdpt.llvm_choice
     if named and choice is not None and choice.origin == "variable":
         return f"Unset {llvm.VARIABLE}; it names {named!r}."

@@ -1,4 +1,4 @@
-"""The image of a render while it goes on: a PNG that is rewritten."""
+"""Previews during a render: a PNG that is rewritten."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..run.rendering import PassReport
 
 
 class Often:
-    """Calls ``work(report)`` after the first pass, and after passes that end so many ``seconds`` later."""
+    """Calls ``work(report)`` after the first pass, then at intervals of ``seconds``."""
 
     def __init__(self, seconds: float, work: Callable[[PassReport], None]):
         self._seconds, self._work, self._last = seconds, work, -float("inf")
@@ -27,7 +27,7 @@ class Often:
 
 
 def watchers(options: Namespace, film: mi.Film, output: Path, least: int) -> list[Often]:
-    """Functions of a `PassReport` that show the image of a render into ``film`` as ``options`` ask.
+    """Return functions of a `PassReport` that show the image as ``options`` request.
 
     Previews replace the PNG from ``least`` samples per pixel on.
     """
@@ -43,7 +43,7 @@ def watchers(options: Namespace, film: mi.Film, output: Path, least: int) -> lis
 
 
 def _rewrite(report: PassReport, film: mi.Film, path: Path, exposure: float) -> None:
-    """Put the image so far into the PNG. A full disk must not cost the render."""
+    """Write the image so far to the PNG; a full disk does not end the render."""
     report.image()
     try:
         write_png(film, film.bitmap(), path, exposure)

@@ -1,4 +1,4 @@
-"""Mitsuba's log as lines of a command: on standard error, without colours and names of functions."""
+"""Mitsuba's log on standard error, without colours and function names."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ LEVELS = {
     mi.LogLevel.Error: "error",
 }
 
-# `mi.Log` puts the name of the function that calls it before the text.
+# `mi.Log` prepends the name of the calling function.
 CALLER = re.compile(r"[\w<>]+(\(\))?: (?=bdpt: )")
 
 
 class _Lines(mi.Appender):
-    """Prints messages as ``warning: TEXT``, as the command's own."""
+    """Prints messages as ``warning: TEXT``, like the command's own."""
 
     def append(self, level: mi.LogLevel, text: str) -> None:
-        # A render must not end because nobody reads its log any more.
+        # A closed stream must not end the render.
         if sys.stderr is not None:
             with contextlib.suppress(OSError, ValueError):
                 print(f"{LEVELS[level]}: {CALLER.sub('', text, count=1)}", file=sys.stderr, flush=True)
 
     def log_progress(self, *_: object) -> None:
-        """Show nothing: `progress` does."""
+        """Show nothing: `progress` shows it."""
 
 
 @contextlib.contextmanager
 def lines(verbose: int) -> Iterator[None]:
-    """Print Mitsuba's log as lines; ``verbose`` 1 to 3: from info, debug or trace, with date and class."""
+    """Print Mitsuba's log; ``verbose`` 1 to 3 adds info, debug, trace, date and class."""
     logger, level = mi.logger(), mi.log_level()
     before, formatter = [logger.appender(i) for i in range(logger.appender_count())], logger.formatter()
     own = mi.DefaultFormatter()

@@ -1,6 +1,6 @@
-"""The subcommands that measure, with the extra ``[measure]``: their arguments, and what runs them.
+"""The subcommands that measure, with the extra ``[measure]``.
 
-The room `measure` is imported when one of them runs, since it needs packages that the rest does without.
+`measure` is imported when one of them runs, since it needs further packages.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _run(arguments: Namespace) -> int:
 
 
 def check_installed(command: str) -> None:
-    """Raise ``CommandError`` if the extra ``[measure]`` is not there."""
+    """Raise ``CommandError`` if the extra ``[measure]`` is not installed."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise CommandError(
@@ -47,7 +47,7 @@ def check_installed(command: str) -> None:
 
 
 def add_commands(add_command: Callable[[str, str], argparse.ArgumentParser]) -> None:
-    """Declare all subcommands; ``add_command`` makes the parser of one, of its name and help."""
+    """Declare all subcommands; ``add_command(name, help)`` returns a parser."""
     for name, (help_text, declare, _) in COMMANDS.items():
         parser = add_command(name, help_text)
         text = "folder with scenes/, references/, presets/, results/; default: the current one"
@@ -56,7 +56,7 @@ def add_commands(add_command: Callable[[str, str], argparse.ArgumentParser]) -> 
 
 
 def integrator(text: str) -> tuple[str, dict]:
-    """An argparse type: ``TYPE KEY=VALUE …``, itself and as the parameters of a plugin."""
+    """Argparse type: ``TYPE KEY=VALUE …``; returns the text and a plugin's parameters."""
     kind, *properties = text.split() or [""]
     if not kind or "=" in kind:
         raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form TYPE KEY=VALUE …")
@@ -64,7 +64,7 @@ def integrator(text: str) -> tuple[str, dict]:
 
 
 def parameters(text: str) -> dict:
-    """An argparse type: as `integrator`, the parameters alone."""
+    """Argparse type: like `integrator`, returns the parameters alone."""
     return integrator(text)[1]
 
 
@@ -80,7 +80,7 @@ def declare(parser: argparse.ArgumentParser, kind: type) -> None:
 
 
 def _parsed(bounds):
-    """What argparse takes for these bounds: choices, or a type."""
+    """Return argparse's arguments for these bounds: choices, or a type."""
     if isinstance(bounds, options.Choice):
         return bounds.names
     return bounds if isinstance(bounds, type) else within(bounds)

@@ -1,18 +1,18 @@
-"""How a command ends on an error: one line on standard error without a traceback, and an exit status.
+"""Errors of a command: one line on standard error, and an exit status.
 
-Usage errors, `USAGE`, name something that the user gave; the same command would fail again:
+Usage errors, `USAGE`, concern the user's input; the same command would fail again:
 
-* `errors.UsageError` and `errors.UnsupportedError`: a value, a file or a name that cannot be used; also
-  where Mitsuba or Dr.Jit have wrapped them.
-* ``argparse.ArgumentTypeError``: words of the command line that are read after the rest of it.
+* `errors.UsageError` and `errors.UnsupportedError`: an invalid value, file or name, also if wrapped by
+  Mitsuba or Dr.Jit.
+* ``argparse.ArgumentTypeError``: words of the command line that are parsed later.
 * ``OSError`` about a path that is missing or cannot be written (`PATHS`).
-* ``RuntimeError`` of Mitsuba's parser: about a scene's file, an unknown plugin, or its parameters; where it
-  holds the traceback of a plugin in Python, only if that ends in one of the first.
+* ``RuntimeError`` of Mitsuba's parser: about a scene file, an unknown plugin, or its parameters; with the
+  traceback of a Python plugin, only if that ends in one of the first.
 
-Failures, `FAILURE`, may not happen again: `errors.FailureError`, other ``OSError``, ``MemoryError`` and the
-``RuntimeError`` of Dr.Jit where it cannot allocate memory.
+Failures, `FAILURE`, may be transient: `errors.FailureError`, other ``OSError``, ``MemoryError`` and Dr.Jit's
+``RuntimeError`` about memory.
 
-All else is a bug, whose traceback must be seen; Python's exit status is then that of a failure.
+All else is a bug: its traceback is printed, with Python's exit status.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt
 
 
 def answered(main: Callable[[], Status]) -> Status | int:
-    """The exit status of ``main``; that of its error if it raises one, which is printed."""
+    """Return the exit status of ``main``; prints its error, if any."""
     try:
         return main()
     except Exception as error:
@@ -84,7 +84,7 @@ PATHS = (*REMEDIES.keys() - {errno.ENOSPC, errno.EDQUOT}, errno.ENAMETOOLONG, er
 
 
 def in_words(error: Exception) -> str:
-    """What went wrong; of what the system could not do, with which file, and what to do about it."""
+    """Describe the error; for system errors, with the file and a remedy."""
     if (lacking := of_memory(error)) is not None:
         return f"not enough memory ({message(lacking) or 'no more was given'}); {MEMORY_REMEDY}"
     if not isinstance(error, OSError) or error.strerror is None or error.filename is None:
@@ -101,7 +101,7 @@ OUT_OF_MEMORY = re.compile(r"out[ _]of[ _]memory|failed to allocate", re.IGNOREC
 
 
 def of_memory(error: BaseException) -> BaseException | None:
-    """The exception about a lack of memory that ``error`` is, or that was wrapped into it; else None."""
+    """Return the exception about lack of memory that ``error`` is or wraps, else None."""
 
     def is_lack(found: BaseException) -> bool:
         drjits = isinstance(found, RuntimeError) and OUT_OF_MEMORY.search(str(found))
@@ -111,7 +111,7 @@ def of_memory(error: BaseException) -> BaseException | None:
 
 
 def status_of(error: Exception) -> int | None:
-    """The exit status after an ``error``, see above; None for a bug."""
+    """Return the exit status after an ``error``, see above; None for a bug."""
     if is_mistake(error):
         return USAGE
     failed = isinstance(error, FailureError | OSError) or of_memory(error) is not None
@@ -119,7 +119,7 @@ def status_of(error: Exception) -> int | None:
 
 
 def is_mistake(error: Exception) -> bool:
-    """Whether an ``error`` is a usage error, see above."""
+    """Return whether ``error`` is a usage error, see above."""
     if isinstance(error, OSError):
         return error.errno in PATHS
     if isinstance(error, argparse.ArgumentTypeError):

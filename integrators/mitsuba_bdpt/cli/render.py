@@ -45,7 +45,7 @@ IDENTITY = "bdptIdentity"
 
 @dataclass
 class Outcome:
-    """What a finished or interrupted rendering leaves besides the film."""
+    """Result of a finished or interrupted render, beside the film."""
 
     seconds: float
     spp: int
@@ -60,7 +60,7 @@ class Outcome:
 
 
 def run(options: Namespace) -> int:
-    """Render as the command line `options` say and return the exit status."""
+    """Render as the command-line `options` request; returns the exit status."""
     with terminable() as ending:
         try:
             return answered(lambda: _run(options, ending))
@@ -70,8 +70,8 @@ def run(options: Namespace) -> int:
 
 
 def _run(options: Namespace, ending: Ending) -> int:
-    """Render like `run`, and raise errors."""
-    check_file(options.scene)  # before a folder is made for its image
+    """Like `run`, but raises errors."""
+    check_file(options.scene)  # before creating the image's folder
     jobs = jobs_of(options)
     for job in jobs:
         prepare_output(job.output)
@@ -91,13 +91,16 @@ def _run(options: Namespace, ending: Ending) -> int:
         try:
             if not render_job(scene, integrator, job, ending):
                 return ending.status
-        except OSError as error:  # what was wrong with a path has come out before
+        except OSError as error:  # errors about paths were raised before
             raise FailureError(in_words(error)) from error
     return 0
 
 
 def jobs_of(options: Namespace) -> list[Namespace]:
-    """The options of each image, with its ``sensor`` and ``output``: of one, or of each of the ``frames``."""
+    """Return the options of each image, with ``sensor`` and ``output``.
+
+    One image, or one for each of the ``frames``.
+    """
     output = options.output or Path("renders") / f"{options.scene.stem}.exr"
     if options.frames is None:
         return [Namespace(**vars(options) | {"output": output})]
@@ -115,14 +118,14 @@ def jobs_of(options: Namespace) -> list[Namespace]:
 
 
 def is_done(job: Namespace, spp: int) -> bool:
-    """Whether a frame has its image from an earlier run of the same command with checkpoints."""
+    """Return whether an earlier run of this command with checkpoints made the image."""
     if job.frames is None or job.checkpoint is None or job.resume == "never":
         return False
     return attribute(job.output, IDENTITY) == checkpoints.identity(job, spp)
 
 
 def loaded(options: Namespace) -> Loaded:
-    """`load`, with what holds for the whole process: its memory and the number of its threads."""
+    """Like `load`; also sets the memory limit and number of threads of the process."""
     memory.set_limit(options.memory and options.memory * 2**30)
     try:
         found = load(options)
@@ -131,17 +134,17 @@ def loaded(options: Namespace) -> Loaded:
         if behind(error, KeyboardInterrupt) or is_mistake(error) or of_plugin:
             raise
         raise CommandError(in_words(error)) from error
-    # After the scene: with one thread Mitsuba reads no EXR, see `two_threads`.
+    # After loading: with one thread Mitsuba cannot read EXR, see `two_threads`.
     if options.threads is not None:
         dr.set_thread_count(options.threads)
     return found
 
 
 def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, ending: Ending) -> bool:
-    """Render one image and write it; returns whether it came to its end.
+    """Render and write one image; returns whether it was completed.
 
-    Once rendered, it is written whatever signals come, and only then a checkpoint is removed. A resumed
-    render that ends early does not replace an image of more samples.
+    Writing ignores signals, and the checkpoint is removed afterwards. A resumed render that ends early does
+    not replace an image with more samples.
     """
     sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
     if is_done(job, spp):
@@ -176,7 +179,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
 
 
 def samples_per_pixel(scene: mi.Scene, job: Namespace) -> int:
-    """Samples per pixel of a job, at most; raises ``CommandError`` if there are none."""
+    """Return the samples per pixel of a job, at most; ``CommandError`` if none."""
     if is_open_ended(job):
         return UNLIMITED_SPP
     spp = job.spp or choose_sensor(scene, job.sensor).sampler().sample_count()
@@ -186,15 +189,15 @@ def samples_per_pixel(scene: mi.Scene, job: Namespace) -> int:
 
 
 def is_open_ended(options: Namespace) -> bool:
-    """Whether time or error alone ends a render, of which no number of samples is asked for."""
+    """Return whether only time or error ends the render."""
     return not options.spp and (options.time is not None or options.target_error is not None)
 
 
 def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
     """Write the image of a job with these attributes.
 
-    Where that is not possible any more, among the files of the system that are temporary: hours of rendering
-    must not be lost with a network drive. That is an error all the same, which says where the image is.
+    If that fails (a network drive, for example), writes it to the system's temporary folder and raises an
+    error with its path.
     """
     try:
         write_images(film, job.output, attributes, job.exposure)
@@ -209,17 +212,17 @@ def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
 
 
 def say(line: str) -> None:
-    """Print a ``line``; that nobody reads it any more must not cost an image, or the next ones."""
+    """Print a ``line``; a closed stream must not end the render."""
     try:
         print(line, flush=True)
     except OSError as error:
         sys.stdout = None
-        if not isinstance(error, BrokenPipeError):  # of a reader who has seen enough, such as head
+        if not isinstance(error, BrokenPipeError):  # a reader such as head may close early
             print(f"warning: standard output: {error}", file=sys.stderr)
 
 
 def explain(options: Namespace) -> int:
-    """Print what a render as the command line `options` say would do, and return the exit status."""
+    """Print what such a render would do; returns the exit status."""
     try:
         return answered(lambda: _explain(options))
     except KeyboardInterrupt:
@@ -228,7 +231,7 @@ def explain(options: Namespace) -> int:
 
 
 def _explain(options: Namespace) -> int:
-    """Print the report of `explain`, and raise errors."""
+    """Print the report of `explain`; raises errors."""
     scene, integrator, _ = loaded(options)
     sensor = choose_sensor(scene, options.sensor)
     say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
@@ -236,7 +239,7 @@ def _explain(options: Namespace) -> int:
 
 
 def check_options(options: Namespace) -> None:
-    """Raise ``CommandError`` for options that contradict one another."""
+    """Raise ``CommandError`` for contradictory options."""
     if options.resume and options.checkpoint is None:
         raise CommandError("resume needs --checkpoint MINUTES: how often to write them.")
     if options.parts is not None and options.scheduler is None:
@@ -264,7 +267,7 @@ def check_options(options: Namespace) -> None:
 
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
-    """Raise ``CommandError`` for options that only ``bdpt`` can follow, and for what these cannot."""
+    """Raise ``CommandError`` for options that the integrator does not support."""
     for name in ("checkpoint", "scheduler", "preview", "memory"):
         if getattr(options, name) is not None and not is_ours(integrator):
             raise CommandError(
@@ -278,7 +281,7 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
 def render(
     scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, least: int = 0
 ) -> Outcome:
-    """Render into the sensor's film, and show what is done meanwhile; ``least`` see `live.watchers`."""
+    """Render into the sensor's film, with progress; ``least``: see `live.watchers`."""
     film = choose_sensor(scene, options.sensor).film()
     watchers = live.watchers(options, film, options.output, least)
     if options.scheduler is None:
@@ -298,7 +301,7 @@ def render(
 
 
 def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
-    """A function that calls all ``watchers`` with a report."""
+    """Return a function that calls all ``watchers`` with a report."""
 
     def watch(report: PassReport) -> None:
         for watcher in watchers:
@@ -308,10 +311,10 @@ def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
 
 
 def render_here(scene, integrator, options: Namespace, spp: int, watchers: list) -> Outcome:
-    """Render in one go, with checkpoints if they are wanted."""
+    """Render in this process, with checkpoints if requested."""
     started, interrupted = time.perf_counter(), False
     if hasattr(integrator, "statistics"):
-        integrator.statistics = {}  # of the render before
+        integrator.statistics = {}  # not those of the previous render
     kept, limit = None, options.time
     start = checkpoints.start(options, options.output)
     if start is not None:
@@ -338,13 +341,13 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     if "passes" in statistics:
         done = int(sum(statistics["passes"]))
     elif interrupted:
-        # Mitsuba's own integrators leave nothing behind.
+        # Mitsuba's own integrators leave no partial image.
         done = 0
     outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics=statistics)
     if kept is not None:
         whole = done == spp or reached(target_error_of(integrator), statistics)
         outcome.finished = not interrupted and whole
-        # Of a finished render at the end only: its image may fail to be written.
+        # A finished render keeps it until the image is written.
         if outcome.finished:
             outcome.written = kept.remove
         else:
@@ -353,23 +356,23 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
 
 
 def is_ours(integrator: mi.Integrator) -> bool:
-    """Whether this is `bdpt`, which can leave its result to the film; `prb` renders only what it develops."""
+    """Return whether this is `bdpt`, which need not develop; `prb` renders only then."""
     return hasattr(integrator, "assemble")
 
 
 def target_error_of(integrator) -> float:
-    """The parameter ``target_error``, from wherever it comes; 0 for other integrators than `bdpt`."""
+    """Return the parameter ``target_error``; 0 for other integrators than `bdpt`."""
     return getattr(getattr(integrator, "settings", None), "target_error", 0)
 
 
 def reached(target_error: float, statistics: Mapping) -> bool:
-    """Whether the ``target_error``, if not 0, is reached."""
+    """Return whether the ``target_error``, if not 0, is reached."""
     return 0 < target_error and statistics["error"] <= target_error
 
 
 @dataclass(frozen=True)
 class _Report:
-    """What displays ask of a `PassReport`, of an integrator that tells nothing of its rays."""
+    """`PassReport` for displays, of an integrator without counts of rays."""
 
     spp_done: int
     spp_total: int
@@ -378,9 +381,9 @@ class _Report:
 
 
 def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
-    """Render with one seed after the other until the time is over, and leave the mean in the film.
+    """Render with consecutive seeds until the time limit; the film has the mean.
 
-    Mitsuba's integrators render all samples at once in vectorised variants, whatever their timeout.
+    Mitsuba's integrators ignore their timeout in vectorised variants.
     """
     started, done, total, interrupted = time.perf_counter(), 0, 0.0, False
     film = choose_sensor(scene, options.sensor).film()
@@ -389,7 +392,7 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
         while done < spp and (done == 0 or time.perf_counter() - started < options.time):
             size, seed = min(PASS_SPP, spp - done), options.seed + done // PASS_SPP
             integrator.render(scene, options.sensor, seed, size)
-            # Raw sums with their weights: passes of any size and filter add up.
+            # Raw sums include their weights, so passes of any size add up.
             total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
             done += size
             shown(_Report(done, spp, time.perf_counter() - started))
@@ -405,7 +408,7 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
 
 
 def settings(options: Namespace, spp: int) -> dict:
-    """The command line as values that JSON knows."""
+    """Return the command line as JSON values."""
     values = {key: str(v) if isinstance(v, Path) else v for key, v in vars(options).items()}
     values |= {"spp": spp, "defines": dict(options.defines), "append": list(map(str, options.append))}
     values["properties"] = dict(options.properties)
@@ -413,7 +416,7 @@ def settings(options: Namespace, spp: int) -> dict:
 
 
 def report(outcome: Outcome) -> dict:
-    """What was rendered, and with what, as values that JSON knows."""
+    """Return what was rendered, and with which versions, as JSON values."""
     own = {
         "wall_seconds": round(outcome.seconds, 3),
         "spp": outcome.spp,
@@ -425,7 +428,7 @@ def report(outcome: Outcome) -> dict:
 
 
 def plain(value):
-    """A ``value`` as JSON knows it: None for numbers that are not finite, the text of other objects."""
+    """Convert a ``value`` to JSON: None if non-finite, text for other objects."""
     if isinstance(value, Mapping):
         return {str(key): plain(held) for key, held in value.items()}
     if isinstance(value, list | tuple):
@@ -436,7 +439,7 @@ def plain(value):
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float) -> str:
-    """The closing line."""
+    """Return the closing line."""
     width, height = size
     parts = [
         f"{output}: {outcome.seconds:.1f} s",

@@ -1,4 +1,4 @@
-"""Signals that end a command: Ctrl-C, and SIGTERM, by which farms and operating systems end a process."""
+"""Signals that end a command: SIGINT (Ctrl-C) and SIGTERM (farms, shutdown)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ STATUS = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
 
 @dataclass
 class Ending:
-    """What has ended a command before its time.
+    """State of a command that a signal ends.
 
-    ``status``, with which it exits then; ``patient``: whether the next signal is only noted, since what is
-    done is being written; ``signalled``: whether one has come.
+    ``status``: its exit status; ``patient``: whether the next signal is only recorded, while results are
+    written; ``signalled``: whether one has come.
     """
 
     status: int = INTERRUPTED
@@ -26,7 +26,7 @@ class Ending:
     signalled: bool = False
 
     def __call__(self, number: int, frame: object) -> None:
-        """Answer a signal: the first one raises ``KeyboardInterrupt``; later ones change nothing."""
+        """Handle a signal: the first raises ``KeyboardInterrupt``; later ones are ignored."""
         if self.signalled:
             return
         self.signalled, self.status = True, STATUS[signal.Signals(number)]
@@ -36,9 +36,9 @@ class Ending:
 
 @contextmanager
 def terminable() -> Iterator[Ending]:
-    """Within, SIGINT and SIGTERM are answered as `Ending` says.
+    """Within, `Ending` handles SIGINT and SIGTERM.
 
-    Where another thread than the main one runs the command, signals are left as they are.
+    Leaves signals unchanged outside of the main thread.
     """
     ending = Ending()
     if threading.current_thread() is not threading.main_thread():

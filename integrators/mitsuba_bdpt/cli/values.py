@@ -1,4 +1,4 @@
-"""Values on command lines: argparse types."""
+"""Argparse types of values on command lines."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ MOST_FRAMES = 1 << 20
 
 
 def number(kind: type, least: float, most: float = math.inf) -> Callable[[str], float]:
-    """An argparse type: a finite number of a ``kind`` from ``least`` to ``most``."""
+    """Return an argparse type: a finite number of ``kind`` in [``least``, ``most``]."""
     return within(Number(kind, least, most))
 
 
 def within(bounds: Number) -> Callable[[str], float]:
-    """An argparse type: a number within ``bounds``."""
+    """Return an argparse type: a number within ``bounds``."""
 
     def parse(text: str) -> float:
         with contextlib.suppress(ValueError):
@@ -37,7 +37,7 @@ def within(bounds: Number) -> Callable[[str], float]:
 
 
 def size(text: str) -> tuple[int, int]:
-    """Split ``WIDTHxHEIGHT``, whole numbers of at least 1."""
+    """Parse ``WIDTHxHEIGHT``, integers of at least 1."""
     width, x, height = text.lower().partition("x")
     if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form WIDTHxHEIGHT, in pixels")
@@ -45,7 +45,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def crop(text: str) -> tuple[int, int, int, int]:
-    """Split ``X,Y,WIDTH,HEIGHT``, whole numbers, the last two of at least 1."""
+    """Parse ``X,Y,WIDTH,HEIGHT``, integers, the last two at least 1."""
     parts = text.split(",")
     if len(parts) != 4 or not all(p.strip().isdecimal() for p in parts) or not all(map(int, parts[2:])):
         raise argparse.ArgumentTypeError(
@@ -56,7 +56,7 @@ def crop(text: str) -> tuple[int, int, int, int]:
 
 
 def frames(text: str) -> list[int]:
-    """Numbers of sensors: ``3``, ``0-9``, ``0-99:10`` (each tenth), several of these with commas between."""
+    """Parse sensor indices: ``3``, ``0-9``, ``0-99:10`` (every tenth), or a list."""
     found = []
     for part in text.split(","):
         match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
@@ -81,7 +81,7 @@ def resume(text: str) -> str:
 
 
 def definition(text: str) -> tuple[str, str]:
-    """Split ``KEY=VALUE``."""
+    """Parse ``KEY=VALUE``."""
     key, equals, value = text.partition("=")
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form KEY=VALUE")
@@ -89,7 +89,7 @@ def definition(text: str) -> tuple[str, str]:
 
 
 def property_(text: str) -> tuple[str, PropertyValue]:
-    """Split ``KEY=VALUE`` and read the value as a Boolean, a whole number, a number or a string."""
+    """Parse ``KEY=VALUE``, with a Boolean, integer, number or string as value."""
     key, value = definition(text)
     if value in ("true", "false"):
         return key, value == "true"

@@ -50,7 +50,7 @@ def check_png(film: mi.Film) -> None:
 
 
 def prepare_output(output: Path) -> None:
-    """Create the folder of `output`; raise an error, before the render, if not writable."""
+    """Create the folder of `output`; raise an error now if it is not writable."""
     if output.suffix.lower() != ".exr":
         raise CommandError(
             f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."

@@ -61,7 +61,7 @@ _STARTS = (
 
 
 def elements(file: Path) -> list[ElementTree.Element]:
-    """Return all elements of a scene file in order; raises ``CommandError`` if not XML."""
+    """Return the elements of a scene file; raises ``CommandError`` if not XML."""
     text = _decoded(file.read_bytes())
     try:
         # Mitsuba accepts "--" within comments, XML does not.
@@ -347,7 +347,7 @@ def _files_near(scene: Path, name: str) -> str:
 
 
 def _in_words(error: str, options: Namespace) -> str | None:
-    """Return a message for Mitsuba's ``error`` about an unknown name, with a suggestion.
+    """Return a message with a suggestion for Mitsuba's ``error`` about a name.
 
     None for other errors.
     """

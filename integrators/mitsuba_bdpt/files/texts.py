@@ -35,7 +35,7 @@ def table_of(path: Path, key: str, value) -> dict:
 
 
 def list_of(path: Path, key: str, value, kind: type, what: str) -> list:
-    """Return ``value`` if it is a non-empty list of ``kind``, called ``what`` in errors."""
+    """Return ``value`` if it is a non-empty list of ``kind``, called ``what``."""
     if not isinstance(value, list) or not value or not all(isinstance(entry, kind) for entry in value):
         raise CommandError(f"{path}: {key}={value!r} must be a list with at least one entry, all {what}")
     return value

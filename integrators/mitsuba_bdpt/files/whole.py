@@ -34,7 +34,7 @@ def check_format(path: Path, output: Path) -> None:
 
 
 def check_own(path: Path, mark: str, remedy: str) -> None:
-    """Raise ``CommandError`` with the ``remedy`` if the text at ``path`` lacks ``mark``."""
+    """Raise ``CommandError`` with the ``remedy`` if a text file lacks ``mark``."""
     if path.is_file() and mark not in (text := path.read_text(errors="replace")) and text.strip():
         raise CommandError(f"{str(path)!r} exists and was made by something else; {remedy}")
 
