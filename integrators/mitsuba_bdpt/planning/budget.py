@@ -18,8 +18,7 @@ LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
 
 # Compilation per kind of BSDF and recording per BSDF of a pilot's kernel in a scene of many BSDFs
-# (`bsdf.MANY`), in samples of a render without a pilot. Longer renders run a pilot; see experiments, "Choice
-# of strategies".
+# (`bsdf.MANY`), in samples of a render without a pilot. Longer renders run a pilot.
 SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
 
 # Multiple of that length from which on the pilot also predicts the gain of photon-guided BSDF sampling, which

@@ -22,8 +22,7 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
     def lost_without_arrival(plan: Plan) -> tuple[UnreachablePaths, ...]:
         """Paths that are not sampled, when neither t = 0 nor merging counts.
 
-        A small lens rarely samples what only t = 0 samples, and merging is not unbiased: neither replaces
-        connections.
+        A small lens rarely samples such paths, and merging is not unbiased: neither replaces connections.
         """
         return unreachable_paths(prepared, replace(plan, arrival=False, merging=False), settings)
 

@@ -160,8 +160,7 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
 def guided_gain(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> float:
     """Factor by which guiding s = 0 shortens the time to equal error; 0 if impossible.
 
-    Outliers included. Lower quartile of the pilot's groups, for the smallest number of guided samples.
-    ``table`` of `choose`.
+    Outliers included. Lower quartile of the groups, for the fewest guided samples. ``table`` of `choose`.
     """
     found = _guided(moments, alternatives, [row for row in table if not row.candidate.guided])
     return found[0][0] if found else 0.0
@@ -206,7 +205,7 @@ def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
 
 
 def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:
-    """Variance of each candidate in each group of the pilot, shape (`GROUPS`, candidates)."""
+    """Variance of each candidate by group of the pilot, shape (`GROUPS`, candidates)."""
     drawn = moments.variance(moments.draw, stratified)
     every = moments.variance(0, stratified)
     columns = [

@@ -31,7 +31,7 @@ class Weighting:
 
     @property
     def combination(self) -> str:
-        """``n0c0`` path tracing alone, ``n1c0`` with light tracing, ``n1c1`` with inner connections."""
+        """``n0c0`` path tracing, ``n1c0`` with light tracing, ``n1c1`` with connections."""
         return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
 
 

@@ -118,8 +118,7 @@ _ARRAYS = (*_OF_GROUPS, "gain", "emission")
 class Moments:
     """What a pilot measured: relative squared error per sample and pixel.
 
-    With independent numbers the variance is ``base`` + S ``light``, plus ``draw`` where one inner connection
-    is drawn.
+    Variance with independent numbers: ``base`` + S ``light``, plus ``draw`` if one inner connection is drawn.
 
     * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, weightings). ``rare``: the part of ``base`` on
       paths too rare for stratification.
@@ -159,8 +158,7 @@ class Moments:
     def _left_by_points(self) -> np.ndarray:
         """Stratification gain of the points of a pixel, by weighting.
 
-        Extrapolates the factor of nets of `NET` (see `OWN_GAIN`) to 64 points. Fitted; see experiments,
-        "Choice of strategies".
+        Extrapolates that of nets of `NET` points (`OWN_GAIN`) to 64; see experiments, "Choice of strategies".
         """
         possible = np.isfinite(self.base).all(axis=0)
         common = self.gain[possible].mean() if possible.any() else 1.0

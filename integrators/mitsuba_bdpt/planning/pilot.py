@@ -14,8 +14,7 @@ with counts n_i and coefficients kappa_i (E. Veach 1997, section 9.2),
 
 The variance is the sum of the second moments and of the products of different contributions within a camera
 sample, less the squared mean of the pixel, estimated without bias from two independent samples. The samples
-use neither roulette of connections nor a drawn connection; the variance of the draw follows from unshadowed
-contributions.
+use neither roulette nor a drawn connection; unshadowed contributions give the variance of the draw.
 
 Stratified points reduce the variance of camera samples in smooth regions (up to a hundredfold under a sky),
 hardly that of rare paths, and little that of splats. Half of the samples lie in pairs of nets of one pixel,
@@ -77,8 +76,7 @@ LOST = 1e30
 # One in NET_SHARE of a pilot's camera samples is in a net.
 NET_SHARE = 2
 
-# Light subpaths per camera sample, most of them without one: they are cheap, and few hit a small caster of a
-# caustic.
+# Light subpaths per camera sample, most without one: they are cheap, and few hit a small caster of a caustic.
 LIGHT_TIMES = 4
 
 # Paths of light tracing that camera subpaths sample less than once in SELDOM times as often as the pilot do
@@ -228,8 +226,7 @@ class Pilot:
         own, squares, lights = [], [], []
         for w in WEIGHTINGS:
             total = _dot(w, shares, 1)
-            # With inner connections all classes are in use; weightings that cannot sample the path are ruled
-            # out.
+            # With inner connections all classes are in use; others may be unable to sample the path.
             possible = mi.Bool(True) if w.inner else total > 0
             # Rate of the path relative to the pilot: see `RAREST`.
             seldom = dr.maximum(1, self._least / _dot(w, shares, 0))

@@ -107,8 +107,7 @@ class Planner:
     ``passes``: samples per pixel of each finished pass.
     """
 
-    # The same for all seeds of a render, so that all decide alike. Of 32 the one with the most efficient
-    # choices.
+    # The same for all seeds of a render, so that all decide alike. The most efficient of 32.
     pilot_seed = 30
 
     def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: Findings):
@@ -273,8 +272,7 @@ class Planner:
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on.
 
-        A changed plan uses new points: lanes sample other pixels, and the rest of the old sequence would be
-        missing.
+        A changed plan uses new points: its lanes would not complete the old sequence.
         """
         if decision.joined > 1 and (why := self._why_not_joined()):
             raise UsageError(

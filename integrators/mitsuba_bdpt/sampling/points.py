@@ -79,8 +79,7 @@ STRATIFIED = {
 class Stream:
     """Random numbers of one subpath, ``UInt32``, constant along the subpath.
 
-    ``digits``: reversed index in the Sobol' sequence; ``seed`` of the sequence; ``key`` of the hashed
-    numbers.
+    ``digits``: reversed index in the Sobol' sequence; ``seed`` of the sequence; ``key`` of hashes.
     """
 
     digits: mi.UInt32

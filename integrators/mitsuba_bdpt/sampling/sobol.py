@@ -28,8 +28,7 @@ Sources
 Digits
 ------
 Binary digits are stored least significant bit first: bit k of a *digit word* is the coefficient of 2^-(k+1).
-The digit word of the van der Corput point is then the index itself, and the hash applies without a bit
-reversal in between.
+The digit word of the van der Corput point is then the index itself, and the hash needs no bit reversal.
 
 Dr.Jit types are resolved at call time, under the current variant, which must be a JIT variant.
 """
@@ -137,7 +136,7 @@ def split_index(index64: mi.UInt64 | int, seed: UInt32Like) -> tuple[mi.UInt32, 
 
 
 def mix(x: mi.UInt32) -> mi.UInt32:
-    """Bijective 32-bit mix with 0 -> 0 (hash-prospector, two multiplications, bias 0.107)."""
+    """Bijective 32-bit mix with 0 -> 0 (hash-prospector, bias 0.107)."""
     x = (x ^ (x >> 16)) * 0x21F0AAAD
     x = (x ^ (x >> 15)) * 0xD35A2D97
     return x ^ (x >> 15)
@@ -157,8 +156,7 @@ def _scramble(digits: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
     """Owen-scramble a digit word: flip each bit by a hash of the lower bits and seed.
 
     On a reversed index it is a nested uniform shuffle of aligned power-of-two blocks. Vegdahl's form of the
-    Laine-Karras hash: sums, products and ``x ^= x * even`` carry only from lower to higher bits, and each is
-    a bijection.
+    Laine-Karras hash: sums, products and ``x ^= x * even`` are bijections that carry to higher bits only.
     """
     digits = digits ^ (digits * 0x3D20ADEA)
     digits = (digits + seed) * ((seed >> 16) | 1)

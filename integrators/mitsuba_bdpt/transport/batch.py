@@ -113,8 +113,7 @@ LONGEST_RUN = 16
 # Parts of fewer runs use runs of one pixel: few runs would meet at few distances.
 LEAST_RUNS = 256
 
-# Words that derive seeds from that of a pass: the points use 1 and 2 (`Points.stream`), parts the words after
-# them.
+# Words that derive seeds from that of a pass: the points use 1 and 2 (`Points.stream`), parts later ones.
 _WORDS_OF_POINTS = 2
 
 _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # distinguish the keys of the rounds

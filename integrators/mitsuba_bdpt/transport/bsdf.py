@@ -128,7 +128,7 @@ class Asked:
 
     @property
     def kinds(self) -> int:
-        """Number of distinct BSDF structures. BSDFs of one structure share the functions of a kernel."""
+        """Number of BSDF structures; BSDFs of one share the functions of a kernel."""
         return len({draws.structure(bsdf) for bsdf in self.bsdfs})
 
     def __call__(self, bsdf, question, *args):
@@ -211,8 +211,7 @@ def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
 def evaluate_adjoint(bsdf, si, wo, active, traits: Traits, cos_ratio=None) -> Evaluation:
     """Evaluate a light vertex towards the local direction ``wo`` (camera's side).
 
-    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal (computed
-    if None).
+    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal.
     """
     if cos_ratio is None:
         cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)

@@ -22,13 +22,11 @@ LEAST_SURVIVAL = 2.0**-20
 class Counters:
     """Counters of a lane (``UInt32``); None if not counted, at no cost.
 
-    * Closest hits of ``camera`` and ``light`` subpaths; shadow rays of s = 1, t = 1 (with (1,1)), inner
-      connections.
+    * Closest hits of ``camera`` and ``light`` subpaths; shadow rays of s = 1, t = 1 and (1,1), inner ones.
     * Inner connections: ``evaluated``, of these ``zero``; ``rouletted`` (splats too) have no ray.
     * ``non_finite``: values that count as zero: contributions (s = 1 and t <= 1 if visible, inner ones before
       visibility), subpaths that end with a non-finite throughput, colours, features.
-    * With media ``segments`` of edges, connections included, each with a ray; tentative ``collisions`` in
-      grids.
+    * With media ``segments`` of edges and connections, with a ray each; tentative ``collisions`` in grids.
     * With merging closest hits of photon subpaths (``photon``), stored ``photons``, and ``merges``: camera
       vertices near a photon. With guiding the same of photons, guided camera vertices (``aimed``), and
       closest hits that followed (``guided``).

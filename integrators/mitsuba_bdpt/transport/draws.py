@@ -46,8 +46,7 @@ class Draw:
 def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active: mi.Bool) -> Draw:
     """Sample a BSDF in radiance mode; ``u1`` picks the lobe, ``u2`` the direction.
 
-    ``bs.pdf``: as returned by Mitsuba's ``sample``; for a blend ``pdf()`` (solid angle), or the probability
-    of a delta event.
+    ``bs.pdf``: Mitsuba's; of a blend ``pdf()`` (solid angle) or the probability of a delta event.
     """
     if not by_parts(bsdf):
         return _by_mitsuba(bsdf, si, u1, u2, active)

@@ -165,8 +165,7 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
         splat=entry("light", light, plan.splat),
         endpoints=entry("light", light, plan.endpoints),
         arrival=entry("light", light, plan.arrival),
-        # One of M candidates is not M independent samples; see experiments, "Several light subpaths per
-        # lane".
+        # One of M candidates is not M independent samples (experiments, "Several light subpaths per lane").
         inner=entry("inner", math.sqrt(plan.joined), plan.connections != "none"),
     )
 

@@ -59,8 +59,7 @@ class Sketch:
 
     ``p``: position; ``n``: geometric normal on the incident side; ``both``: scatters to both sides; ``wi``:
     incident direction, ``shading``: shading normal, both in world space; ``others``: partial sums of the
-    other strategies over the density from the other side, for diffuse directions; ``peak_others``: the lobe's
-    addition at its peak.
+    other strategies over the density from the other side, of the diffuse part; ``peak_others``: of the lobe.
     """
 
     p: mi.Point3f

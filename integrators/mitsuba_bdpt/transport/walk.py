@@ -35,8 +35,7 @@ class Walk:
       edge; ``eta``: product of relative indices of refraction (1 if nothing refracts).
     * ``seen``: a non-null event happened; ``broken``: ended by a non-finite throughput or shading frame;
       ``edge``: its state along an edge, None without media.
-    * ``isolated``: no edge is connected by a strategy in use, see `merging` (None without merging and
-      guiding).
+    * ``isolated``: no edge is connected by a strategy in use, see `merging` (None if unused).
     * With guiding (`guided_hits`): ``guided``, on camera subpaths, the other density of the last non-delta
       direction over its own; ``only_delta``, on light subpaths: all events were delta.
 
@@ -173,8 +172,7 @@ class Side:
     whether a non-null event happened; ``parallel``: the first edge has one direction, with density one across
     it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false. Functions:
 
-    * ``complete``, of the first vertex of a light subpath: density of next-event estimation that completes
-      ``d_vcm``.
+    * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
     * ``join``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
       `Sensor.join`) and its `bsdf.Target`; None if no strategy does so.
     * ``guide``, of each vertex, the walk before it and the step after it: its `guided_hits.Advice`.
@@ -354,8 +352,7 @@ def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
     """Whether to sample at this vertex.
 
     `path` samples at the last vertex too: alpha is 1 unless that event is null. With media null events are no
-    edges, so that subpaths go on after them; `volpath` has alpha 1 where something in a medium may scatter
-    again.
+    edges, so that subpaths go on after them; `volpath` has alpha 1 where a medium may scatter again.
     """
     if vertex.volume is not None:
         return vertex.hit & (~vertex.volume | (walk.edges < side.last_edge))

@@ -50,7 +50,7 @@ class Sphere:
 
 @dataclass
 class Aim:
-    """The ``spheres`` at which photons are aimed; ``no_sky``: the environment emits none."""
+    """``spheres`` at which photons are aimed; ``no_sky``: the environment emits none."""
 
     spheres: tuple[Sphere, ...]
     no_sky: bool
@@ -69,7 +69,7 @@ class Aim:
         return Aim(tuple(_sphere(box) for box in boxes), no_sky)
 
     def emission(self, emitters: Emitters, u_point, u_direction, shared) -> tuple[Emission, mi.Float]:
-        """Sample emissions of photons; returns them, and the emitter's own density over the mixture's.
+        """Sample emissions of photons; also the emitter's own density over the mixture's.
 
         ``pdf_second`` of the emissions is the mixture's.
         """
@@ -113,7 +113,7 @@ class Aim:
         return (pdf_second + aimed / len(self.spheres)) / 2
 
     def _sample(self, p, u: mi.Point2f) -> tuple[mi.UInt32, mi.Vector3f]:
-        """Sample a direction in one of the cones from ``p``; returns the index of the sphere and it."""
+        """Sample a direction in one of the cones from ``p``; index of the sphere, direction."""
         scaled = u.x * len(self.spheres)
         number = dr.minimum(mi.UInt32(scaled), len(self.spheres) - 1)
         axis, width = self.spheres[0].cone(p)
@@ -128,7 +128,7 @@ class Aim:
 
 
 def _halved(u: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Whether ``u`` is in the upper half of [0, 1), and ``u`` rescaled to [0, 1) within its half."""
+    """Whether ``u`` is in the upper half of [0, 1), and ``u`` rescaled in its half."""
     upper = u >= 0.5
     return upper, dr.minimum(2 * u - dr.select(upper, 1, 0), 1 - 2**-24)
 
@@ -162,7 +162,7 @@ def _sphere(box) -> Sphere:
 
 
 def _delta_boxes(scene: mi.Scene) -> list:
-    """Bounding boxes of shapes with delta lobes; of all instances if a shape in any group has some."""
+    """Bounding boxes of shapes with delta lobes; of all instances if a group has some."""
     grouped = any(_is_delta(shape) for shape in grouped_shapes(scene))
     found = (box_of(s) for s in scene.shapes() if (grouped if is_instance(s) else _is_delta(s)))
     return [box for box in found if box is not None]

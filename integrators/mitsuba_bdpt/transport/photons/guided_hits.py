@@ -56,7 +56,7 @@ def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
 
 
 def look_back(kernel: Kernel, y: Vertex, walk: Walk, step) -> Advice:
-    """The guide at the light vertex ``y``; ``other``: of the direction the light came from.
+    """The guide at the light vertex ``y``; ``other`` of the incident direction.
 
     ``step`` is not used: `Side.guide` passes it.
     """

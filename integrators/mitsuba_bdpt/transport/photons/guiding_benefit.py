@@ -49,10 +49,9 @@ class Estimator:
 
 @dataclass
 class Found:
-    """Moments of the mean of the colours at a vertex; ``aimed``: 1 where s = 0 can be guided, else 0.
+    """Moments of the colours' mean at a vertex; ``aimed``: 1 if s = 0 can be guided.
 
-    ``moments``: the first; the second of s = 0 without guiding; the second for each number of guided samples
-    (`GUIDED`).
+    ``moments``: the first; the second of s = 0 without guiding; the second for each of `GUIDED`.
     """
 
     moments: list[mi.Float64]

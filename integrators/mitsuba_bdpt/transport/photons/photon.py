@@ -17,10 +17,9 @@ class Photon:
     """A stored light vertex, or arrays of many.
 
     ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal; ``flux``:
-    throughput of its subpath, not divided by the number of subpaths; ``older``: partial sum of all
-    alternatives with fewer light vertices (area measure); ``aim``: the emitter's own density of the first
-    direction over that of `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index
-    of its subpath.
+    throughput, not divided by the number of subpaths; ``older``: partial sum of all alternatives with fewer
+    light vertices (area measure); ``aim``: the emitter's own density of the first direction over that of
+    `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath.
     """
 
     p: mi.Point3f

@@ -1,4 +1,4 @@
-"""The photon pass: traces light subpaths along SDS paths and stores their vertices as photons."""
+"""The photon pass: traces SDS paths from the light and stores their vertices."""
 
 from __future__ import annotations
 
