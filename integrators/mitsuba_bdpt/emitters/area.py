@@ -251,7 +251,6 @@ class AreaEmitters(Group):
         return dr.select(flat, own * density, curved)
 
     def _plain(self, guide: EmissionGuide, index, active):
-        """`PLAIN` for curved lights with a table, 1 for those without."""
         return dr.select(guide.is_guided(index, active), PLAIN, 1)
 
     def _sample_direction(self, index, si, u, active):

@@ -64,7 +64,6 @@ class EmissionTables:
         return values / values.mean(axis=(1, 2), keepdims=True)
 
     def record(self) -> dict[str, int | float | str]:
-        """Return a dictionary that JSON can hold."""
         return asdict(self)
 
     @staticmethod
@@ -118,10 +117,7 @@ class Factor:
 
 @dataclass
 class Cell:
-    """Cell of an emission: its ``number`` in all tables, and the `Factor`.
-
-    ``known``: its emitter has a table.
-    """
+    """Cell of an emission: ``number`` in all tables, ``known`` if it has a table."""
 
     number: mi.UInt32
     known: mi.Bool
@@ -153,7 +149,6 @@ class EmissionGuide:
         dr.make_opaque(self._densities, self._within, self._below)
 
     def is_guided(self, index: mi.UInt32, active) -> mi.Bool:
-        """Mask: the emitter with this ``index`` has tables."""
         return dr.gather(mi.UInt32, self._first, index, active) > 0
 
     def _table(self, index: mi.UInt32, which: mi.UInt32, active) -> mi.UInt32:

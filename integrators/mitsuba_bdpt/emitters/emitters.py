@@ -110,10 +110,7 @@ class Emitters:
         ]
 
     def _cannot_be_asked(self, registered: list[str]) -> bool:
-        """Whether the virtual call `sample_position` fails.
-
-        It visits every emitter in the process (classes ``registered``), and user-defined classes may lack it.
-        """
+        """Whether `sample_position` fails: classes in the process may lack it."""
         if not any(map(is_third_party, registered)):
             return False
         try:
@@ -131,7 +128,6 @@ class Emitters:
 
     @property
     def table_count(self) -> int:
-        """Number of tables that guide the emission of all emitters."""
         return sum(self.tables)
 
     def placed(self, tables: EmissionTables | None = None) -> Emitters:
@@ -219,7 +215,6 @@ class Emitters:
         return found
 
     def _supporting(self, capability: str) -> list[Group]:
-        """Return the scene's groups with this capability."""
         return [group for group in self.groups if getattr(group, capability)]
 
     def covers(self, p, d):

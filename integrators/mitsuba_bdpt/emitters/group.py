@@ -29,7 +29,6 @@ class Context:
 
     @property
     def shape_errors(self) -> rounding.ShapeErrors:
-        """The `rounding.ShapeErrors` of the scene's shapes."""
         return self.facts.errors
 
 
@@ -69,7 +68,6 @@ class Group:
 
     @classmethod
     def is_hittable(cls, emitter) -> bool:
-        """Whether camera subpaths can hit this emitter."""
         return cls.hittable
 
     @classmethod
@@ -97,10 +95,7 @@ class Group:
         raise NotImplementedError(f"{type(self).__name__} has no place")
 
     def factor(self, index: mi.UInt32, p, d, cos, side: int, active) -> Factor:
-        """Effect of tables of ``side`` x ``side`` cells on the density of such emissions.
-
-        ``cos`` with the geometric normal.
-        """
+        """Effect of tables on the density of such emissions; ``cos``: geometric normal's."""
         return Factor.whole()
 
     # -- emission ---------------------------------------------------------------------------
@@ -165,9 +160,6 @@ def free_emission(index, weight, d, pdf_first, pdf_second, delta, si) -> Emissio
 
 
 def weight_over(pmf, weight, pdf):
-    """Divide the ``weight`` of next-event estimation by the selection's ``pmf``.
-
-    NaN, to be counted, where its density ``pdf`` is not finite.
-    """
+    """Weight of next-event estimation over ``pmf``; NaN for non-finite densities."""
     weight = dr.select(pdf == 0, 0, weight / pmf)
     return dr.select(dr.isfinite(pdf), weight, dr.nan)

@@ -38,7 +38,6 @@ def group_of(emitter) -> type[Group]:
 
 
 def is_third_party(class_name: str) -> bool:
-    """Whether an emitter's class is not Mitsuba's."""
     return class_name not in MITSUBAS
 
 

@@ -12,10 +12,7 @@ from ..geometry import rays
 
 @dataclass
 class Chosen:
-    """The selected emitters.
-
-    ``emitter`` for Mitsuba's calls, ``index`` in the scene, ``pmf`` probability of the selection.
-    """
+    """The selected emitters, their ``index`` in the scene and its probability ``pmf``."""
 
     emitter: mi.EmitterPtr
     index: mi.UInt32
@@ -73,10 +70,7 @@ class Direct:
 
 @dataclass
 class Hit:
-    """The emitter point ``si`` that a camera subpath has hit, or missed into.
-
-    ``previous``: the vertex before; both as Mitsuba's calls take them.
-    """
+    """Emitter point ``si`` hit (or missed into) by a camera subpath from ``previous``."""
 
     scene: mi.Scene
     si: mi.SurfaceInteraction3f

@@ -21,10 +21,7 @@ from .textured import TexturedPoints
 
 @dataclass
 class _Turned:
-    """A sphere whose sampled normals have to be turned with its points.
-
-    ``outward``: see `Sphere`; 0 where normals are right.
-    """
+    """A sphere whose sampled normals are turned; ``outward``: see `Sphere` (0: none)."""
 
     center: mi.Vector3f | tuple = (0, 0, 0)
     outward: mi.Float | float = 0.0
@@ -127,7 +124,6 @@ class Surfaces:
         return n if self._smooth_meshes is None else self._smooth_meshes.normal(n, index, u.y, active)
 
     def anchor(self, chosen, p, n, active) -> rays.Anchor:
-        """Anchor of the point ``p`` with the normal ``n``."""
         errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
         return rays.sampled_anchor(p, n, errors)
 

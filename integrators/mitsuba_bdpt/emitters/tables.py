@@ -37,7 +37,6 @@ def table(records: list[Record]) -> Record:
 
 
 def look_up(columns: Record, index: mi.UInt32, active: mi.Bool) -> Record:
-    """Return the row ``index`` of a `table`."""
     return replace(columns, **{k: dr.gather(type(v), v, index, active) for k, v in vars(columns).items()})
 
 

@@ -59,10 +59,7 @@ class _Map:
 
 
 class TexturedPoints:
-    """The lights of a group that are sampled here (flags ``chosen``).
-
-    ``emitters`` and ``spheres`` as in `surfaces.Surfaces`; ``mask`` is the `tables.Mask` of ``chosen``.
-    """
+    """The lights among ``emitters`` (see `surfaces.Surfaces`) that ``chosen`` flags."""
 
     def __init__(self, emitters, spheres, chosen):
         self.chosen, self.mask = chosen, Mask(chosen)

@@ -30,7 +30,6 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
 
 
 def boxes(scene: mi.Scene) -> list[mi.ScalarBoundingBox3f]:
-    """Return the bounding boxes of all shapes that have one."""
     found = (box_of(shape) for shape in scene.shapes())
     return [box for box in found if box is not None]
 

@@ -59,7 +59,6 @@ def spread_points(count: int):
 
 
 def is_textured(emitter) -> bool:
-    """Whether an area light has spatially varying radiance."""
     return mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying)
 
 
@@ -112,7 +111,6 @@ def check_densities(emitters, emitter, index: int, by_mitsuba: bool = True):
 
 
 def _directions_differ(emitters, emitter, place, u):
-    """`_differ` of the densities of next-event estimation."""
     it = dr.zeros(mi.Interaction3f)
     others, _ = emitter.sample_position(0, mi.Point2f(u.y, u.x))
     it.p = _places(emitter.get_shape().bbox(), others.p)

@@ -67,7 +67,6 @@ def darkened(value: mi.Spectrum, dark) -> mi.Spectrum:
 
 
 def stokes_types() -> list[type]:
-    """Types of the results of `stokes`."""
     return [mi.UnpolarizedSpectrum] * 4 if mi.is_polarized else [mi.Spectrum]
 
 
@@ -77,7 +76,6 @@ def stokes(value: mi.Spectrum) -> list:
 
 
 def of_stokes(entries: list) -> mi.Spectrum:
-    """Restore a throughput from the ``entries`` of `stokes`."""
     if not mi.is_polarized:
         return entries[0]
     value = dr.zeros(mi.Spectrum)

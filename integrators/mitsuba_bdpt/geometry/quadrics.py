@@ -47,7 +47,6 @@ class Sphere:
 
     @staticmethod
     def of(shape: mi.Shape) -> Sphere | None:
-        """Return the sphere of a shape; None if it is not a sphere."""
         if shape.shape_type() != mi.ShapeType.Sphere.value:
             return None
         matrix = matrix_of(shape)
@@ -63,7 +62,6 @@ class Sphere:
 
 
 def sphere_normal(p, center, outward):
-    """Normal at the point ``p`` of a sphere, see `Sphere`."""
     return mi.Normal3f(dr.normalize(p - center) * outward)
 
 

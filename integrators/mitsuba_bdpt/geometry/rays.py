@@ -41,7 +41,6 @@ class Anchor:
 
 
 def surface_anchor(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, shape_errors: ShapeErrors) -> Anchor:
-    """Anchor of the hit ``si`` of ``ray``."""
     errors = shape_errors.at(si.shape, si.is_valid(), si.instance, si.prim_index)
     offset = rounding_offset(si.p, ray.o, si.t, errors.reach)
     offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * errors.starts
@@ -130,10 +129,7 @@ def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
 
 @dataclass
 class Own:
-    """The surface at the end of a shadow ray.
-
-    ``number``: its index (see `met`); ``t``: distance from which on the ray may hit it.
-    """
+    """Surface (``number``, see `met`) at a shadow ray's end, hit from ``t`` on."""
 
     number: mi.UInt32
     t: mi.Float
@@ -154,10 +150,7 @@ def sight(
 
 
 def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None):
-    """Whether any surface blocks ``ray``, null surfaces included (as in ``path``).
-
-    ``own``: the surface at the end, where it can be hit too early.
-    """
+    """Whether any surface (also null, as in ``path``) but ``own`` blocks ``ray``."""
     if own is None:
         return scene.ray_test(ray, active=active)
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
@@ -167,10 +160,7 @@ def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = 
 def intersect_past_emitters(
     scene: mi.Scene, shape_errors: ShapeErrors, ray: mi.Ray3f, active: mi.Bool, coherent: bool
 ) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
-    """First hit along ``ray`` on a shape that does not emit, and the ray of it.
-
-    As ``path`` treats camera rays under ``hide_emitters``.
-    """
+    """First hit that does not emit, and its ray (``hide_emitters``, as in ``path``)."""
 
     def body(ray, pi, active):
         si = pi.compute_surface_interaction(ray, mi.RayFlags.Minimal, active)

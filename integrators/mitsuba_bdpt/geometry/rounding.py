@@ -38,10 +38,7 @@ FAR = 200
 
 
 def rounding_offset(p, o, t, reach):
-    """Offset that covers the rounding error of a hit ``p`` on a shape of ``reach``.
-
-    The hit was found from ``o`` at distance ``t``.
-    """
+    """Offset that covers the rounding error of a hit ``p`` found from ``o`` at ``t``."""
     magnitude = dr.maximum(dr.max(dr.abs(p)), dr.max(dr.abs(o)))
     return offset_at(dr.maximum(dr.maximum(magnitude, t), reach))
 
@@ -126,10 +123,7 @@ def met(shape, instance=None):
 
 
 def _curvatures(shape, grouped, extent) -> tuple[float, float]:
-    """``ends`` and ``starts`` of `Errors`, in a scene of diameter ``extent``.
-
-    ``grouped``: the largest ``ends`` of shapes in groups.
-    """
+    """``ends`` and ``starts`` of `Errors`; ``grouped``: largest ``ends`` in groups."""
     kind = shape.shape_type()
     if kind in ROUND:
         matrix = matrix_of(shape)

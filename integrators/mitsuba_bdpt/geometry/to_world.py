@@ -126,15 +126,11 @@ def check_inverse(shape: mi.Shape):
 
 
 def _differs(inverse, true, tolerance: float) -> bool:
-    """Whether a row differs from ``true`` by more than ``tolerance`` of its length."""
     return bool(np.any(np.linalg.norm(inverse - true, axis=1) > tolerance * np.linalg.norm(true, axis=1)))
 
 
 def check_rotation(emitter: mi.Emitter):
-    """Raise ``UsageError`` unless the ``to_world`` of an environment is a rotation.
-
-    With any other matrix Mitsuba's own calls disagree.
-    """
+    """Raise ``UsageError`` unless the ``to_world`` of an environment is a rotation."""
     columns = matrix_of(emitter)[:3, :3]
     if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
         raise UsageError(

@@ -13,7 +13,6 @@ from . import renamed
 
 
 def number(x) -> float:
-    """Convert a Dr.Jit number to a Python float."""
     return float(dr.slice(x) if dr.is_array_v(x) else x)
 
 
@@ -33,15 +32,11 @@ def children(owner) -> dict:
 
 
 def is_instance(shape: mi.Shape) -> bool:
-    """Whether ``shape`` is an instance of a shape group."""
     return shape.class_name() == "Instance"
 
 
 def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
-    """Return the shapes in the scene's shape groups.
-
-    Instances do not expose their group: groups are found among the scene's children.
-    """
+    """Return the shapes in the scene's shape groups, which instances do not expose."""
     shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
     groups = [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
     return [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
@@ -53,10 +48,7 @@ def all_shapes(scene: mi.Scene) -> list[mi.Shape]:
 
 
 def own_parameters(owner) -> dict:
-    """Return the parameters of ``owner`` alone, by name.
-
-    Cheaper than ``mi.traverse``, which visits all descendants.
-    """
+    """Return the parameters of ``owner`` alone, by name; cheaper than ``mi.traverse``."""
     collector = _collector(mi.variant())()
     found = collector.of(owner)
     return {
@@ -120,10 +112,7 @@ def _called(owner) -> str:
 
 
 def inverse_of(owner) -> np.ndarray:
-    """Return the inverse that Mitsuba stores beside `matrix_of`.
-
-    It is wrong after ``rotate`` about an axis of length other than 1: Mitsuba assumes a rotation.
-    """
+    """Mitsuba's inverse of `matrix_of`: wrong after ``rotate`` about a non-unit axis."""
     return _entries(own_parameters(owner)["to_world"].inverse().matrix)
 
 

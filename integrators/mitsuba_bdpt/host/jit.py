@@ -16,10 +16,7 @@ _GAP = 64
 
 
 def float64(x) -> np.ndarray:
-    """Convert a Dr.Jit array to double precision, including masked lanes.
-
-    Masked lanes hold arbitrary memory: NumPy's warning about signalling NaNs is suppressed.
-    """
+    """Convert to double precision, without NumPy warnings for NaN in masked lanes."""
     with np.errstate(invalid="ignore"):
         return np.array(x, dtype=np.float64)
 
@@ -36,7 +33,6 @@ def registered_emitters() -> list[str]:
 
 
 def _emitter(index: int):
-    """Return the emitter with this registry index, or None."""
     try:
         return dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(index))[0]
     except RuntimeError:  # never given, or freed
@@ -45,10 +41,7 @@ def _emitter(index: int):
 
 @contextlib.contextmanager
 def evaluated_mode(on=True):
-    """Evaluate loops, calls and branches instead of recording them symbolically.
-
-    Needed for calls of `timed_sunsky`.
-    """
+    """Evaluate loops, calls and branches instead of recording (for `timed_sunsky`)."""
     flags = (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals)
     with contextlib.ExitStack() as stack:
         for flag in flags if on else ():

@@ -54,8 +54,6 @@ class Choice:
 
 @dataclass(frozen=True)
 class Machine:
-    """Everything that the choice depends on."""
-
     env: Mapping[str, str]
     wheel: tuple[Path, ...]
     """Libraries of the installed wheel."""
@@ -68,7 +66,6 @@ class Machine:
 
     @classmethod
     def here(cls) -> Machine:
-        """Describe the machine that this process runs on."""
         return cls(
             env=os.environ,
             wheel=tuple(wheel_libraries(Path(sys.prefix))),
@@ -152,7 +149,6 @@ def prepare() -> Choice:
 
 
 def cuda_driver() -> bool:
-    """Whether the CUDA driver library can be loaded."""
     try:
         ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1")
     except OSError:

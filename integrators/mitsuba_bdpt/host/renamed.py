@@ -34,7 +34,6 @@ def is_transform(value: Any) -> bool:
 
 
 def may_be_animated() -> bool:
-    """Whether the installed Mitsuba supports animated transformations."""
     return hasattr(mi, "AnimatedTransform4f")
 
 
@@ -79,7 +78,6 @@ def normals(parameters: Parameters) -> mi.Float:
 
 
 def has_coordinates(parameters: Parameters) -> bool:
-    """Whether the mesh has texture coordinates."""
     return len(_flat(_named(parameters, COORDINATES))) > 0
 
 

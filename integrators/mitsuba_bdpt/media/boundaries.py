@@ -182,7 +182,6 @@ def disagreements(space: Space, lines: Lines) -> tuple[mi.UInt32, mi.UInt32]:
 
 
 def _transmits(si) -> mi.Bool:
-    """Mask: the BSDF of the surface ``si`` has transmissive lobes."""
     return (si.bsdf().flags() & int(mi.BSDFFlags.Transmission)) != 0
 
 

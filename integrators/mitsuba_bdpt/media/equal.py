@@ -48,10 +48,7 @@ def _same(structure: tuple | None, other: tuple | None) -> bool:
 
 
 def _structure(medium: mi.Medium) -> tuple | None:
-    """Classes of a medium and its descendants, and its volumes, to compare media.
-
-    None with Python plugins, which parameters do not identify.
-    """
+    """Classes and volumes of a medium and its descendants; None with Python plugins."""
     parts = list(_held(medium, "medium"))
     # Objects of Mitsuba's own plugins have exactly these types, Python plugins derived ones.
     if any(type(owner) not in (mi.Medium, mi.Volume, mi.PhaseFunction) for _, owner in parts):

@@ -94,7 +94,6 @@ class Landing:
 
 
 def choose_channel(u: mi.Float) -> mi.UInt32:
-    """Choose a channel of a spectrum uniformly."""
     count = len(mi.UnpolarizedSpectrum(0))
     return dr.minimum(mi.UInt32(u * count), count - 1)
 
@@ -124,7 +123,6 @@ def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:
 
 @dr.syntax
 def _through_surfaces(space: Space, ray, landing: Landing, word, active, hidden) -> Landing:
-    """Like `advance`, with surfaces to pass."""
     going = mi.Bool(active)
     while dr.hint(going, label="segments of an edge", exclude=[space, ray, hidden, active]):
         si, landing, word = _segment(space.media, ray, landing, word, going)
@@ -172,7 +170,6 @@ def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
 
 
 def at(spectrum: mi.UnpolarizedSpectrum, channel: mi.UInt32):
-    """The entry ``channel`` of a spectrum."""
     value = spectrum[0]
     for i in range(1, len(spectrum)):
         value = dr.select(channel == i, spectrum[i], value)
@@ -203,10 +200,7 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
 
 
 def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum:
-    """Throughput after a flight of optical ``depth`` that ends before a collision.
-
-    In homogeneous media; as `_weighted`: in gray media transmittance / density is 1.
-    """
+    """Throughput after homogeneous ``depth`` without collision; see `_weighted`."""
     if edge.ratio is None:
         return throughput
     transmittance = dr.exp(-depth)

@@ -77,10 +77,7 @@ class Media:
 
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Iterable[mi.BSDF]) -> Media | None:
-        """Return the media of a scene seen by a sensor, None if there are none.
-
-        ``bsdfs``: those of the scene's shapes.
-        """
+        """Return the media of a scene whose shapes have ``bsdfs``; None without media."""
         found = media_of(scene, [sensor])
         return Media(found, sensor.get_medium(), bsdfs) if found else None
 
@@ -100,7 +97,6 @@ class Media:
         return dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, medium))
 
     def is_homogeneous(self, number: mi.UInt32) -> mi.Bool:
-        """Mask: the medium of this number is homogeneous."""
         return dr.gather(mi.UInt32, self._homogeneous, number) == 1
 
     def is_null(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
@@ -233,10 +229,7 @@ def _numbers(number_of: dict[int, int]) -> mi.UInt32:
 
 
 def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray):
-    """Raise ``UnsupportedError`` if a homogeneous medium's extinction varies in space.
-
-    ``majorant``: its values at ``mei`` (`probes`).
-    """
+    """Raise ``UnsupportedError`` if a homogeneous medium's extinction varies in space."""
     if not medium.is_homogeneous():
         return
     extinction = children(medium).get("sigma_t")
@@ -277,10 +270,7 @@ def _majorants(medium: mi.Medium, mei: mi.MediumInteraction3f) -> np.ndarray:
 
 
 def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
-    """Random points in a grid, or in the varying volumes of a homogeneous medium.
-
-    With directions of arrival and wavelengths.
-    """
+    """Random points in the varying volumes of a medium, directions and wavelengths."""
     rng = np.random.default_rng(0)
     mei = dr.zeros(mi.MediumInteraction3f, _PROBES)
     wi = random_directions(rng, _PROBES)
@@ -298,7 +288,6 @@ def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
 
 
 def random_directions(rng, count: int) -> mi.Vector3f:
-    """Random unit vectors, uniform over the sphere."""
     return mi.warp.square_to_uniform_sphere(mi.Point2f(rng.random((2, count))))
 
 

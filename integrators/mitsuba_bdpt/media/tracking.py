@@ -35,10 +35,7 @@ class Tracked:
 
 
 def exponential(u: mi.Float) -> mi.Float:
-    """Sample an optical depth with density exp(-depth) from ``u`` in [0, 1); never 0.
-
-    At 0, vertices would coincide.
-    """
+    """Optical depth with density exp(-depth); never 0, where vertices would coincide."""
     return dr.select(u > 0, -dr.log(1 - u), 2.0**-25)
 
 

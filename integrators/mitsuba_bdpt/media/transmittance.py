@@ -85,7 +85,6 @@ def _along(media: Media, medium, ray, length, word, active):
 
 @dr.syntax
 def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> Crossing:
-    """Like `between`, with surfaces to pass."""
     media, scene = space.media, space.scene
     o, left, medium = mi.Point3f(ray.o), mi.Float(ray.maxt), mi.UInt32(medium)
     transmittance, word, going = mi.UnpolarizedSpectrum(1), mi.UInt32(word), mi.Bool(active)

@@ -43,10 +43,7 @@ class _Scale:
 
 
 def non_conserving_bsdfs(owners) -> list[str]:
-    """Describe the BSDFs that are not energy-conserving, by their parameters.
-
-    ``owners``: BSDFs or shapes with a BSDF; nested BSDFs are included.
-    """
+    """Describe the BSDFs, nested ones included, that are not energy-conserving."""
     scales = _scales([(owner,) for owner in owners])
     most = max(_QUICKLY_READ // max(len(scales), 1), 1)
     found = [(scale, _largest(scale.owners[0], most)) for scale in scales]

@@ -167,13 +167,11 @@ class _Asked:
 
     @classmethod
     def of(cls, side: boundaries.NearSide, count: int) -> _Asked:
-        """Evaluate ``side`` for ``count`` rays."""
         dr.eval(side)  # one kernel
         return cls(*(np.broadcast_to(np.array(x), count) for x in (side.number, side.found, side.escaped)))
 
     @property
     def numbers(self) -> np.ndarray:
-        """The media before the boundaries that were found."""
         return self.number[self.found]
 
 
@@ -224,11 +222,7 @@ class _Leaving:
 
 
 def _outside(space: Space, around: _Asked, leaving: _Leaving | None) -> int:
-    """Number of the medium that surrounds the scene.
-
-    The most frequent one of rays that leave the scene, from boundaries or ``around`` the sensor; the sensor's
-    if none does.
-    """
+    """The medium of most rays that leave the scene; the sensor's if none does."""
     numbers = np.full(around.escaped.sum(), space.media.sensor)
     if leaving is not None:
         numbers = np.concatenate([numbers, leaving.number[leaving.escaped]])

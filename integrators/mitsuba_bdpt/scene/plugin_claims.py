@@ -119,7 +119,6 @@ def _differ(a, b, where) -> bool:
 
 
 def _lit(value) -> np.ndarray:
-    """Mask: values are finite and not 0."""
     found = _numbers(value)
     return np.isfinite(found).all(0) & (found != 0).any(0)
 

@@ -60,10 +60,7 @@ class PreparedScene:
 
 
 def _check_passed(found):
-    """Raise ``UnsupportedError`` for polarizing null lobes.
-
-    Shadow rays carry the intensity only.
-    """
+    """Raise ``UnsupportedError`` for polarizing null lobes: shadow rays are scalar."""
     for one in bsdf.polarizing(found):
         raise UnsupportedError(
             f"{named(one)} of class {one.class_name()} polarizes what it lets pass, which is not supported "

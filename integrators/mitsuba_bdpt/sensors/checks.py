@@ -97,7 +97,6 @@ def _check_numbers(sensor: mi.Sensor):
 
 
 def _numbers(sensor: mi.Sensor) -> dict[str, float]:
-    """Return the sensor's own numeric parameters."""
     found = own_parameters(sensor)
     return {k: number(v) for k, v in found.items() if isinstance(v, float) or type(v) is mi.Float}
 
@@ -129,7 +128,6 @@ def inverse(matrix: np.ndarray, sensor: mi.Sensor) -> np.ndarray:
 
 
 def _parameters(sensor: mi.Sensor) -> str:
-    """The sensor's numbers and its ``to_world``, for messages."""
     numbers = [f"{name}={value:g}" for name, value in _numbers(sensor).items()]
     return ", ".join([*numbers, f"to_world=({_rows(world_matrix(sensor))})"])
 

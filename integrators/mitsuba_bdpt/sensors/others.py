@@ -80,10 +80,7 @@ class Orthographic(_Parallel):
 
 
 class Distant(_Parallel):
-    """A distant sensor without target: its rays cover a disk about the scene.
-
-    Its film has one pixel; positions on the film have no meaning.
-    """
+    """A distant sensor without target: one pixel, rays from a disk about the scene."""
 
     needs_aperture_sample = True
     needs_film_sample = True
@@ -125,7 +122,6 @@ class _Face:
         self._sphere = sphere if sphere is not None and sphere.turned else None
 
     def sample(self, u, shared):
-        """Sample a point, its shading normal, and its anchor."""
         ps = self.shape.sample_position(shared.time, u)
         if self._sphere is not None:
             ps.n = sphere_normal(ps.p, self._sphere.center, self._sphere.outward)
@@ -171,7 +167,6 @@ class IrradianceMeter(Sensor):
             self.area = True
 
     def _sample(self, u, shared):
-        """Like `_Face.sample`, for the view that ``u`` chooses."""
         if len(self._faces) == 1:
             return self._faces[0].sample(u, shared)
         index, x = view_at(u.x, len(self._faces))
@@ -274,6 +269,5 @@ def _has_area(sensor: mi.Sensor) -> bool:
 
 
 def _sampled(view, uv, u_lens, shared):
-    """Sample a ray and its weight with Mitsuba."""
     ray, weight = view.sample_ray_differential(shared.time, shared.u_wavelength, uv, u_lens)
     return mi.Ray3f(ray.o, ray.d, ray.maxt, shared.time, shared.wavelengths), mi.unpolarized_spectrum(weight)
