@@ -1,7 +1,7 @@
-"""Whether renders agree: tests on the means of tiles, bias checks. The one home of these statistics.
+"""Tests whether renders agree: on the means of tiles, and bias checks.
 
-Samples are tile means: one number per tile and render, renders with different seeds. Tiles of many pixels and
-samples are near normal, which Welch's test needs; single pixels are not.
+Samples are tile means: one number per tile and render, renders with different seeds. Welch's test needs
+normal samples; means of many pixels are nearly normal, single pixels are not.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from scipy import stats
 from ..errors import CommandError
 from .checks import CONFIDENCE, Estimate, floats, image_of, number_of
 
-# What float32 arithmetic alone may do to a tile's mean, relative: differences below are no finding.
+# Relative differences of tile means up to this are attributed to float32 rounding.
 ROUNDING = 2e-5
 
-# Tiles that are nonzero in fewer renders on both sides hold a few lumps, which are not normal.
+# Tiles nonzero in a smaller share of the renders of both sides are not normal, and not tested.
 NONZERO_SHARE = 0.9
 
-# Renders that a bias check takes at least. Sidak asks for the far tail, where Welch's test fails too often
-# for few of them. At a significance of 1e-3 over 48 values, normal and as noisy as those of 64 references,
-# the chance of a false alarm is 4 % for 5 renders, 0.9 % for 8, 0.2 % for 12 and 16 (8000 simulated).
+# Minimum number of renders of a bias check. Sidak's correction uses the far tail, where Welch's test of few
+# renders rejects too often: at significance 1e-3 over 48 values, 4 % false alarms for 5 renders, 0.9 % for 8,
+# 0.2 % for 12.
 FEWEST_RUNS = 8
 
-# Tiles of a bias check along an edge of the image, and the chance of a false alarm of a whole check.
+# Tiles of a bias check along each side of the image, and its probability of a false alarm.
 TILES = 4
 SIGNIFICANCE = 1e-3
 
 
 def tile_means(image, tiles: int) -> np.ndarray:
-    """Means over ``tiles`` x ``tiles`` tiles of an image (height, width, channels).
+    """Return means over ``tiles`` x ``tiles`` tiles, of (height, width, channels).
 
-    Flattened to (tiles * tiles, channels), row by row. The size must be divisible by ``tiles``.
+    Shape (tiles * tiles, channels), row by row. ``tiles`` must divide the size.
     """
     image = np.asarray(image, dtype=np.float64)
     h, w, c = image.shape
@@ -48,10 +48,9 @@ def tile_means(image, tiles: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Sample:
-    """Means and standard errors of m quantities over several renders.
+    """Means and standard errors of m quantities over several renders, each (m,).
 
-    Means (m,), their standard errors (m,), the errors' degrees of freedom, and the share of the renders in
-    which each quantity is nonzero (m,).
+    With the errors' degrees of freedom, and the share of the renders in which each quantity is nonzero.
     """
 
     mean: np.ndarray
@@ -61,13 +60,13 @@ class Sample:
 
     @staticmethod
     def of(values) -> Sample:
-        """From ``values`` (renders, m)."""
+        """Return the sample of ``values`` (renders, m)."""
         values = np.asarray(values, dtype=np.float64)
         error = values.std(0, ddof=1) / np.sqrt(len(values))
         return Sample(values.mean(0), error, len(values) - 1.0, (values != 0).mean(0))
 
     def joined(self, other: Sample) -> Sample:
-        """What `of` gives for the renders of both."""
+        """Return the sample of the renders of both."""
         a, b = self.freedom + 1, other.freedom + 1
         mean = (a * self.mean + b * other.mean) / (a + b)
         squares = sum((n - 1) * n * s.error**2 for n, s in ((a, self), (b, other)))
@@ -77,13 +76,13 @@ class Sample:
 
     @staticmethod
     def known(mean, error=0.0) -> Sample:
-        """Values (m,) whose standard errors are known rather than estimated."""
+        """Return values (m,) with known standard errors."""
         mean = np.asarray(mean, dtype=np.float64)
         return Sample(mean, np.broadcast_to(error, mean.shape), np.inf, np.ones_like(mean))
 
 
 def satterthwaite(variance_a, freedom_a, variance_b, freedom_b):
-    """Degrees of freedom of a sum of two estimated variances, by Welch and Satterthwaite.
+    """Degrees of freedom of a sum of two estimated variances (Welch-Satterthwaite).
 
     1 / (c^2 / n_a + (1 - c)^2 / n_b) with c = a / (a + b), and 1 where both are 0. Source: B. L. Welch,
     Biometrika 34, 1947.
@@ -96,10 +95,10 @@ def satterthwaite(variance_a, freedom_a, variance_b, freedom_b):
 
 
 class Difference(NamedTuple):
-    """Differences of the means of m quantities, and how significant they are, each (m,).
+    """Differences of the means of m quantities and their significance, each (m,).
 
-    Mean a - mean b, its standard error and degrees of freedom, the p-value, and whether that one is uniform
-    if nothing differs (not where rounding or a few lumps decide).
+    Mean a - mean b, its standard error and degrees of freedom, the p-value, and whether the p-value is
+    uniform under equality (not where rounding or few nonzero values decide).
     """
 
     value: np.ndarray
@@ -110,11 +109,10 @@ class Difference(NamedTuple):
 
 
 def welch(a: Sample, b: Sample) -> Difference:
-    """Welch's unequal-variances t-test of each quantity; Student's where one side is known exactly.
+    """Welch's unequal-variances t-test; Student's where one side is known exactly.
 
     Two-sided: t = |a - b| / hypot(error_a, error_b). Differences within `ROUNDING` of the larger mean count
-    as none. Where both sides are nonzero in less than `NONZERO_SHARE` of the renders it does not apply, and
-    p is 1.
+    as none. p is 1 where both sides are nonzero in less than `NONZERO_SHARE` of the renders.
     """
     error = np.hypot(a.error, b.error)
     gap = np.abs(a.mean - b.mean)
@@ -128,26 +126,25 @@ def welch(a: Sample, b: Sample) -> Difference:
 
 
 def sidak(p) -> float:
-    """Chance that the smallest of so many independent p-values is as small as it is."""
+    """Return the probability of so small a minimum of independent p-values."""
     p = np.asarray(p, dtype=np.float64)
     return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 1 - 1e-16))))
 
 
 def _each(significance: float, count: int) -> float:
-    """The p-value below which one of ``count`` comparisons fails the whole check: `sidak` the other way."""
+    """Return the significance of each of ``count`` comparisons; inverse of `sidak`."""
     return float(-np.expm1(np.log1p(-significance) / count))
 
 
 @dataclass(frozen=True)
 class BiasCheck:
-    """What `bias_check` finds.
+    """Result of `bias_check`.
 
-    ``passed``: no difference at the significance asked for; ``p``: the smallest p-value; ``family_p``: the
-    same after Sidak's correction for all ``comparisons``; ``tile``: (row, column) of the worst tile, None
-    for the image as a whole; ``channel`` of it; ``difference``: image - reference there, in radiance, with
-    an interval that holds the differences of all comparisons at once with confidence 1 - significance;
-    ``missing``: the share of the energy that is missing, 1 - mean(image) / mean(reference) over the whole
-    image, with its 95 % interval.
+    ``passed``: no difference at the given significance; ``p``: the smallest p-value; ``family_p``: the same
+    after Sidak's correction for all ``comparisons``; ``tile``: (row, column) of the worst tile, None for the
+    whole image; ``channel``: of it; ``difference``: image - reference there, in radiance, with a simultaneous
+    interval of all comparisons at confidence 1 - significance; ``missing``: the missing share of the energy,
+    1 - mean(image) / mean(reference) over the whole image, with its 95 % interval.
     """
 
     passed: bool
@@ -161,7 +158,7 @@ class BiasCheck:
 
 
 def tile_columns(image, tiles=TILES) -> np.ndarray:
-    """What a bias check compares, (3 tiles^2 + 3,): means of tiles and of the whole image.
+    """Return the quantities of a bias check, (3 tiles^2 + 3,).
 
     `tile_means` by row, column and channel, then the mean of the whole image by channel.
     """
@@ -170,9 +167,9 @@ def tile_columns(image, tiles=TILES) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Means:
-    """`tile_columns` of renders as a sample, and the mean of the whole image over its channels as another.
+    """Samples of `tile_columns` and of the image's mean over all channels.
 
-    All that `compare_means` needs of a set of renders; small enough to keep beside a reference or in a table.
+    The input of `compare_means`, small enough to be stored with a reference or in a table.
     """
 
     columns: Sample
@@ -180,7 +177,7 @@ class Means:
 
     @staticmethod
     def of(columns, name="columns") -> Means:
-        """From ``columns`` (renders, 3 tiles^2 + 3), renders with seeds of their own."""
+        """Return the means of ``columns`` (renders, 3 tiles^2 + 3), one seed each."""
         columns = np.asarray(columns, dtype=np.float64)
         if len(columns) < FEWEST_RUNS:
             raise CommandError(
@@ -190,31 +187,31 @@ class Means:
         return Means(Sample.of(columns), Sample.of(columns[:, -3:].mean(1, keepdims=True)))
 
     def joined(self, other: Means) -> Means:
-        """What `of` gives for the renders of both."""
+        """Return the means of the renders of both."""
         return Means(self.columns.joined(other.columns), self.whole.joined(other.whole))
 
     @staticmethod
     def known(image, tiles=TILES) -> Means:
-        """Of an image without error."""
+        """Return the means of an exact image."""
         columns = tile_columns(image, tiles)
         return Means(Sample.known(columns), Sample.known(columns[-3:].mean(keepdims=True)))
 
     @property
     def tiles(self) -> int:
-        """Tiles along an edge of the image."""
+        """Tiles along each side of the image."""
         return math.isqrt(len(self.columns.mean) // 3 - 1)
 
 
 def _means_of_runs(name, runs, tiles):
-    """`Means` of ``runs`` (seeds, height, width, 3), and the shape of one."""
+    """Return `Means` of ``runs`` (seeds, height, width, 3), and the shape of one."""
     runs = floats(name, runs, ("seeds", "height", "width", "3"))
     return Means.of([tile_columns(run, tiles) for run in runs], name), runs.shape[1:]
 
 
 def _means_of_reference(reference, standard_error, tiles):
-    """As `_means_of_runs`, from one image and the standard error of its values (height, width, 3).
+    """Like `_means_of_runs`, from one image and its standard error (height, width, 3).
 
-    Pixels are taken for independent, the channels of a pixel for fully correlated.
+    Assumes independent pixels, and full correlation between the channels of a pixel.
     """
     reference = image_of("references", reference)
     standard_error = image_of("standard_error", standard_error)
@@ -233,13 +230,13 @@ def _means_of_reference(reference, standard_error, tiles):
 
 
 def _student(value, error, freedom, confidence) -> Estimate:
-    """``value`` with Student's interval for its standard error."""
+    """Return ``value`` with Student's interval for its standard error."""
     half = stats.t.isf((1 - confidence) / 2, freedom) * error
     return Estimate(float(value), float(value - half), float(value + half))
 
 
 def missing_energy(image: Sample, reference: Sample) -> Estimate:
-    """1 - mean(image) / mean(reference) with its 95 % interval, from samples of both means (m = 1).
+    """Return 1 - mean(image) / mean(reference) with its 95 % interval (m = 1).
 
     Variance of the ratio to first order: v_x / r^2 + x^2 v_r / r^4, Student's t with the degrees of freedom
     of `satterthwaite`.
@@ -253,19 +250,18 @@ def missing_energy(image: Sample, reference: Sample) -> Estimate:
 
 
 def bias_check(images, references, tiles=TILES, significance=SIGNIFICANCE, standard_error=None) -> BiasCheck:
-    """Whether the renders agree with the reference within their noise.
+    """Test whether renders agree with the reference within their noise.
 
-    `welch` over the means of ``tiles`` x ``tiles`` tiles and of the whole image, channel by channel, with
-    Sidak's correction: with no bias it fails with a chance of ``significance``, up to 2.5 times that for 12
-    seeds and 9 times for 8 (see `FEWEST_RUNS`); take 16.
+    `welch` over the means of ``tiles`` x ``tiles`` tiles and of the whole image, by channel, with Sidak's
+    correction. Without bias it fails with probability ``significance``, up to 2.5 times that for 12 seeds and
+    9 times for 8; use 16.
 
     ``images`` (seeds, height, width, 3), seeds all different; ``references`` either the same, or one image
-    (height, width, 3) with ``standard_error`` of the same shape. The latter takes pixels for independent,
-    which they are not under filters wider than a pixel or when light paths are shared: then give runs.
+    (height, width, 3) with ``standard_error`` of the same shape. The latter assumes independent pixels, which
+    wide filters and shared light paths violate: then give renders.
 
-    It finds bias of a few standard errors of a tile; what it does not find may be hidden by noise (see the
-    width of the intervals). An integrator whose energy sits in events rarer than the samples fails too:
-    what it misses in practice and what it can never find look the same.
+    It detects bias of a few standard errors of a tile; noise may hide smaller bias (see the intervals). It
+    cannot distinguish bias from energy in events that are rarer than the samples.
     """
     ours, shape = _means_of_runs("images", images, tiles)
     if np.ndim(references) == 3:
@@ -284,7 +280,7 @@ def bias_check(images, references, tiles=TILES, significance=SIGNIFICANCE, stand
 
 
 def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> BiasCheck:
-    """`bias_check` of what was kept of the renders on both sides."""
+    """Like `bias_check`, from the stored means of both sides."""
     significance = number_of("significance", significance, 0, 1)
     if ours.tiles != theirs.tiles:
         raise CommandError(
@@ -313,9 +309,10 @@ def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> Bias
 
 
 class Apart(NamedTuple):
-    """A ``tile`` (row, column), None for the whole image, and the ``share`` by which the first is brighter.
+    """A differing ``tile`` (row, column), None for the whole image, and its ``share``.
 
-    The share is of the second's mean, in the most significant channel; infinite where that is black.
+    ``share``: relative difference to the second's mean, in the most significant channel; infinite where that
+    is black.
     """
 
     tile: tuple[int, int] | None
@@ -323,7 +320,7 @@ class Apart(NamedTuple):
 
 
 def apart(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> list[Apart]:
-    """Where the renders differ, row by row, the whole image at last: nowhere if `compare_means` passes."""
+    """Return the tiles that differ, the whole image last; none if unbiased."""
     significance = number_of("significance", significance, 0, 1)
     found, tiles = welch(ours.columns, theirs.columns), ours.tiles
     p = found.p.reshape(-1, 3)

@@ -1,7 +1,8 @@
-"""What the rows of a sweep say: efficiencies, slopes, bias, costs. Pure functions; a row is a dictionary.
+"""Statistics of a sweep's rows: efficiencies, slopes, bias, costs.
 
-Efficiency = 1 / (seconds * error); comparisons pair the renders of one seed, which followed one another in
-time. A figure that the data cannot give is refused: `Refused` says why, `Biased` with the missing energy.
+Pure functions; a row is a dictionary. Efficiency = 1 / (seconds * error). Comparisons pair renders of equal
+seed, which ran consecutively. Unavailable figures raise `Refused` with the reason, or `Biased` with the
+missing energy.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from .efficiency import (
     slope,
 )
 
-# Errors of a row, and the reference's own.
+# Error columns of a row, and the reference's own.
 OWN = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_trimmed"}
 
-# Names of integrators that the report looks for, as presets/benchmark.toml has them.
+# Names of the integrators that reports compare with, as in presets/benchmark.toml.
 RIVALS = ("path", "path multijitter")
 MEDIA_RIVALS = ("volpath", "volpathmis")  # in scenes with participating media
 NONE = "bdpt skip=none"
@@ -37,16 +38,16 @@ ALONE = "bdpt light_paths=0"
 UNAIMED = "bdpt emission_guiding=never"
 LIGHT_TRACER = "ptracer"
 
-# Samples per pixel of the first integrator at which efficiencies are compared, if there are such renders.
+# Samples per pixel of the first integrator at which efficiencies are compared, if available.
 DECIDING = 64
 
 
 class Refused(CommandError):
-    """A figure that the data cannot give; the text says why."""
+    """A figure that cannot be computed from the data; the text has the reason."""
 
 
 class NotJudged(Refused):
-    """A figure for which the reference is too noisy; ``share`` of the error measured that it carries."""
+    """The reference is too noisy for a figure: ``share`` of the error is its own."""
 
     def __init__(self, text: str, share: float):
         super().__init__(text)
@@ -54,7 +55,7 @@ class NotJudged(Refused):
 
 
 class Biased(Refused):
-    """An efficiency over integrators that fail the bias check; ``lacks``: what each of them does, by name."""
+    """All rivals fail the bias check; ``lacks``: missing energy by integrator."""
 
     def __init__(self, lacks: dict[str, str]):
         several = "; ".join(f"{name}: {what}" for name, what in lacks.items())
@@ -75,25 +76,25 @@ class Summary:
 
 
 def summary(values) -> Summary:
-    """`Summary` of at least two values."""
+    """Return the `Summary` of at least two values."""
     middle = bootstrap_median(values)
     return Summary(middle.value, middle.low, middle.high, min(values), max(values), len(values))
 
 
 def select(rows, **wanted) -> list[dict]:
-    """Rows with these values."""
+    """Return the rows with these values."""
     return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
 
 
 def judged(own: float, measured: float) -> bool:
-    """Whether the reference is good enough for an error; an image without any needs one without."""
+    """Return whether a reference of error ``own`` can judge the error ``measured``."""
     return reference_good_enough(own, measured) if measured > 0 else own == 0
 
 
 def check_judged(rows, error: str) -> None:
-    """Raise `Refused` if the reference is too noisy for the median of the errors.
+    """Raise `Refused` if the reference is too noisy for the median error.
 
-    Those that are not among `OWN` need none.
+    Errors not in `OWN` need no reference.
     """
     if error not in OWN:
         return
@@ -106,9 +107,9 @@ def check_judged(rows, error: str) -> None:
 
 
 def unjudged(rows) -> dict[tuple[str, int], NotJudged]:
-    """Integrators and budgets of the ``rows`` of a scene for whose errors the reference is too noisy.
+    """Return integrators and budgets whose errors the reference cannot judge.
 
-    With the refusal, of raw and trimmed errors that of the worse.
+    With the exception, for the worse of raw and trimmed error.
     """
     found = {}
     for method, budget in dict.fromkeys((row["method"], row["budget"]) for row in rows):
@@ -118,13 +119,13 @@ def unjudged(rows) -> dict[tuple[str, int], NotJudged]:
             except NotJudged as why:
                 if (method, budget) not in found or found[method, budget].share < why.share:
                     found[method, budget] = why
-            except Refused:  # an error of 0, which no reference judges
+            except Refused:  # an error of 0 cannot be judged
                 continue
     return found
 
 
 def paired(ours, theirs) -> list[tuple[dict, dict]]:
-    """The renders of each seed that both have; raises `Refused` for fewer than two."""
+    """Return pairs of renders with equal seeds; raises `Refused` for less than two."""
     by_seed = {row["seed"]: row for row in theirs}
     pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
     if len(pairs) < 2:
@@ -133,13 +134,15 @@ def paired(ours, theirs) -> list[tuple[dict, dict]]:
 
 
 def pair_ratios(ours, theirs, error="rel_mse_trimmed") -> list[float]:
-    """Ratio of efficiencies, ours over theirs, of each pair of `paired`."""
+    """Return the ratio of efficiencies, ours over theirs, of each pair."""
     pairs = paired(ours, theirs)
     return [equal_time_speedup(*(Measurement(row["seconds"], row[error]) for row in pair)) for pair in pairs]
 
 
 def efficiency(ours, theirs, error="rel_mse_trimmed") -> Summary:
-    """Summary of `pair_ratios`; raises `Refused` where the reference is too noisy or an error is 0.
+    """Return the summary of `pair_ratios`.
+
+    Raises `Refused` like `check_judged`, and for errors of 0.
 
     ``error``: one of `OWN`, or ``spread`` or ``spread_trimmed``: see `metrics.spread`.
     """
@@ -155,9 +158,9 @@ def efficiency(ours, theirs, error="rel_mse_trimmed") -> Summary:
 
 
 def gap(rows) -> Summary:
-    """Summary of raw over trimmed relMSE: how much of the error the worst values of an image carry.
+    """Return the summary of raw over trimmed relMSE.
 
-    Raises `Refused` as `efficiency` does.
+    Large where few values carry most of the error. Raises `Refused` like `efficiency`.
     """
     if len(rows) < 2:
         raise Refused("fewer than two renders")
@@ -169,9 +172,9 @@ def gap(rows) -> Summary:
 
 
 def widths(rows, methods) -> dict[str, float]:
-    """Widths of the intervals of the median ratios of efficiencies (trimmed).
+    """Return the interval widths of median efficiency ratios (trimmed), by rival.
 
-    The ratios are of the first method over each other one, without regard to the reference.
+    Ratios of the first method over each other one, regardless of the reference.
     """
     ours = select(rows, method=methods[0])
     found = {name: bootstrap_median(pair_ratios(ours, select(rows, method=name))) for name in methods[1:]}
@@ -179,14 +182,14 @@ def widths(rows, methods) -> dict[str, float]:
 
 
 def cost(ours, theirs) -> Summary:
-    """Summary of the ratio of seconds per sample per pixel, pairs of seeds."""
+    """Return the summary of the ratio of seconds per sample, over pairs of seeds."""
     return summary([a["seconds"] / a["spp"] / (b["seconds"] / b["spp"]) for a, b in paired(ours, theirs)])
 
 
 def convergence(rows, error="rel_mse") -> Estimate:
-    """Slope of log(error) over log(samples), from all renders of one method in one scene.
+    """Return the slope of log(error) over log(samples), over all renders of a method.
 
-    Budgets whose error the reference cannot judge are left out.
+    Excludes budgets whose error the reference cannot judge.
     """
     if not rows:
         raise Refused("not rendered")
@@ -205,9 +208,9 @@ def convergence(rows, error="rel_mse") -> Estimate:
 
 
 def bias(rows, reference: Means) -> BiasCheck:
-    """Bias check of one method in one scene against the reference.
+    """Return the bias check of a method in a scene against the reference.
 
-    With the budget that has most samples among those with enough renders.
+    Uses the largest budget with enough renders.
     """
     budgets = {row["budget"]: select(rows, budget=row["budget"]) for row in rows}
     enough = [at for at in budgets.values() if len(at) >= FEWEST_RUNS]
@@ -224,7 +227,7 @@ def geometric_mean(values) -> float:
 
 @dataclass(frozen=True)
 class Results:
-    """The rows of a sweep with the tile means of its references by scene, and what its probes measured."""
+    """Rows of a sweep, tile means of its references by scene, and results of probes."""
 
     rows: list
     references: dict
@@ -237,14 +240,14 @@ class Results:
 
     @cached_property
     def methods(self) -> list[str]:
-        """Integrators, first the one that the others are compared with."""
+        """Integrators; the others are compared with the first."""
         return list(dict.fromkeys([self.rows[0]["first"], *(row["method"] for row in self.rows)]))
 
     @cached_property
     def rivals(self) -> list[str]:
-        """What the first integrator is compared with at equal time.
+        """Integrators that the first is compared with at equal time.
 
-        Mitsuba's path tracers, then others that no figure of the project's own looks for.
+        Mitsuba's path tracers first, then others.
         """
         tracers = *RIVALS, *MEDIA_RIVALS
         known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, UNAIMED, LIGHT_TRACER}
@@ -253,15 +256,14 @@ class Results:
 
     @cached_property
     def standard(self) -> list[str]:
-        """The integrators that efficiencies by budget and costs are over.
+        """Baselines of efficiencies by budget and of costs.
 
-        `path` with each sampler, `volpath` and `volpathmis`; other rivals if none was rendered under these
-        names. `standard_in` has those of a scene.
+        `path` with each sampler, `volpath` and `volpathmis`; other rivals if none of these was rendered.
         """
         return [rival for rival in self.rivals if rival in (*RIVALS, *MEDIA_RIVALS)] or self.rivals
 
     def standard_in(self, scene: str) -> list[str]:
-        """Those of `standard` that were rendered in a scene."""
+        """Return the `standard` integrators that were rendered in a scene."""
         return [rival for rival in self.standard if self.of(scene, rival)]
 
     @cached_property
@@ -274,7 +276,7 @@ class Results:
 
     @cached_property
     def deciding(self) -> int:
-        """The budget that decides: `DECIDING`, or the largest that every scene has."""
+        """The budget of comparisons: `DECIDING`, or the largest that every scene has."""
         budgets = {scene: set() for scene in self.scenes}
         for row in self.rows:
             budgets[row["scene"]].add(row["budget"])
@@ -282,23 +284,23 @@ class Results:
         return DECIDING if DECIDING in common or not common else max(common)
 
     def of(self, scene: str, method: str, budget: int | None = None) -> list[dict]:
-        """Rows of an integrator in a scene."""
+        """Return the rows of an integrator in a scene."""
         rows = self._of.get((scene, method), [])
         return rows if budget is None else select(rows, budget=budget)
 
     def bias(self, scene: str, method: str) -> BiasCheck:
-        """Bias check against the scene's reference."""
+        """Return the bias check against the scene's reference."""
         if scene not in self.references:
             there = self.of(scene, method)
             raise Refused("no bias check: the reference is a given image" if there else "not rendered")
         return bias(self.of(scene, method), self.references[scene])
 
     def gap(self, scene: str, method: str) -> Summary:
-        """`gap` of an integrator at the deciding budget."""
+        """Return `gap` of an integrator at the deciding budget."""
         return gap(self.of(scene, method, self.deciding))
 
     def by_gap(self, method: str) -> list[str]:
-        """Scenes with the largest `gap` first, and at last those without such a figure."""
+        """Return the scenes by decreasing `gap`; those without one are last."""
 
         def size(scene):
             try:
@@ -309,15 +311,17 @@ class Results:
         return sorted(self.scenes, key=size, reverse=True)
 
     def efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Summary:
-        """Of the first integrator over another one, at the deciding budget unless said."""
+        """Return the efficiency of the first integrator over ``rival``.
+
+        At the deciding budget by default.
+        """
         budget = budget or self.deciding
         return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
 
     def fair_efficiency(self, scene, rival, error="rel_mse_trimmed", budget=None) -> Summary:
-        """As `efficiency`; raises `Biased` where the other fails the bias check.
+        """Like `efficiency`; raises `Biased` if ``rival`` fails the bias check.
 
-        With too few seeds for one there is none to fail, but an image that is black where the reference is
-        not.
+        With too few seeds for a check, only an image that is black where the reference is not fails.
         """
         try:
             check = self.bias(scene, rival)
@@ -331,9 +335,9 @@ class Results:
         return self.efficiency(scene, rival, error, budget)
 
     def against_path(self, scene, error="rel_mse_trimmed", budget=None) -> Summary:
-        """Efficiency over the strongest of `standard`, that with the smallest ratio.
+        """Return the efficiency over the strongest of `standard` (smallest ratio).
 
-        Of those that were rendered and pass the bias check; raises `Biased` if none does.
+        Considers integrators that pass the bias check; raises `Biased` if none does.
         """
         found, biased = [], {}
         rivals = self.standard_in(scene)
@@ -353,7 +357,7 @@ NOTHING = "all energy is missing"
 
 
 def missing(check: BiasCheck) -> str:
-    """What an integrator lacks that fails the bias check, in words."""
+    """Describe the energy missing from an integrator that fails the bias check."""
     share = check.missing
     low, high = sorted((abs(100 * share.low), abs(100 * share.high)))
     if low > 99.95:

@@ -1,7 +1,7 @@
-"""Measurements as functions: each command that measures, of scenes as dictionaries or files.
+"""Measurements as functions, of scenes as dictionaries or files.
 
-What a measurement needs is imported when it is called: the command declares its options from this package
-where the extra ``[measure]``, or Mitsuba, is missing.
+Heavy imports are deferred: the command declares its options where the extra ``[measure]`` or Mitsuba is
+missing.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class SceneDict:
-    """A scene as the ``dictionary`` of ``mi.load_dict``, with the ``name`` of its references and rows."""
+    """A scene ``dictionary`` for ``mi.load_dict``, and the ``name`` of its references."""
 
     def __init__(self, name: str, dictionary: Mapping[str, Any]):
         self.name, self.dictionary = name, dictionary
@@ -40,7 +40,7 @@ Asked = TypeVar("Asked", bound=available.Options)
 
 
 def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Reference:
-    """Make the reference of a scene, or go on with the stored one.
+    """Make the reference of a scene, or refine the stored one.
 
     ``options``: those of `options.MakeReference`. Returns the reference with its ``image`` and own ``error``.
     """
@@ -55,7 +55,7 @@ def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Ref
 def compare_integrators(
     scenes: Scene | Sequence[Scene], first: Plugin, second: Plugin, *, project: str | Path = ".", **options
 ) -> str:
-    """Compare two ways to render: time, error and efficiency of the first over the second.
+    """Compare two integrators: time, error, efficiency of the first over the second.
 
     ``options``: those of `options.Compare`. Returns a table in Markdown.
     """
@@ -70,7 +70,7 @@ def compare_integrators(
 def compare_at_equal_time(
     scene: Scene, integrators: Sequence[Plugin] = (), *, project: str | Path = ".", **options
 ) -> list[Shot]:
-    """Render a scene by several integrators in equal time, and draw them side by side.
+    """Render a scene with several integrators in equal time, and draw the images.
 
     ``options``: those of `options.EqualTime`; by default `path` (with media `volpath`) and `bdpt`. Returns
     the renders, with their ``image``, ``seconds`` and ``rel_mse``.
@@ -99,10 +99,10 @@ def render_pyramid(scene: Scene, *, project: str | Path = ".", **options) -> dic
 def run_sweep(
     preset: str | Path, dictionaries: Sequence[SceneDict] = (), *, project: str | Path = ".", **options
 ) -> list[dict]:
-    """Render what is missing of a preset, a TOML file, whose scenes may be ``dictionaries`` by their names.
+    """Render the missing cells of a preset, a TOML file.
 
-    ``options``: those of `options.Sweep`. Returns the rows. Raises ``FailureError`` if a render failed;
-    the rows of the others are kept.
+    ``dictionaries``: scenes by name. ``options``: those of `options.Sweep`. Returns the rows. Raises
+    ``FailureError`` if a render failed; the other rows are kept.
     """
     from . import sweep as module
 
@@ -116,7 +116,7 @@ def run_sweep(
 
 @contextmanager
 def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[tuple[Project, list[str]]]:
-    """The project with these scenes, and their names in it; within, the variant is `VARIANT`."""
+    """Yield the project with these scenes, and their names; sets `VARIANT`."""
     import mitsuba as mi
 
     from .project import Project
@@ -145,13 +145,13 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
 
 
 def _options(kind: type[Asked], given: dict) -> Asked:
-    """The ``given`` options of a measurement; raises ``CommandError`` for others."""
+    """Return the options of a measurement; raises ``CommandError`` for others."""
     known = {field.name: field.default for field in available.options_of(kind)}
     for name in given:
         if name not in known:
             question = did_you_mean(name, known)
             raise CommandError(f"{name}={given[name]!r} is no option; {question}there are {', '.join(known)}")
-    # Of an option that takes several values one may be given alone.
+    # An option of several values accepts a single one.
     several = [name for name in given if isinstance(known[name], tuple)]
     alone = {name: (given[name],) for name in several if not isinstance(given[name], list | tuple)}
     return kind(**given | alone)
@@ -165,6 +165,6 @@ def _parameters(plugin: Plugin) -> dict[str, Any]:
 
 
 def _called(plugin: Plugin) -> str:
-    """What is written beneath the image of an integrator."""
+    """Return the caption of an integrator."""
     found = _parameters(plugin)
     return " ".join([found.pop("type"), *(f"{key}={value}" for key, value in found.items())])

@@ -1,4 +1,4 @@
-"""Renders of a sweep's cells, here or on a worker of a cluster."""
+"""Renders the cells of a sweep, locally or on a cluster's worker."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from .project import Project
 from .scenes import integrator_of
 from .timing import timed
 
-CALIBRATIONS = 3  # alternating renders from which the samples for equal time follow
+CALIBRATIONS = 3  # alternating renders that calibrate the samples for equal time
 
 
 class Bench:
-    """The loaded scenes and integrators of one scene's cells, warm."""
+    """Loaded scenes and integrators of one scene's cells, with compiled kernels."""
 
     def __init__(self, cells: Cells, output: Path):
         self.cells, self.output = cells, output
@@ -35,26 +35,25 @@ class Bench:
         self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
 
     def scene(self, sampler: str):
-        """The scene with that sampler."""
+        """Return the scene with that sampler."""
         if sampler not in self._scenes:
             self._scenes[sampler] = self._file.load(self._resolution, sampler)
         return self._scenes[sampler]
 
     def integrator(self, cell: Cell):
-        """The plugin of a cell."""
+        """Return the integrator of a cell."""
         if cell.parameters not in self._integrators:
             self._integrators[cell.parameters] = integrator_of(dict(cell.parameters), self._depth)
         return self._integrators[cell.parameters]
 
     def timed(self, cell: Cell, spp: int, seed: int):
-        """Image and wall seconds of a render."""
+        """Return image and wall seconds of a render."""
         return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
     def compile_seconds(self, cell: Cell, spp: int) -> float:
-        """Seconds for the kernels of an integrator, which is warm afterwards.
+        """Return the seconds of compiling an integrator's kernels.
 
-        Less where they come from the cache on disk. Mitsuba's integrators have kernels of their own for each
-        number of samples.
+        Less with a cache on disk. Mitsuba's integrators compile for each number of samples.
         """
         key = cell.method, spp
         if key not in self._compile:
@@ -72,14 +71,14 @@ class Bench:
         return self._compile[key]
 
     def pilot_seconds(self, cell: Cell, spp: int) -> float:
-        """Seconds of the pilots of the first render of so many samples, which later ones remember."""
+        """Return the seconds of the first render's pilots, whose results are then cached."""
         self.compile_seconds(cell, spp)
         return self._pilot[cell.method, spp]
 
     def spp_of(self, cell: Cell) -> int:
-        """Samples of a cell: its budget, or what fits into the first method's seconds for it.
+        """Return the samples of a cell: its budget, or those for equal time.
 
-        The ratio of seconds is measured once, at the largest budget, and kept.
+        The ratio of seconds is measured once, at the largest budget.
         """
         first, largest = self.cells.of(cell.budget, cell.seed)[0], max(self.cells.subject.spp)
         if cell.match == "spp" or cell.method == first.method:
@@ -98,18 +97,18 @@ class Bench:
         wanted = cell.budget * self._spp[cell.method]
         if cell.sampler == "independent":
             return max(round(wanted), 1)
-        # Mitsuba's stratified samplers take a tenth longer per sample for numbers far from a power of two.
+        # Mitsuba's stratified samplers are a tenth slower per sample far from a power of two.
         return self._possible(cell.sampler, 2 ** max(round(math.log2(wanted)), 0))
 
     def _possible(self, sampler: str, spp: int) -> int:
-        """The samples that a sampler makes of so many: stratified ones may round up."""
+        """Return the samples that a sampler takes: stratified ones may round up."""
         fork = self.scene(sampler).sensors()[0].sampler().fork()
         fork.set_sample_count(spp)
         return int(fork.sample_count())
 
 
 def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
-    """Render a cell; its row, but for the errors, and its image."""
+    """Render a cell; returns its row, without errors, and its image."""
     spp = bench.spp_of(cell)
     compile_seconds = bench.compile_seconds(cell, spp)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -122,7 +121,7 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "parameters": json.dumps(dict(cell.parameters)),
         "versions": json.dumps(dict(cell.versions)),
         "started": started,
-        # A render that stops at a target error or after some time has fewer than it was asked for.
+        # A target error or timeout may end a render early.
         "spp": sum(statistics.get("passes", ())) or spp,
         "seconds": seconds,
         "seconds_compile": compile_seconds,
@@ -134,9 +133,9 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
 
 
 def measured(root: str, preset: str, scene: str, cells: list[dict]) -> list:
-    """On a worker: row and image of each cell, or why it failed, as text; one after the other.
+    """On a worker: return row and image of each cell, or the text of its error.
 
-    ``root`` of the project, text of the ``preset``, name of the ``scene``.
+    ``root``: of the project; ``preset``: its text; ``scene``: its name.
     """
     with workers.one_at_a_time:
         mi.set_variant(VARIANT)
@@ -149,22 +148,22 @@ def measured(root: str, preset: str, scene: str, cells: list[dict]) -> list:
                 raise CommandError(f"a worker has another {scene}.xml, mesh or texture than the client")
             try:
                 found.append(measure(bench, cell))
-            except Exception as error:  # one cell must not cost the others
+            except Exception as error:  # one cell must not end the others
                 found.append(message(error))
         return found
 
 
 @cache
 def _loaded_software() -> tuple:
-    """`software` when this process first asked: files may change under a worker, not what it imported."""
+    """Return `software` at the first call: files may change later, imports do not."""
     return tuple(software().items())
 
 
 @lru_cache(maxsize=2)
 def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
-    """The bench of a scene of a preset; kept, so that it stays warm.
+    """Return the cached bench of a scene of a preset.
 
-    The scene has these contents, the preset is in a file of this text.
+    Identified by the scene's content and the preset's text.
     """
     folder = tempfile.TemporaryDirectory(prefix="bdpt_sweep_")
     file = Path(folder.name) / "preset.toml"
@@ -173,5 +172,5 @@ def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
     whole = read_preset(file, project)
     subject = next(subject for subject in whole.subjects if subject.name == scene)
     bench = Bench(Cells(project, whole, subject), file.parent)
-    bench.folder = folder  # goes with the bench
+    bench.folder = folder  # lives as long as the bench
     return bench

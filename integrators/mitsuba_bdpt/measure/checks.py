@@ -1,4 +1,4 @@
-"""Arguments of measures: images, numbers and rows of numbers, checked; estimates with their interval."""
+"""Argument checks for images and numbers, and estimates with an interval."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from ..errors import CommandError
 
-# Confidence of an interval that is not asked for another.
+# Default confidence of intervals.
 CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value and the interval [low, high] that holds the true one with the stated confidence."""
+    """A value and its interval [low, high] at the stated confidence."""
 
     value: float
     low: float
@@ -24,7 +24,7 @@ class Estimate:
 
 
 def floats(name, value, shape) -> np.ndarray:
-    """``value`` as finite float64 with as many axes as ``shape`` has words, the last of length 3."""
+    """Return ``value`` as finite float64, an axis per word of ``shape``, the last 3."""
     words = "(" + ", ".join(shape) + ")"
     try:
         array = np.asarray(value)
@@ -53,7 +53,7 @@ def image_of(name, value) -> np.ndarray:
 
 
 def pair_of(image, reference):
-    """Both images, checked, as float64 of shape (height, width, 3)."""
+    """Return both images, checked, as float64 of shape (height, width, 3)."""
     image, reference = image_of("image", image), image_of("reference", reference)
     if image.shape != reference.shape:
         raise CommandError(
@@ -63,7 +63,7 @@ def pair_of(image, reference):
 
 
 def number_of(name, value, low=-math.inf, high=math.inf) -> float:
-    """A finite float in the open interval (low, high)."""
+    """Return a finite float in the open interval (low, high)."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise TypeError(f"{name}={value!r} must be a number.")
     if not (math.isfinite(value) and low < value < high):
@@ -75,7 +75,7 @@ def number_of(name, value, low=-math.inf, high=math.inf) -> float:
 
 
 def values_of(name, values, at_least, low=-math.inf) -> np.ndarray:
-    """A vector of at least so many finite float64, each above ``low``."""
+    """Return a vector of at least ``at_least`` finite float64, each above ``low``."""
     try:
         array = np.asarray(list(values), dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -1,10 +1,9 @@
-"""Two ways to render, alternating in time: seconds, errors and efficiency of the first over the second.
+"""Compares two integrators in alternating renders: seconds, errors, efficiency.
 
-Medians over pairs of renders of different seeds, after one that compiles; of the efficiency the quartiles
-too. Errors are relMSE, trimmed of the worst 0.1 % and raw; the last column is what the reference's own error
-adds to the trimmed one, of that side where it is more (ratios are off by as much). Where an image has no
-error at all there are no ratios of errors, and that is said. Whether both have the same mean is not tested
-here: see `agreement`.
+Medians over pairs of renders with different seeds, after a warm-up that compiles; for efficiency also
+quartiles. Errors are relMSE, trimmed of the worst 0.1 % and raw. The last column is the share of the
+reference's own error in the trimmed one (the larger of both sides), which bounds the bias of the ratios.
+Without any error there are no ratios. Equality of means is not tested here: see `agreement`.
 """
 
 from __future__ import annotations
@@ -42,25 +41,25 @@ HEADS = (
 
 @dataclass(frozen=True)
 class Side:
-    """A plugin with parameters, and the scene with the sampler that it is given."""
+    """A plugin with parameters, and the scene with its sampler."""
 
     made: mi.Integrator
     scene: mi.Scene
 
     @staticmethod
     def of(parameters: dict, job: Job) -> Side:
-        """From the ``parameters`` of the plugin, of which ``sampler`` is the sensor's.
+        """Create from the plugin's ``parameters``, of which ``sampler`` is the sensor's.
 
-        At the size and depth of the ``job`` of the reference.
+        Size and depth are those of the reference's ``job``.
         """
         own = dict(parameters)
         sampler = own.pop("sampler", "independent")
         return Side(integrator_of(own, job.depth), job.scene.load(job.resolution, sampler))
 
     def measured(self, target: Reference, spp: int, seed: int) -> tuple[float, ...]:
-        """Seconds, errors, trimmed and raw, and the reference's share of the trimmed one, of a render.
+        """Return seconds, trimmed and raw error, and the reference's share of the former.
 
-        Raises `Refused` if it has no error.
+        Raises `Refused` if the error is 0.
         """
         image, seconds = timed(self.scene, self.made, spp, seed)
         trimmed = rel_mse(image, target.image, TRIM)
@@ -70,7 +69,7 @@ class Side:
 
 
 def line(name: str, sides: list[Side], target: Reference, spp: int, pairs: int) -> list[str]:
-    """A scene's line of the table."""
+    """Return a scene's line of the table."""
     try:
         with steps(2 * (pairs + 1)) as step:
             found = ratios(sides, target, spp, pairs, lambda seed: step(f"{name}, {spp} spp, seed {seed}"))
@@ -80,7 +79,7 @@ def line(name: str, sides: list[Side], target: Reference, spp: int, pairs: int) 
 
 
 def ratios(sides: list[Side], target: Reference, spp: int, pairs: int, on_render) -> list[str]:
-    """The figures of a scene's line; ``on_render`` is called with the seed before each render.
+    """Return the figures of a scene's line; calls ``on_render`` before each render.
 
     Raises `Refused` for an image without an error.
     """
@@ -108,7 +107,7 @@ def ratios(sides: list[Side], target: Reference, spp: int, pairs: int, on_render
 def lines(
     project: Project, names: Sequence[str], ways: Sequence[dict], options: Compare | Namespace
 ) -> list[list[str]]:
-    """The rows of the table of two ``ways`` to render the scenes with these ``names``."""
+    """Return the rows of the table, for two integrators and the scenes ``names``."""
     scenes = [project.scene(name) for name in names]
     for side in map(dict, ways):
         if "max_depth" in side:
@@ -130,7 +129,7 @@ def lines(
 
 
 def run(options: Namespace) -> int:
-    """Print the table that the command line ``options`` ask for."""
+    """Print the table that the command-line ``options`` request."""
     mi.set_variant(VARIANT)
     print(table(HEADS, lines(Project(options.project), options.scenes, options.sides, options)))
     return 0

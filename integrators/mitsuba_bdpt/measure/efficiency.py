@@ -1,4 +1,4 @@
-"""Efficiency, speed-up, slopes of errors, medians with their interval, and what a reference can judge."""
+"""Efficiency, speed-up, slopes of errors, bootstrap medians, limits of references."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 from ..errors import CommandError
 from .checks import CONFIDENCE, Estimate, number_of, values_of
 
-# Resamples of a bootstrap. The ends of a 95 % interval then move by 1 % of its width from seed to seed.
+# Bootstrap resamples: the ends of a 95 % interval vary by 1 % of its width between seeds.
 RESAMPLES = 10_000
 
-# Share of the measured error that the reference's own error may have.
+# Largest share of the reference's own error in a measured error.
 REFERENCE_SHARE = 0.01
 
 
 class Measurement(NamedTuple):
-    """Wall seconds of a render and its error (a squared one: relMSE or MSE)."""
+    """Wall seconds of a render and its squared error (relMSE or MSE)."""
 
     seconds: float
     error: float
 
 
 def efficiency(seconds, error) -> float:
-    """1 / (seconds * error): the same however long one renders, as a squared error falls with 1 / time."""
+    """1 / (seconds * error): constant, as a squared error falls as 1 / time."""
     return 1 / (number_of("seconds", seconds, 0) * number_of("error", error, 0))
 
 
 def equal_time_speedup(ours, other) -> float:
-    """How many times smaller our error is when the other renders as long as we did.
+    """Return the ratio of errors, other over ours, at our time.
 
     Both are (seconds, error), as `Measurement`. With error ~ 1 / time the other's error after our time is
     e_other t_other / t_ours, so the result is (e_other t_other / t_ours) / e_ours.
@@ -40,11 +40,11 @@ def equal_time_speedup(ours, other) -> float:
 
 
 def equal_error_speedup(ours, other) -> float:
-    """How many times sooner we reach our error than the other reaches it.
+    """Return the ratio of times, other over ours, at our error.
 
-    Both are (seconds, error), as `Measurement`. With error ~ 1 / time the other reaches it after
-    t_other e_other / e_ours, so the result is (t_other e_other / e_ours) / t_ours. Under that assumption this
-    and `equal_time_speedup` are one number, the ratio of efficiencies; `slope` tests the assumption.
+    Both are (seconds, error), as `Measurement`. With error ~ 1 / time the other reaches our error after
+    t_other e_other / e_ours, so the result is (t_other e_other / e_ours) / t_ours, equal to
+    `equal_time_speedup`. `slope` tests the assumption.
     """
     ours, other = _measurement("ours", ours), _measurement("other", other)
     return other.seconds * other.error / ours.error / ours.seconds
@@ -59,16 +59,16 @@ def _measurement(name, pair) -> Measurement:
 
 
 def slope(samples, errors, confidence=CONFIDENCE, seed=0) -> Estimate:
-    """Exponent of error ~ samples^slope: -1 for the squared error of independent samples.
+    """Exponent of error ~ samples^slope; -1 for squared errors of Monte Carlo.
 
-    ``samples`` (n,) counts; ``errors``: for each count the errors of several independent runs (at least 2);
-    of a dict {spp: errors}, ``slope(runs.keys(), runs.values())``. Least squares of log(error) over
-    log(samples), a point per run: sum (x - mean x) y / sum (x - mean x)^2.
+    ``samples`` (n,) counts; ``errors``: for each count the errors of at least 2 independent runs; of a dict
+    {spp: errors}, ``slope(runs.keys(), runs.values())``. Least squares of log(error) over log(samples), a
+    point per run: sum (x - mean x) y / sum (x - mean x)^2.
 
-    The interval is the bootstrap's, percentiles of `RESAMPLES` fits to runs drawn with replacement within
-    each count. Deviations from a count's mean are multiplied by sqrt(k / (k - 1)), k its number of runs:
-    resampling k values shows only (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An
-    Introduction to the Bootstrap, 1993, sections 9 and 13.
+    The interval is from percentiles of `RESAMPLES` fits to runs drawn with replacement within each count.
+    Deviations from a count's mean are multiplied by sqrt(k / (k - 1)), k its number of runs: resampling k
+    values has only (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to the
+    Bootstrap, 1993, sections 9 and 13.
     """
     x = np.log(values_of("samples", samples, 2, 0))
     errors = list(errors)
@@ -96,11 +96,11 @@ def _percentiles(value, drawn, confidence) -> Estimate:
 
 
 def bootstrap_median(values, confidence=CONFIDENCE, seed=0) -> Estimate:
-    """Median of a handful of values and its bootstrap interval.
+    """Return the median of a few values and its bootstrap interval.
 
-    The interval is from percentiles of `RESAMPLES` medians of values drawn with replacement. It cannot leave
-    the range of the values, which with n of them holds the median with chance 1 - 2^(1 - n): 94 % for 5, 97 %
-    for 6, 99.8 % for 10. Source: as `slope`, section 13.
+    Percentiles of `RESAMPLES` medians of values drawn with replacement. The interval lies within the range of
+    the n values, which contains the median with probability 1 - 2^(1 - n): 94 % for 5, 99.8 % for 10. Source:
+    as `slope`, section 13.
     """
     values = values_of("values", values, 2)
     rng = np.random.default_rng(seed)
@@ -115,22 +115,22 @@ def _reference_share(own_error, measured_error) -> float:
 
 
 def reference_good_enough(own_error, measured_error) -> bool:
-    """Whether the reference's own squared error is at most `REFERENCE_SHARE` of the error measured with it.
+    """Return whether a reference's error is within `REFERENCE_SHARE` of the measured.
 
     Both in the same measure (relMSE or MSE). The errors of image and reference are independent, so their
-    squares add: a reference at the limit makes what is measured too large by 1 %.
+    squares add: at the limit, the measured error is 1 % too large.
     """
     return _reference_share(own_error, measured_error) <= REFERENCE_SHARE
 
 
 def refused_share(share: float, digits: int) -> str:
-    """A ``share`` above `REFERENCE_SHARE` in percent; rounding does not make it one that is allowed."""
+    """Format a ``share`` above `REFERENCE_SHARE` in percent, never rounded down to it."""
     text, limit = f"{100 * share:.{digits}g}", 100 * REFERENCE_SHARE
     return f"{text} %" if float(text) > limit else f"just above {limit:g} %"
 
 
 def reference_refusal(own_error, measured_error) -> str:
-    """The sentence that says why a figure is refused and how many more samples the reference needs."""
+    """Return why a figure is refused, and the samples that the reference lacks."""
     share = _reference_share(own_error, measured_error)
     if share <= REFERENCE_SHARE:
         raise CommandError(

@@ -1,9 +1,8 @@
-"""Pictures of integrators side by side at equal time: images, magnified windows, error maps.
+"""Images of integrators at equal time: images, magnified windows, error maps.
 
-The last integrator has the samples per pixel that are asked for, the others as many as fit into its seconds.
-Errors are against a reference of the project, at its size and depth, which is made first if there is none; or
-against an image that is given, at the scene file's own size and depth. Windows are where the errors differ
-most.
+The last integrator has the given samples per pixel, the others as many as fit into its seconds. Errors are
+against the project's reference, at its size and depth (made first if missing), or against a given image, at
+the scene file's size and depth. Windows lie where the errors differ most.
 """
 
 from __future__ import annotations
@@ -35,14 +34,14 @@ import matplotlib.pyplot as plt
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Rectangle
 
-WINDOW = 6  # a window's side is this part of the image's
+WINDOW = 6  # side of a window: this fraction of the image's
 COLOURS = ("#E69F00", "#56B4E9")  # of the two windows
-TIMED = 3  # renders of which the median is the time
+TIMED = 3  # renders for the median of times
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A render: what made it, samples per pixel, seconds, the image (height, width, 3), its errors."""
+    """A render: integrator, samples per pixel, seconds, image, errors."""
 
     name: str
     spp: int
@@ -53,12 +52,12 @@ class Shot:
 
     @property
     def caption(self) -> str:
-        """Beneath the image."""
+        """Caption of the image."""
         return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.rel_mse:.2g} (trimmed)"
 
 
 def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespace):
-    """Scene, image to take errors against, and ``max_depth``, as the command line ``options`` say."""
+    """Return scene, reference image and ``max_depth`` of the ``options``."""
     if options.reference is None:
         seconds = options.reference_seconds
         job = Job(project, file, options.resolution or RESOLUTION, None, options.spp, seconds)
@@ -76,15 +75,14 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
 
 
 def seconds(scene, made, spp: int) -> float:
-    """Median over renders that follow a first one, which compiles."""
+    """Return the median seconds of renders after a warm-up, which compiles."""
     return float(np.median([timed(scene, made, spp, seed)[1] for seed in range(TIMED + 1)][1:]))
 
 
 def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int) -> list[Shot]:
-    """A render by each integrator in the time of the last one.
+    """Render with each integrator in the time of the last one.
 
-    ``ways``: parameters of plugins by what is written beneath. The last has ``spp`` samples per pixel, others
-    as many as its seconds allow.
+    ``ways``: parameters of plugins by caption. The last has ``spp`` samples per pixel, others as many as fit.
     """
     made = [integrator_of(parameters, depth) for parameters in ways.values()]
     with steps(1 + len(made)) as step:
@@ -93,7 +91,7 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
         for name, one in zip(ways, made, strict=True):
             step(name)
             count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))
-            seconds(scene, one, count)  # Mitsuba compiles anew for each number of samples
+            seconds(scene, one, count)  # Mitsuba compiles for each number of samples
             image, taken = timed(scene, one, count, seed=7)
             error = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
             found.append(Shot(name, count, taken, image, error, rel_mse(image, target, TRIM)))
@@ -101,9 +99,9 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
 
 
 def windows(found: list[Shot], shape) -> list[tuple[int, int, int]]:
-    """Two windows (left, top, side) that do not overlap, where the first and the last image differ most.
+    """Return two disjoint windows (left, top, side) of the largest differences.
 
-    The errors are compared, on a logarithmic scale, so that no single pixel decides.
+    Those of the first and the last image.     Compares logarithms of the errors, so that no single pixel decides.
     """
     height, width = shape
     side = max(4, min(height, width) // WINDOW)
@@ -119,7 +117,7 @@ def windows(found: list[Shot], shape) -> list[tuple[int, int, int]]:
 
 
 def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
-    """A column per image and one of the reference: image, windows, error map."""
+    """Draw a column per image and one of the reference: image, windows, error map."""
     chosen = windows(found, target.shape[:2])
     exposure = math.log2(0.9 / max(float(np.quantile(target.max(axis=-1), 0.95)), 1e-9))
     images = [(shot.image, shot.caption, shot.errors) for shot in found] + [(target, "reference", None)]
@@ -153,7 +151,7 @@ def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
 def pictured(
     project: Project, scene: str, integrators: Mapping[str, dict], options: EqualTime | Namespace
 ) -> tuple[Path, list[Shot]]:
-    """Draw a scene rendered by these integrators; the picture's file, and the renders."""
+    """Draw a scene rendered by these integrators; returns the file and the renders."""
     file = project.scene(scene)
     output = options.output or project.renders / f"equal_time_{file.name}.png"
     check_output(output, ".png")
@@ -165,7 +163,7 @@ def pictured(
 
 
 def run(options: Namespace) -> int:
-    """Draw what the command line ``options`` ask for."""
+    """Draw the images that the command-line ``options`` request."""
     mi.set_variant(VARIANT)
     integrators = dict(options.integrators)
     output, found = pictured(Project(options.project), options.scene, integrators, options)

@@ -1,4 +1,4 @@
-"""The plots of a sweep, readable in print: each integrator has a marker and a dash of its own."""
+"""Plots of a sweep, readable in print: each integrator has its marker and dash."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ STYLES = {
     UNAIMED: ("#999999", "X", "--"),
     RIVALS[0]: ("#D55E00", "s", "-"),
     RIVALS[1]: ("#E69F00", "D", "--"),
-    # In other scenes than these two.
+    # Only in scenes with media.
     MEDIA_RIVALS[0]: ("#D55E00", "s", "-"),
     MEDIA_RIVALS[1]: ("#E69F00", "D", "--"),
     LIGHT_TRACER: ("#CC79A7", "x", ":"),
@@ -54,16 +54,16 @@ COLUMNS = 4
 
 
 def style(method: str) -> dict:
-    """Colour, marker and dash of an integrator."""
+    """Return colour, marker and dash of an integrator."""
     colour, marker, dash = STYLES.get(method, PLAIN)
     return {"color": colour, "marker": marker, "linestyle": dash, "markersize": 4, "linewidth": 1.2}
 
 
 def convergence(results: Results, against: str, path: Path):
-    """Draw relMSE over ``against``, "seconds" or "spp", a panel per scene.
+    """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene.
 
-    Medians over seeds with the range of all; hollow where the reference is too noisy for the error; the
-    dotted line falls with slope -1.
+    Medians over seeds with the range of all; hollow where the reference is too noisy; the dotted line has
+    slope -1.
     """
     rows = math.ceil(len(results.scenes) / COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(11, 2.5 * rows), squeeze=False)
@@ -118,7 +118,7 @@ def _judged(rows) -> bool:
 
 
 def _ideal(axis, rows, against):
-    """A line of slope -1 through the first budget's median of the first integrator."""
+    """Draw a line of slope -1 through the first integrator's first median."""
     budgets = sorted({row["budget"] for row in rows})
     if not budgets or min(row["rel_mse"] for row in rows) == 0:
         return
@@ -132,9 +132,9 @@ def _ideal(axis, rows, against):
 
 
 def efficiencies(results: Results, rivals, path: Path):
-    """Draw the ratio of efficiencies per scene, median and range over seeds, trimmed and raw.
+    """Plot the ratio of efficiencies per scene, median and range, trimmed and raw.
 
-    An integrator that fails the bias check has none.
+    Integrators that fail the bias check are left out.
     """
     figure, axes = plt.subplots(1, len(rivals), figsize=(11, 0.28 * len(results.scenes) + 1.2), sharey=True)
     for rival, axis in zip(rivals, np.atleast_1d(axes), strict=True):
@@ -156,7 +156,7 @@ def efficiencies(results: Results, rivals, path: Path):
 
 
 def _ratios(axis, results, scene, rival, place):
-    """One scene's efficiencies over one rival around the height ``place``, or the word for their absence."""
+    """Plot a scene's efficiencies over a rival at ``place``, or why there are none."""
     if not results.of(scene, rival):
         return
     for (error, (label, colour, marker)), y in zip(ERRORS.items(), (place - 0.15, place + 0.15), strict=True):
@@ -173,7 +173,7 @@ def _ratios(axis, results, scene, rival, place):
 
 
 def rays(results: Results, path: Path):
-    """Rays per sample of the first integrator by kind, a bar per scene; none where it counts no rays."""
+    """Plot rays per sample of the first integrator by kind, a bar per scene."""
     figure, axis = plt.subplots(figsize=(9, 0.28 * len(results.scenes) + 1.4))
     left = np.zeros(len(results.scenes))
     for kind, (label, colour, hatch) in RAYS.items():

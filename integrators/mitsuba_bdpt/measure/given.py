@@ -1,8 +1,8 @@
-"""References that the user gives as images: of other programs, of any size, of an error that nobody knows.
+"""References given as images: of other programs, any size, unknown error.
 
-Such an image is brought to the size of the measurement by averages over areas, and stored among the project's
-references in place of one that is made. Nothing in it tells how far it is from what the scene shows: by its
-noise, another filter, another depth, or other light. The renders that it judges do: `own_error`.
+An image is averaged down to the size of the measurement, and stored as the project's reference. It may differ
+from the scene by noise, filter, depth or lighting; the renders that it judges estimate its error:
+`own_error`.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ TRIMS = {"rel_mse": 0.0, "rel_mse_trimmed": TRIM}
 
 
 def adopt(job: Job, file: Path) -> Reference:
-    """Store the image in an EXR ``file`` as the reference of a job's scene, and return it.
+    """Store the image of an EXR ``file`` as the reference of a job's scene.
 
-    Raises ``CommandError`` for one that is smaller than the measurement, of another shape, or not finite.
+    Raises ``CommandError`` if it is smaller than the measurement, of another shape, or not finite.
     """
     check_size(job)
     sha256, stored = digest(file), job.stored
@@ -57,14 +57,14 @@ def adopt(job: Job, file: Path) -> Reference:
 
 
 def forget(job: Job) -> None:
-    """Remove a given image from the project's references, so that one can be made in its place."""
+    """Remove a given image from the project's references, so that one can be rendered."""
     stored = job.stored
     if stored is not None and stored.given:
         reference_path(job.project, job.scene.name, job.resolution, job.depth).unlink()
 
 
 def reduced(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """An image at a smaller size: the mean over what each new pixel covers, parts of old ones as parts."""
+    """Reduce an image by area averages; old pixels count by their covered part."""
     rows, columns = _coverage(image.shape[0], height), _coverage(image.shape[1], width)
     return np.einsum("yv,vuc,xu->yxc", rows, image, columns, optimize=True)
 
@@ -77,16 +77,16 @@ def _coverage(old: int, new: int) -> np.ndarray:
 
 
 def own_errors(image: np.ndarray, renders: Sequence[np.ndarray]) -> dict[str, float]:
-    """`own_error` for each of the errors of a row, by the names in `analysis.OWN`."""
+    """Return `own_error` for each error of a row, by the names in `analysis.OWN`."""
     return {error: own_error(image, renders, trim) for error, trim in TRIMS.items()}
 
 
 def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float) -> float:
-    """The relMSE of an ``image`` to what unbiased ``renders`` are of, which have seeds of their own.
+    """Estimate the relMSE of ``image`` from independent unbiased ``renders``.
 
-    The mean of (r - a)(r - b) / (r^2 + eps), a and b the means of every other render: the noise of a and that
-    of b are independent, and only what r has of its own remains. Without the share ``trim`` of the largest
-    products; not negative.
+    The mean of (r - a)(r - b) / (r^2 + eps), a and b the means of every other render: their noise is
+    independent, so only the error of r remains. Excludes the share ``trim`` of the largest products; not
+    negative.
     """
     a, b = (np.mean(renders[start::2], axis=0) for start in (0, 1))
     products = ((image - a) * (image - b) / (image**2 + rel_mse_epsilon(image))).ravel()
@@ -95,7 +95,7 @@ def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float) -> 
 
 
 def judged(rows: list[dict], own: dict[str, float]) -> list[dict]:
-    """The ``rows`` of a scene with the `own_errors` of its reference, as if they had known them."""
+    """Return the ``rows`` of a scene with its reference's `own_errors` filled in."""
     known = {OWN[error]: value for error, value in own.items()}
     names = {"rel_mse": "judged", "rel_mse_trimmed": "judged_trimmed"}
     return [row | known | {names[key]: analysis.judged(own[key], row[key]) for key in OWN} for row in rows]

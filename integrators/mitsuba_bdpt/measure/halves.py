@@ -1,4 +1,4 @@
-"""Sums of renders from which a reference is made, kept between runs."""
+"""Sums of the renders of a reference, kept between runs."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ PASS_SPP = 256
 
 
 class Halves:
-    """Sums of two independent halves of the renders, kept in a file between runs.
+    """Sums of two independent halves of the renders, stored in a file.
 
-    With them how many renders are in each pixel (``counts``), the tile means of each render of the whole
-    image, and the digests of the plugin's source that made them.
+    With ``counts`` of renders per pixel, the tile means of each whole render, and digests of the plugin's
+    sources.
     """
 
     def __init__(self, path: Path, key: str):
         self.path, self.key, self.rounds, self.columns = path, key, 0, []
-        self.sums = self.counts = np.zeros(0)  # of no shape before the first round
+        self.sums = self.counts = np.zeros(0)  # allocated in the first round
         self.sources: set[str] = set()
         self.earlier: Means | None = None
         if path.is_file():
@@ -42,7 +42,7 @@ class Halves:
         self.sources.add(source_digest())
 
     def _take(self, kept):
-        """Go on from what a file has ``kept``, if it is of the same."""
+        """Continue from the content of a file, if it is of the same reference."""
         if str(kept["key"]) != self.key:
             print(f"{self.path}: of another scene, integrator or number of samples; begun anew")
             return
@@ -54,9 +54,9 @@ class Halves:
         self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
 
     def go_on_from(self, stored: Reference, windows: list):
-        """Take a stored reference for the renders before the first; its seeds are not used again.
+        """Use a stored reference in place of earlier renders.
 
-        ``windows`` are slices of rows and columns.
+    Its seeds are not used again.     ``windows``: slices of rows and columns.
         """
         spp = stored.provenance["spp"]
         whole, most = spp / (2 * PASS_SPP), stored.provenance.get("spp_in_windows", spp) / (2 * PASS_SPP)
@@ -65,23 +65,22 @@ class Halves:
             self.counts[window] = most
         self.sums = np.stack([stored.image + stored.difference, stored.image - stored.difference])
         self.sums *= self.counts
-        self.rounds = math.ceil((1 + len(windows)) * most)  # no less than were rendered
-        self.sources |= set(stored.provenance.get("sources", ()))  # older ones do not say
+        self.rounds = math.ceil((1 + len(windows)) * most)  # upper bound of the rounds rendered
+        self.sources |= set(stored.provenance.get("sources", ()))  # missing in older files
         self.earlier = stored.means
 
     def means(self) -> Means | None:
-        """Of all renders of the whole image; None if there are too few."""
+        """Means of all renders of the whole image; None if there are too few."""
         if len(self.columns) < FEWEST_RUNS:
             return self.earlier
         made = Means.of(self.columns)
         return self.earlier.joined(made) if self.earlier else made
 
     def add(self, images, window=None, times: float = 1.0):
-        """Add an image to each half, and keep the sums.
+        """Add an image to each half, and store the sums.
 
-        ``window`` (slices of rows and columns): the images are of that part alone; ``times``: they have so
-        many times the samples of a whole one. Raises ``CommandError`` for values that are not finite, and
-        leaves the sums as they are.
+        ``window`` (slices of rows and columns): part of the image that was rendered; ``times``: its samples
+        relative to a whole image. Raises ``CommandError`` for non-finite values, without changing the sums.
         """
         if not all(np.isfinite(image).all() for image in images):
             raise CommandError(f"{self.path.name}: round {self.rounds} has values that are not finite")
@@ -99,11 +98,11 @@ class Halves:
             np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
 
     def mean(self):
-        """Image, and half the difference of the halves: one sample of the image's own error."""
+        """Return the image, and half the difference of the halves (a sample of its error)."""
         a, b = self.sums / self.counts
         return (a + b) / 2, (a - b) / 2
 
     def reference(self, provenance: dict) -> Reference:
-        """What there is after at least one round."""
+        """Return the reference; needs at least one round."""
         image, difference = self.mean()
         return Reference(image, difference, self.means(), provenance)
