@@ -101,7 +101,7 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
 def windows(found: list[Shot], shape) -> list[tuple[int, int, int]]:
     """Return two disjoint windows (left, top, side) of the largest differences.
 
-    Those of the first and the last image.     Compares logarithms of the errors, so that no single pixel decides.
+    Compares logarithms of the first and the last image's errors, so that no single pixel decides.
     """
     height, width = shape
     side = max(4, min(height, width) // WINDOW)

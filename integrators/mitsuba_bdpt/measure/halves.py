@@ -56,7 +56,7 @@ class Halves:
     def go_on_from(self, stored: Reference, windows: list):
         """Use a stored reference in place of earlier renders.
 
-    Its seeds are not used again.     ``windows``: slices of rows and columns.
+        Its seeds are not used again. ``windows``: slices of rows and columns.
         """
         spp = stored.provenance["spp"]
         whole, most = spp / (2 * PASS_SPP), stored.provenance.get("spp_in_windows", spp) / (2 * PASS_SPP)

@@ -1,16 +1,17 @@
-"""Reference images with an error estimate of their own.
+"""Makes reference images that include an estimate of their own error.
 
 A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
-the samples per pixel that it is to judge, and of `path` in the same time where the reference is made by it.
-It is the mean of two halves with seeds of their own, rendered in turn until that is reached or the time is
-over; the halves differ by twice the standard error of their mean. What makes it stands in `Recipe`: `bdpt`
-with everything switched on, with `merging` too where nothing else finds a part of the light, or `path` (with
-media `volpath`) where that converges, so that `bdpt` is judged by another integrator; windows in which few
-samples find the light have more of them; furnaces are known exactly. Files lie in the project's references/:
-EXR in half precision with the image (R, G, B), half the difference of the halves (difference.R ...), and the
-provenance as JSON in the header, with what a bias check needs. Sums in double precision are kept in renders/,
-so that a further run improves a reference instead of starting anew; where they are gone, it goes on from the
-stored image, whose rounding to half precision is far below its own error.
+the samples per pixel that it has to judge, and of `path` in the same time if `path` makes the reference. It
+is the mean of two halves with different seeds, rendered alternately until that is reached or the time is
+over; the halves differ by twice the standard error of their mean. `Recipe` names the integrator: `bdpt` with
+all strategies, with `merging` where nothing else samples some light, or `path` (with media `volpath`) where
+that converges, as an independent integrator. Windows in which few samples find the light have more samples;
+furnaces are known exactly.
+
+Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
+the halves (difference.R ...), and the provenance as JSON in the header, with the data of bias checks. Sums in
+double precision are kept in renders/, from which a further run continues; without them it continues from the
+stored image, whose rounding is far below its error.
 """
 
 from __future__ import annotations
@@ -56,18 +57,18 @@ MERGING_RADIUS = 0.25
 Merging blurs, and the halves do not show it: docs/development/experiments.md has what is left.
 """
 
-FOCUS_TIMES = 16  # of the samples, in windows
+FOCUS_TIMES = 16  # times the samples of the rest, in windows
 
-# Samplers of `path`: half the error of `independent` at equal time (`bdpt` has its own points); of `volpath`,
-# whose images have pixels that are NaN in grids with `multijitter` (Mitsuba 3.9.1).
+# Samplers of `path` (`multijitter` has half the error of `independent` at equal time) and of `volpath` (whose
+# images of grids have NaN with `multijitter`, Mitsuba 3.9.1).
 SAMPLER = "multijitter"
 OF_MEDIA = "independent"
 
 FIRST_SEED = 1_000_000  # far from the seeds of measurements
-WINDOW_PASSES = 4  # in one render of a window
-TRIALS = 3  # renders of bdpt that say what it has to judge
-TWICE = 2  # samples of `path` in the time of one of `bdpt`, roughly
-MARGIN = 0.9  # of the share that a reference may carry
+WINDOW_PASSES = 4  # per render of a window
+TRIALS = 3  # renders of bdpt that estimate the error to judge
+TWICE = 2  # samples of `path` in the time of one of `bdpt`, approximately
+MARGIN = 0.9  # of the largest share of a reference's error
 
 
 def _is_number(value) -> bool:
@@ -75,7 +76,7 @@ def _is_number(value) -> bool:
 
 
 def _is_window(share) -> bool:
-    """Whether this is left, top, right and bottom of a part of an image."""
+    """Return whether ``share`` is (left, top, right, bottom) of a part of an image."""
     if not isinstance(share, list) or len(share) != 4 or not all(map(_is_number, share)):
         return False
     return 0 <= share[0] < share[2] <= 1 and 0 <= share[1] < share[3] <= 1
@@ -83,19 +84,18 @@ def _is_window(share) -> bool:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the reference of a scene is made, from the table of its name in PROJECT/references/scenes.toml:
+    """How a scene's reference is made, from PROJECT/references/scenes.toml:
 
         [glass_caustics]
         by = "bdpt"                 # the default; or "path", where that (with media: `volpath`) converges, or
-                                    # "merging", where nothing else finds a part of the light
+                                    # "merging", where nothing else samples a part of the light
         merging_radius = 0.125      # of "merging", in pixels; default: 0.25
         windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
 
         [furnace_point]
         radiance = { limit = 1.0, lacks = 2.0 }   # known: limit - lacks / 2^max_depth in every pixel
 
-    Windows have to be chosen by what a scene shows, not by the noise found, which would bias the image. (A
-    window has fewer light subpaths than as many samples of the whole image: t = 1 gains less from it.)
+    Choose windows by the scene, not by observed noise, which would bias the image.
     """
 
     by: str = "bdpt"
@@ -105,13 +105,13 @@ class Recipe:
 
     @staticmethod
     def of(project: Project, name: str) -> Recipe:
-        """That of a scene; raises ``CommandError`` for one that cannot be followed."""
+        """Read the recipe of a scene; raises ``CommandError`` for an invalid one."""
         file = project.references / "scenes.toml"
         entry = table_of(file, name, (read_toml(file) if file.is_file() else {}).get(name, {}))
         keys = {"by", "merging_radius", "windows", "radiance"}
         if unknown := sorted(set(entry) - keys):
             raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
-        if entry.get("by", "bdpt") not in tuple(WAYS):  # of a list there is no hash
+        if entry.get("by", "bdpt") not in tuple(WAYS):  # a list is not hashable
             raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
         radius = entry.get("merging_radius", MERGING_RADIUS)
         idle = "merging_radius" in entry and entry.get("by") != "merging"
@@ -138,8 +138,8 @@ class Recipe:
 class Job:
     """A reference to be made.
 
-    ``spp`` of the renders that it has to judge, ``seconds`` that it may take, ``rounds`` of two renders that
-    it has at least; ``max_depth`` None: the project's; ``by``, a key of `WAYS`, in place of the recipe's.
+    ``spp``: of the renders to judge; ``seconds``: time limit; ``rounds``: least number of rounds of two
+    renders; ``max_depth``: None for the project's; ``by``: a key of `WAYS` that replaces the recipe's.
     """
 
     project: Project
@@ -153,7 +153,7 @@ class Job:
 
     @cached_property
     def scene_sha256(self) -> str:
-        """Of the scene, taken before it is rendered."""
+        """SHA-256 of the scene, computed before it is rendered."""
         return self.scene.sha256
 
     @cached_property
@@ -163,7 +163,7 @@ class Job:
 
     @property
     def stored(self) -> Reference | None:
-        """The reference that there is; None if it is of another scene."""
+        """The stored reference; None if it is of another scene."""
         try:
             return load_reference(self.project, self.scene, self.resolution, self.depth)
         except ValueError:
@@ -171,10 +171,10 @@ class Job:
 
 
 def obtained(job: Job) -> Reference:
-    """The stored reference, made now if there is none.
+    """Return the stored reference, or make it.
 
-    One that is made has renders enough for a bias check, and is announced on standard output. Raises
-    ``CommandError`` if the stored one is of another scene.
+    A new one has enough renders for a bias check, and is reported on standard output. Raises ``CommandError``
+    if the stored one is of another scene.
     """
     if not reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
         print(
@@ -188,10 +188,7 @@ def obtained(job: Job) -> Reference:
 
 
 def check(job: Job) -> None:
-    """Raise ``CommandError`` for a reference that cannot be made or used.
-
-    As far as that is known before anything is rendered.
-    """
+    """Raise ``CommandError``, before rendering, if a reference cannot be made or used."""
     Recipe.of(job.project, job.scene.name)
     check_size(job)
     if reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
@@ -201,8 +198,8 @@ def check(job: Job) -> None:
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it.
 
-    Returns it, and whether it is good enough. One that the time has cut short does not replace a better one
-    of the same light.
+    Returns it, and whether it is good enough. A reference cut short by time does not replace a better one of
+    the same light.
     """
     recipe = Recipe.of(job.project, job.scene.name)
     check_size(job)
@@ -219,7 +216,7 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def check_size(job: Job) -> None:
-    """Raise ``CommandError`` for an image without colours, or that a bias check cannot divide into tiles."""
+    """Raise ``CommandError`` for images without colours or not divisible into tiles."""
     width, height = job.scene.size(job.resolution)
     if height % TILES == 0 == width % TILES:
         return
@@ -232,7 +229,7 @@ def check_size(job: Job) -> None:
 
 
 def nearest_width(scene: MeasuredScene, wanted: float) -> int | None:
-    """The width next to the one ``wanted`` of images that a bias check divides into tiles; None if far."""
+    """Return the nearest width that a bias check can divide into tiles; None if far."""
     own_width, own_height = scene.size()
     widths = range(TILES, max(math.ceil(4 * wanted), TILES + 1), TILES)
     fitting = [n for n in widths if (round(n * own_height / own_width) or 1) % TILES == 0]
@@ -246,8 +243,8 @@ def _pixels(image):
 class Aim:
     """The renders that a reference has to judge.
 
-    Those of default `bdpt` with ``spp`` samples per pixel, with `merging` where that makes the reference, and
-    of a path tracer in the same time where that does (and converges).
+    Default `bdpt` with ``spp`` samples per pixel (with `merging` if that makes the reference), and a path
+    tracer in the same time if that makes it.
     """
 
     def __init__(self, job: Job, scene, by: str):
@@ -261,9 +258,9 @@ class Aim:
                 self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
 
     def reached(self, reference: Reference) -> bool:
-        """Whether the reference carries little enough of their errors, and can serve in a bias check.
+        """Return whether the reference is good enough for their errors and a bias check.
 
-        Raises ``CommandError`` if it is black: no error is relative to that.
+        Raises ``CommandError`` if it is black, since errors are relative.
         """
         if not reference.image.any():
             raise CommandError(
@@ -281,9 +278,9 @@ class Aim:
 
 
 def _way(scene: MeasuredScene, by: str, merging_radius: float = MERGING_RADIUS) -> dict:
-    """Parameters of what makes the reference of a scene, ``by`` a key of `WAYS`, for `_loaded`.
+    """Return the integrator's parameters for a key ``by`` of `WAYS`, for `_loaded`.
 
-    ``merging_radius``: that of "merging", in pixels.
+    ``merging_radius``: in pixels.
     """
     if by == "path":
         return {"type": path_tracers(scene.has_media)[0]}
@@ -291,7 +288,7 @@ def _way(scene: MeasuredScene, by: str, merging_radius: float = MERGING_RADIUS) 
 
 
 def _loaded(way: dict) -> mi.Integrator:
-    """The integrator of these parameters, among which ``merging_radius`` is one of `settings.Internals`."""
+    """Load an integrator; ``merging_radius`` is one of `settings.Internals`."""
     integrator = mi.load_dict({name: value for name, value in way.items() if name != "merging_radius"})
     if "merging_radius" in way:
         integrator.settings = integrator.settings.varied(merging_radius=way["merging_radius"])
@@ -303,7 +300,7 @@ def _same(stored: Reference, **wanted) -> bool:
 
 
 def provenance_of(job: Job, **more) -> dict:
-    """What is kept of how a reference was made, ``more`` with it."""
+    """Return the provenance of a reference, with ``more``."""
     return {
         "scene": job.scene.name,
         "scene_sha256": job.scene_sha256,
@@ -317,7 +314,7 @@ def provenance_of(job: Job, **more) -> dict:
 
 
 def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
-    """The same radiance everywhere, without error, and True."""
+    """Return a constant reference without error, and True."""
     width, height = job.scene.size(job.resolution)
     value = radiance["limit"] - (radiance["lacks"] * 2.0**-job.depth if job.depth > 0 else 0.0)
     image = np.full((height, width, 3), value)
@@ -326,7 +323,7 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
 
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
-    """As `_known`, by an integrator; False if the time was over first."""
+    """Return a rendered reference, and False if the time was over first."""
     by = job.by or recipe.by
     parameters = _way(job.scene, by, recipe.merging_radius) | {"max_depth": job.depth}
     integrator = _loaded(parameters)
@@ -366,7 +363,7 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
 
 
 def _pair(scene, integrator, halves: Halves, times: int = 1):
-    """Two images with seeds of their own."""
+    """Render two images with different seeds."""
     seed = FIRST_SEED + 2 * halves.rounds
     spp = times * PASS_SPP
     return [_pixels(mi.render(scene, integrator=integrator, spp=spp, seed=seed + i)) for i in (0, 1)]
@@ -375,7 +372,7 @@ def _pair(scene, integrator, halves: Halves, times: int = 1):
 class Window:
     """A part of the image that needs more samples.
 
-    The ``scene`` with that crop window, and the ``slices`` of rows and columns.
+    The ``scene`` with that crop window, and its ``slices`` of rows and columns.
     """
 
     def __init__(self, job: Job, share, sampler: str):
@@ -392,14 +389,14 @@ class Window:
         parameters.update()
 
     def is_behind(self, halves: Halves) -> bool:
-        """Whether it has fewer than `FOCUS_TIMES` the samples of the rest."""
+        """Return whether it has less than `FOCUS_TIMES` the samples of the rest."""
         if not halves.rounds:
             return False
         return halves.counts[self.slices].min() < FOCUS_TIMES * halves.counts.min()
 
 
 def said(job: Job, made: Reference, reached: bool) -> str:
-    """What was made, in a line."""
+    """Describe in a line what was made."""
     text = f"{job.scene.name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e}"
     if reached:
         return text
@@ -408,9 +405,9 @@ def said(job: Job, made: Reference, reached: bool) -> str:
 
 
 def run(options: Namespace) -> int:
-    """Make the references that the command line ``options`` name.
+    """Make the references that the command-line ``options`` name.
 
-    The status is 1 if one failed or is not good enough.
+    Returns 1 if one failed or is not good enough.
     """
     if not (options.all or options.scenes):
         raise CommandError("reference: name a scene, or give --all")
@@ -439,7 +436,7 @@ def run(options: Namespace) -> int:
                 options.by,
             )
             made, reached = make(job)
-        except (ValueError, RuntimeError, NotImplementedError) as error:  # go on with the other scenes
+        except (ValueError, RuntimeError, NotImplementedError) as error:  # continue with the other scenes
             raise_interrupt(error)
             print(f"{name}: failed: {' '.join(message(error).split())}", flush=True)
             status = 1

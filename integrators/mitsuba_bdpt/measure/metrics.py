@@ -1,11 +1,9 @@
-"""Measures of error and colour difference, each with its formula and its source.
+"""Measures of error and colour difference, with formula and source.
 
-Images are floats in linear sRGB of shape (height, width, 3), any float type; the arithmetic is float64.
-What would make a number meaningless (another shape, NaN or infinite values, a black reference where one
-divides by it) is refused with ``ValueError`` or ``TypeError``; nothing is replaced by 0. No function prints,
-writes, or renders.
-
-colour-science and flip-evaluator are imported when first used, since they take seconds to load.
+Images are floats in linear sRGB of shape (height, width, 3); the arithmetic is float64. Invalid input (other
+shapes, non-finite values, a black reference as divisor) raises ``ValueError`` or ``TypeError``. No function
+prints, writes, or renders. colour-science and flip-evaluator are imported at first use, since they load
+slowly.
 """
 
 from __future__ import annotations
@@ -19,13 +17,13 @@ import numpy as np
 from ..errors import CommandError
 from .checks import image_of, number_of, pair_of
 
-# Luminance of display white in cd/m^2: that of standard-dynamic-range video, ITU-R BT.2035.
+# Luminance of display white in cd/m^2, of standard-dynamic-range video: ITU-R BT.2035.
 WHITE = 100.0
 
-# Share of the worst values that the trimmed relMSE leaves out.
+# Share of the worst values that the trimmed relMSE excludes.
 TRIM = 0.001
 
-# HDR-FLIP clamps luminances here (float32's epsilon), and ends the process if all are below.
+# HDR-FLIP clamps luminances here (float32's epsilon), and aborts if all are below.
 FLIP_DARKEST = 2.0**-23
 
 
@@ -36,9 +34,9 @@ def mse(image, reference) -> float:
 
 
 def rel_mse_epsilon(reference) -> float:
-    """The eps of `rel_mse`: 0.01 mean(r)^2 over pixels and channels, in squared units of radiance.
+    """The eps of `rel_mse`: 0.01 mean(r)^2 over pixels and channels, squared radiance.
 
-    It keeps dark pixels from deciding: where r is a tenth of the mean, r^2 and eps weigh the same.
+    Bounds the weight of dark pixels: where r is a tenth of the mean, r^2 and eps are equal.
     """
     epsilon = 0.01 * float(image_of("reference", reference).mean()) ** 2
     if not epsilon > 0:
@@ -47,27 +45,25 @@ def rel_mse_epsilon(reference) -> float:
 
 
 def rel_mse(image, reference, trim=0.0) -> float:
-    """Relative mean squared error: mean of (x - r)^2 / (r^2 + eps) over pixels and channels.
+    """Relative mean squared error: mean of (x - r)^2 / (r^2 + eps).
 
-    eps is `rel_mse_epsilon`. Source: F. Rousselle, C. Knaus, M. Zwicker, Adaptive Sampling and
-    Reconstruction using Greedy Error Minimization, SIGGRAPH Asia 2011, there with a constant 0.01; ours
-    follows the image's brightness, so scaling both images changes nothing.
+    Over pixels and channels; eps is `rel_mse_epsilon`. Source: F. Rousselle, C. Knaus, M. Zwicker, Adaptive
+    Sampling and Reconstruction using Greedy Error Minimization, SIGGRAPH Asia 2011, there with a constant
+    0.01; ours is invariant to scaling both images.
 
-    ``trim``: share of the worst values left out, round(trim * n) of the n = 3 * height * width ones, 0.001
-    for the *trimmed* relMSE. It leaves out values, not pixels: of a pixel it may take one channel. With less
-    than 500 values 0.001 of them rounds to none. Trimmed figures depend on the budget (more samples have more
-    rare values): state the samples with them.
+    ``trim``: share of the worst values that are excluded, round(trim * n) of n = 3 * height * width; 0.001
+    for the *trimmed* relMSE. It excludes values, not pixels. Trimmed figures depend on the number of samples:
+    state it with them.
     """
     error, kept = _relative_errors(image, reference, trim)
     return float(error[kept].mean())
 
 
 def spread(images, reference, trim=0.0) -> list[float]:
-    """Of each of n independent ``images`` of one mean, what `rel_mse` would be without bias.
+    """Return `rel_mse` without bias for each of n independent ``images`` of one mean.
 
     The mean of (x - m)^2 n / (n - 1) / (r^2 + eps), m the mean of the n images and r the ``reference``, which
-    weighs pixels and may have an error of its own: what all images lack counts as little as what it has too
-    much.
+    only weighs pixels.
     """
     if len(images) < 2:
         raise CommandError(f"images has {len(images)} images; a spread takes 2 or more.")
@@ -78,16 +74,15 @@ def spread(images, reference, trim=0.0) -> list[float]:
 
 
 def _kept_mean(errors, trim) -> float:
-    """The mean of ``errors`` without the share ``trim`` of the largest."""
+    """Return the mean of ``errors`` without the share ``trim`` of the largest."""
     return float(errors[_smallest(errors, trim)].mean())
 
 
 def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
-    """What the reference's own error adds to ``rel_mse(image, reference, trim)``.
+    """Return what the reference's own error adds to `rel_mse`.
 
-    ``difference``: an image of the reference's error, as half the difference of two halves of it. Its relMSE
-    over the values that the measurement keeps: those that are trimmed are the image's worst, not the
-    reference's.
+    ``difference``: an image of the reference's error, such as half the difference of its halves. Returns its
+    relMSE over the values that the measurement keeps.
     """
     _, kept = _relative_errors(image, reference, trim)
     difference = image_of("difference", difference)
@@ -96,14 +91,14 @@ def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
 
 
 def _relative_errors(image, reference, trim):
-    """Squared relative errors (n,), and the indices of those that are not trimmed."""
+    """Return squared relative errors (n,), and the indices of those kept."""
     image, reference = pair_of(image, reference)
     error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
     return error, _smallest(error, trim)
 
 
 def _smallest(errors, trim):
-    """The indices of ``errors`` without the share ``trim`` of the largest."""
+    """Return the indices of ``errors`` without the share ``trim`` of the largest."""
     if trim != 0:
         trim = number_of("trim", trim, 0, 1)
     keep = len(errors) - round(trim * len(errors))
@@ -113,10 +108,10 @@ def _smallest(errors, trim):
 
 
 def mape(image, reference) -> float:
-    """Mean absolute relative error: mean of |x - r| / (|r| + eps1) over pixels and channels; 1 is 100 %.
+    """Mean absolute relative error: mean of |x - r| / (|r| + eps1); 1 is 100 %.
 
-    eps1 = 0.01 mean(r): small against what is seen, so only pixels below a hundredth of the mean count
-    less than their relative error, and 0 / 0 in black ones is 0.
+    Over pixels and channels. eps1 = 0.01 mean(r) bounds the weight of pixels below a hundredth of the mean,
+    and makes 0 / 0 in black ones 0.
     """
     image, reference = pair_of(image, reference)
     epsilon = 0.01 * float(reference.mean())
@@ -125,15 +120,15 @@ def mape(image, reference) -> float:
     return float(np.mean(np.abs(image - reference) / (np.abs(reference) + epsilon)))
 
 
-# Of the mean: negative values that rounding makes, as `volpath`'s in grids.
+# Relative to the mean: negative values up to this are rounding (`volpath` in grids).
 ROUNDED = 1e-5
 
 
 def energy_in_black(image, reference) -> float:
-    """Share of the image's energy where the reference is black: sum of x over those pixels / sum of x.
+    """Share of the image's energy in pixels that are black in the reference.
 
-    Black are pixels in which all three channels of the reference are exactly 0. An image without energy has
-    none there either: 0. Negative values beyond rounding raise ``CommandError``.
+    All three channels of the reference are exactly 0 there. 0 for an image without energy. Negative values
+    beyond rounding raise ``CommandError``.
     """
     image, reference = pair_of(image, reference)
     if image.min() < -ROUNDED * image.mean():
@@ -144,11 +139,10 @@ def energy_in_black(image, reference) -> float:
 
 
 def tone_map(image, exposure=0.0) -> np.ndarray:
-    """What a display shows: sRGB-encoded values in [0, 1], shape (height, width, 3).
+    """Return sRGB-encoded values in [0, 1] for display, shape (height, width, 3).
 
-    x = clip(image * 2^exposure, 0, 1) with ``exposure`` in stops, then the transfer function of
-    IEC 61966-2-1: 12.92 x up to 0.0031308, above it 1.055 x^(1/2.4) - 0.055. Negative values (filters with
-    negative lobes) become black, as on a display.
+    x = clip(image * 2^exposure, 0, 1) with ``exposure`` in stops, then the transfer function of IEC
+    61966-2-1: 12.92 x up to 0.0031308, above it 1.055 x^(1/2.4) - 0.055.
     """
     x = np.clip(image_of("image", image) * 2.0 ** number_of("exposure", exposure, -100, 100), 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
@@ -156,9 +150,9 @@ def tone_map(image, exposure=0.0) -> np.ndarray:
 
 @functools.cache
 def _of_the_extra(module: str, needed_by: str):
-    """Import a module that the extra ``[measure]`` installs; raise ``CommandError`` without it.
+    """Import a module of the extra ``[measure]``; raise ``CommandError`` without it.
 
-    Silences what modules say at import about packages that they miss and that are not used here.
+    Suppresses warnings at import about optional packages.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -170,10 +164,10 @@ def _of_the_extra(module: str, needed_by: str):
 
 
 def delta_e_2000(image, reference, exposure=0.0) -> float:
-    """Mean over pixels of CIEDE2000 between both images as `tone_map` shows them; 1 is just visible.
+    """Mean CIEDE2000 of both images as `tone_map` displays them; 1 is just visible.
 
-    sRGB to XYZ to L*a*b* under D65, k_L = k_C = k_H = 1. Source: CIE 142-2001; G. Sharma, W. Wu,
-    E. Dalal, The CIEDE2000 color-difference formula, 2005.
+    sRGB to XYZ to L*a*b* under D65, k_L = k_C = k_H = 1. Source: CIE 142-2001; G. Sharma, W. Wu, E. Dalal,
+    The CIEDE2000 color-difference formula, 2005.
     """
     colour = _of_the_extra("colour", "delta_e_2000")
     labs = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(tone_map(x, exposure))) for x in pair_of(image, reference)]
@@ -181,10 +175,10 @@ def delta_e_2000(image, reference, exposure=0.0) -> float:
 
 
 def delta_e_itp(image, reference, exposure=0.0, white=WHITE) -> float:
-    """Mean over pixels of Delta E ITP between both images as `tone_map` shows them; 1 is just visible.
+    """Mean Delta E ITP of both images as `tone_map` displays them; 1 is just visible.
 
     720 sqrt(dI^2 + (dC_T / 2)^2 + dC_P^2) in IC_TC_P of BT.2100 (PQ), linear BT.2020 in cd/m^2 with 1 at
-    ``white``. Source: Recommendation ITU-R BT.2124. It tells dark differences better than `delta_e_2000`.
+    ``white``. Source: Recommendation ITU-R BT.2124. More accurate than `delta_e_2000` in dark regions.
     """
     colour = _of_the_extra("colour", "delta_e_itp")
     white = number_of("white", white, 0)
@@ -198,11 +192,11 @@ def delta_e_itp(image, reference, exposure=0.0, white=WHITE) -> float:
 def hdr_flip(image, reference):
     """Mean HDR-FLIP error in [0, 1] and the error map (height, width), float32.
 
-    The largest LDR-FLIP error over a range of exposures that is chosen from the reference, ACES tone
-    mapping, 67 pixels per degree (a 0.7 m wide screen of 3840 pixels seen from 0.7 m). Not symmetric: the
-    reference decides the exposures. Where more than half of it is black, these reach 24 stops beyond its
-    highlights and any light in black counts nearly 1. Source: P. Andersson, J. Nilsson, P. Shirley,
-    T. Akenine-Moller, Visualizing Errors in Rendered High Dynamic Range Images, Eurographics 2021.
+    The largest LDR-FLIP error over exposures that follow from the reference, ACES tone mapping, 67 pixels per
+    degree (a 0.7 m wide screen of 3840 pixels seen from 0.7 m). Not symmetric. Where more than half of the
+    reference is black, exposures reach 24 stops beyond its highlights and any light in black counts nearly 1.
+    Source: P. Andersson, J. Nilsson, P. Shirley, T. Akenine-Moller, Visualizing Errors in Rendered High
+    Dynamic Range Images, Eurographics 2021.
     """
     flip_evaluator = _of_the_extra("flip_evaluator", "hdr_flip")
     pair = pair_of(image, reference)

@@ -1,7 +1,6 @@
-"""Options of measurements: their names, defaults and bounds, for the command and for Python alike.
+"""Options of measurements: names, defaults and bounds, for the command and Python.
 
-A dataclass for each measurement. Nothing but the standard library is imported here, since the command
-declares its options before it imports anything else.
+A dataclass per measurement. Imports only the standard library, since the command declares its options first.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ REFERENCE_SECONDS = 600.0
 
 @dataclass(frozen=True)
 class Number:
-    """A finite number of a ``kind``, from ``least`` to ``most``, a multiple of ``step``; or ``apart``."""
+    """A finite number in [least, most], multiple of ``step``; or the value ``apart``."""
 
     kind: type
     least: float
@@ -43,7 +42,7 @@ class Number:
         return found if self.apart is None else f"{found}, or {self.apart}"
 
     def holds(self, value: object) -> bool:
-        """Whether a ``value`` is such a number."""
+        """Return whether ``value`` is such a number."""
         if isinstance(value, bool) or not isinstance(value, int if self.kind is int else int | float):
             return False
         if value == self.apart:
@@ -55,7 +54,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some ``names``."""
+    """One of ``names``."""
 
     names: tuple[str, ...]
 
@@ -63,7 +62,7 @@ class Choice:
         return f"one of {', '.join(self.names)}"
 
     def holds(self, value: object) -> bool:
-        """Whether a ``value`` is one of them."""
+        """Return whether ``value`` is one of the names."""
         return value in self.names
 
 
@@ -72,7 +71,7 @@ SECONDS, WIDTH = Number(float, 0), Number(int, 4, step=4)
 
 
 def option(default: Any, bounds: Number | Choice | type, text: str, **declared) -> Any:
-    """A field: its ``default`` and ``bounds``, None beside them if that is the default, and its help.
+    """Return a field: default (None is valid beside the bounds), bounds and help.
 
     ``declared``: further arguments for argparse, and ``short``, another name there.
     """
@@ -90,10 +89,10 @@ def _reference_seconds() -> Any:
 
 
 class Options:
-    """What all options have in common."""
+    """Base of all options."""
 
     def __post_init__(self):
-        """Raise ``CommandError`` for values that cannot be."""
+        """Raise ``CommandError`` for invalid values."""
         for found in options_of(type(self)):
             value, bounds = getattr(self, found.name), found.metadata["bounds"]
             if isinstance(bounds, type) or (value is None and found.default is None):
@@ -107,7 +106,7 @@ class Options:
 
 
 def options_of(kind: type) -> list[Field]:
-    """The fields of a dataclass of options."""
+    """Return the fields of a dataclass of options."""
     return [found for found in fields(kind) if "bounds" in found.metadata]
 
 
@@ -200,7 +199,7 @@ class Pyramid(Options):
 
 
 def _documented(kind: type[Options]) -> str:
-    """The docstring of a dataclass of options with the meaning of each."""
+    """Return the docstring of a dataclass of options, with the meaning of each."""
     lines = [kind.__doc__ or "", ""]
     for found in options_of(kind):
         bounds, text = found.metadata["bounds"], found.metadata["text"] % {"default": found.default}

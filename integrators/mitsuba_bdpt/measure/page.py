@@ -1,8 +1,8 @@
-"""A sweep as one HTML file that needs neither network nor server.
+"""Writes a sweep as one HTML file that needs neither network nor server.
 
-It says for each scene how the first integrator does beside `path`, and why, and shows images: those of the
-first seed at the deciding budget, in half precision, under a divider with exposure control, and error maps
-against the reference. Then come all renders as a table, and plots. page.html is its frame.
+For each scene: the first integrator's efficiency over `path` and its reasons, images of the first seed at the
+deciding budget (half precision, divider, exposure control), and error maps. Then a table of all renders, and
+plots. The template is page.html.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ PLOTS = {
 
 
 def answer(results: Results, scene: str) -> tuple[float, str]:
-    """How the first integrator does against the strongest path tracer in a scene: the ratio, and a sentence.
+    """Return the ratio over a scene's strongest path tracer, and a sentence about it.
 
-    The ratio is infinite where that fails, NaN where that cannot be said.
+    The ratio is infinite where path tracers fail, NaN where it is unknown.
     """
     rival = (results.standard_in(scene) or RIVALS)[0].split()[0]
     try:
@@ -75,13 +75,13 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
 
 
 def why(results: Results, scene: str) -> str:
-    """What the first render at the deciding budget did and left out, in words."""
+    """Describe what the first render at the deciding budget used and skipped."""
     rows = results.of(scene, results.methods[0], results.deciding)
     if not rows:
         return ""
     row = rows[0]
     statistics = json.loads(row["statistics"] or "{}")
-    if not statistics:  # of another integrator than `bdpt`
+    if not statistics:  # an integrator other than `bdpt`
         return ""
     decided = (statistics.get("decisions") or [None])[-1]
     if decided is None:
@@ -105,7 +105,7 @@ def why(results: Results, scene: str) -> str:
 
 
 def answers(results: Results) -> str:
-    """The list of all scenes, the greatest gain first."""
+    """Return the list of all scenes, by decreasing gain."""
     found = {scene: answer(results, scene) for scene in results.scenes}
     order = sorted(found, key=lambda scene: -1 if math.isnan(found[scene][0]) else found[scene][0])[::-1]
     items = [
@@ -117,13 +117,13 @@ def answers(results: Results) -> str:
 
 
 def encoded(image: np.ndarray) -> str:
-    """An image as base64 of half precision, as the page reads it."""
+    """Encode an image as base64 of half precision, as the page decodes it."""
     half = np.minimum(image, HALF_MAX).astype("<f2")
     return base64.b64encode(half.tobytes()).decode()
 
 
 def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
-    """What the page shows of a scene: images by name, captions, size."""
+    """Return a scene's images by name, captions and size."""
     target = made[scene].image
     images, captions = {}, {}
     for method in results.methods:
@@ -151,7 +151,7 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
 
 
 def lines(results: Results) -> list[list]:
-    """The lines of the table: medians over the seeds of each scene, integrator and budget."""
+    """Return the table's lines: medians over seeds."""
     found = []
     for scene in results.scenes:
         for method in results.methods:
@@ -168,7 +168,7 @@ def lines(results: Results) -> list[list]:
 
 
 def plots(results: Results) -> str:
-    """The figures, in the page."""
+    """Return the plots, embedded."""
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / f"{name}.png" for name in PLOTS}
         if results.rivals:
@@ -205,7 +205,7 @@ def page(folder: Path, results: Results, made: dict) -> str:
         "ANSWERS": answers(results),
         "PLOTS": plots(results),
         "MACHINE": html.escape(report.machine(results)),
-        # Inside a script element only "</" could end it.
+        # Only "</" could end a script element.
         "DATA": json.dumps(data, allow_nan=False).replace("</", "<\\/"),
     }
     text = FRAME.read_text()
@@ -215,7 +215,7 @@ def page(folder: Path, results: Results, made: dict) -> str:
 
 
 def run(options: Namespace) -> int:
-    """Write the page that the command line ``options`` ask for."""
+    """Write the page that the command-line ``options`` request."""
     project = Project(options.project)
     folder = project.results(options.folder)
     output = options.output or folder / "page.html"

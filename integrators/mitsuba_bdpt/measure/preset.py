@@ -62,9 +62,9 @@ MATCHES = ("seconds", "spp")
 class Method:
     """An integrator of a preset.
 
-    ``parameters`` of the plugin, ``sampler`` of the sensor, ``match`` what it has in common with the first
-    one, ``scenes`` where it takes part (None: everywhere), ``media`` whether those have participating media
-    (None: either), ``seeds`` of a budget that it takes at most (None: all).
+    ``parameters``: of the plugin; ``sampler``: of the sensor; ``match``: equal "spp" or "seconds" with the
+    first; ``scenes``: where it is rendered (None: everywhere); ``media``: whether these have participating
+    media (None: either); ``seeds``: at most so many per budget (None: all).
     """
 
     name: str
@@ -76,7 +76,7 @@ class Method:
     seeds: int | None
 
     def takes_part_in(self, scene: MeasuredScene) -> bool:
-        """Whether it renders a scene."""
+        """Return whether it renders a scene."""
         if self.scenes is not None and scene.name not in self.scenes:
             return False
         return self.media is None or self.media == scene.has_media
@@ -84,7 +84,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene of a preset: ``max_depth``, samples per pixel of each budget, number of seeds of each."""
+    """A scene of a preset: ``max_depth``, samples per pixel and seeds of each budget."""
 
     scene: MeasuredScene
     max_depth: int
@@ -99,9 +99,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class More:
-    """Further seeds of some ``methods`` in some scenes at one budget, ``at_least`` to ``at_most``.
+    """Further seeds of some ``methods`` in some scenes at one budget.
 
-    Until the interval of the median ratio of efficiencies is narrower than ``width``.
+    From ``at_least`` to ``at_most``, until the interval of the median ratio of efficiencies is narrower than
+    ``width``.
     """
 
     scenes: tuple
@@ -124,7 +125,7 @@ class Preset:
 
 
 def read_preset(path: Path, project: Project) -> Preset:
-    """Read and check a TOML file of a ``project``; raises ``CommandError`` naming the file and the key."""
+    """Read a TOML file of a ``project``; raises ``CommandError`` naming file and key."""
     data = read_toml(path)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
@@ -154,7 +155,7 @@ def _names(path, key, value) -> list[str]:
 
 
 def _methods(path, entries, scenes) -> tuple:
-    """The integrators of a preset."""
+    """Return the integrators of a preset."""
     list_of(path, "integrator", entries, dict, "tables: write [[integrator]] and the keys of each below")
     methods = tuple(_method(path, dict(entry), scenes) for entry in entries)
     if len({m.name for m in methods}) < len(methods):
@@ -169,7 +170,7 @@ def _methods(path, entries, scenes) -> tuple:
 
 
 def _probes(path, counts) -> dict:
-    """How often each probe is repeated."""
+    """Return the number of repetitions of each probe."""
     for name, count in table_of(path, "probes", counts).items():
         if name not in probes.PROBES:
             raise CommandError(f"{path}: probe {name!r} is unknown; there are {sorted(probes.PROBES)}")
@@ -269,8 +270,8 @@ FIRST_SEED = 1  # seed 0 warms up
 class Cell:
     """One render, and all that determines it.
 
-    ``against``: for equal seconds, parameters and sampler of the first integrator and the samples at which
-    the two were timed.
+    ``against``: for equal time, parameters and sampler of the first integrator, and the samples at which both
+    were timed.
     """
 
     scene: str
@@ -294,12 +295,12 @@ class Cell:
 
 
 def software() -> dict:
-    """Versions of what renders, the plugin's source among them."""
+    """Return the versions that determine a render, with the plugin's source."""
     return versions() | {"source": source_digest()}
 
 
 def machine() -> str:
-    """Processor and number of cores."""
+    """Return processor and number of cores."""
     names = [line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name")]
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
 
@@ -314,7 +315,7 @@ class Cells:
 
     def __init__(self, project: Project, preset: Preset, subject: Subject):
         self.project, self.subject = project, subject
-        self.more: More | None = None  # of [more], if the scene is among its own
+        self.more: More | None = None  # of [more], if it contains the scene
         if preset.more is not None and subject.name in preset.more.scenes:
             self.more = preset.more
         self.methods = [m for m in preset.methods if m.takes_part_in(subject.scene)]
@@ -330,7 +331,7 @@ class Cells:
         self.against = first.parameters, first.sampler, max(subject.spp)
 
     def of(self, budget: int, seed: int, names=None) -> list[Cell]:
-        """A cell per integrator, of those in ``names``."""
+        """Return a cell per integrator, of those in ``names``."""
         return [
             Cell(
                 **self.common,
@@ -345,7 +346,7 @@ class Cells:
         ]
 
     def planned(self) -> list[Cell]:
-        """Those that are rendered in any case."""
+        """Return the cells that are always rendered."""
         found = [
             cell
             for spp, seeds in zip(self.subject.spp, self.subject.seeds, strict=True)
@@ -357,20 +358,20 @@ class Cells:
         return found + [cell for cell in first if cell.key not in known]
 
     def where(self) -> tuple:
-        """What names the reference: project, scene, resolution, ``max_depth``."""
+        """Key of the reference: project, scene, resolution, ``max_depth``."""
         return self.project, self.subject.scene, self.common["resolution"], self.subject.max_depth
 
     def fewest(self) -> int:
-        """Seeds that [more] takes at least, 0 without it."""
+        """Minimum number of seeds of [more], 0 without it."""
         return 0 if self.more is None else self.more.at_least
 
     def further(self, index: int) -> list[Cell]:
-        """The cells of [more] with its ``index``-th seed; none without it."""
+        """Return the cells of [more] with its ``index``-th seed; none without it."""
         if self.more is None:
             return []
         return self._turn(self.of(self.more.spp, FIRST_SEED + index, self.more.methods))
 
     @staticmethod
     def _turn(found: list[Cell]) -> list[Cell]:
-        """There for odd seeds and back for even ones: a drift of the machine's speed favours nobody."""
+        """Reverse the order for even seeds: cancels drifts of the machine's speed."""
         return found[::-1] if found and found[0].seed % 2 == 0 else found

@@ -1,6 +1,6 @@
-"""What a render costs besides its samples: the first image from an empty kernel cache, and memory.
+"""Costs of a render besides its samples: first image without kernel cache, memory.
 
-Each probe takes the project and the number of repetitions, and returns plain numbers; a repetition is a
+Each probe takes the project and the number of repetitions, and returns plain numbers. Each repetition is a
 process of its own.
 """
 
@@ -38,12 +38,12 @@ print(memory.peak() / 2**30)
 
 
 def _printed(code, environment=None) -> float:
-    """The last number that a new process prints."""
+    """Return the last number that a new process prints."""
     return numbers(code, environment=environment)[-1]
 
 
 def numbers(code, *arguments, environment=None, folder: Path | None = None) -> list[float]:
-    """The numbers that a new process prints, run in a ``folder``."""
+    """Return the numbers that a new process prints, run in a ``folder``."""
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder)
     if done.returncode:
@@ -60,9 +60,9 @@ def _is_number(word) -> bool:
 
 
 def coldstart(project: Project, rounds: int) -> dict:
-    """Seconds from an empty kernel cache to the first image, by integrator, a value per round.
+    """Return seconds from an empty kernel cache to the first image, by integrator.
 
-    Of the Cornell box, 256x256, depth 6, 16 spp; imports and loading apart.
+    Cornell box, 256x256, depth 6, 16 spp; without imports and loading. A value per round.
     """
     seconds = {"path": [], "bdpt": []}
     for _ in range(rounds):
@@ -74,9 +74,9 @@ def coldstart(project: Project, rounds: int) -> dict:
 
 
 def memory(project: Project, rounds: int) -> dict:
-    """Peak resident GiB of a process that renders, by samples per pixel, a value per round.
+    """Return the peak resident GiB of a render, by samples per pixel.
 
-    It renders the Cornell box at 1920x1080, depth 8.
+    Cornell box, 1920x1080, depth 8. A value per round.
     """
     return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
 

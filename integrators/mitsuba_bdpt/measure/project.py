@@ -1,12 +1,12 @@
-"""The folder in which one measures.
+"""The folder of a project's measurements.
 
-    PROJECT/scenes/NAME.xml             scenes that have a NAME; others are called by their file
-    PROJECT/references/                 reference images; references/scenes.toml says how they are made
-    PROJECT/presets/NAME.toml           what sweeps render
-    PROJECT/results/NAME/               what they leave
-    PROJECT/renders/                    pictures, and sums from which a reference can be improved
+    PROJECT/scenes/NAME.xml             scenes with a NAME; others are given by their file
+    PROJECT/references/                 reference images, made according to references/scenes.toml
+    PROJECT/presets/NAME.toml           definitions of sweeps
+    PROJECT/results/NAME/               results of sweeps
+    PROJECT/renders/                    pictures, and sums from which references are refined
 
-None of these folders has to be there.
+All folders are optional.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ class Project:
 
     @property
     def scenes(self) -> Path:
-        """The folder of scenes that have names."""
+        """Folder of named scenes."""
         return self.root / "scenes"
 
     @property
     def references(self) -> Path:
-        """The folder of reference images."""
+        """Folder of reference images."""
         return self.root / "references"
 
     @property
     def renders(self) -> Path:
-        """The folder of pictures and of what is only kept to go on with."""
+        """Folder of pictures and of intermediate sums."""
         return self.root / "renders"
 
     def scene_names(self) -> list[str]:
-        """The scenes that can be called by name."""
+        """Return the names of scenes."""
         return sorted(path.stem for path in self.scenes.glob("*.xml"))
 
     def scene(self, name: str) -> MeasuredScene:
-        """A scene by its name, or by its file, seen from here or from the project's folder.
+        """Return a scene by name, or by file relative to here or to the project.
 
-        Raises ``CommandError`` that says what there is if there is none.
+        Raises ``CommandError`` that lists scenes if there is none.
         """
         if name in self.given:
             return self.given[name]
@@ -67,22 +67,22 @@ class Project:
         )
 
     def called(self, scene: MeasuredScene) -> str:
-        """What `scene` finds a scene by."""
+        """Return the name by which `scene` finds a scene."""
         named = self.scenes / f"{scene.name}.xml"
         return str(scene.file) if isinstance(scene, SceneFile) and scene.file != named else scene.name
 
     def command(self, *words: str | Path) -> str:
-        """A command line of this project, as a message quotes it for a shell."""
+        """Return a command line of this project, quoted for a shell."""
         there = [] if self.root == Path() else ["--project", str(self.root)]
         return shlex.join(["mitsuba-bdpt", *map(str, words), *there])
 
     def sweep_command(self, folder: Path) -> str:
-        """That of the sweep that fills a ``folder``: of the preset of its name, if there is one."""
+        """Return the command line of the sweep that fills a ``folder``."""
         known = (self.root / "presets" / f"{folder.name}.toml").is_file()
         return self.command("sweep", folder.name if known else "PRESET", "-o", folder)
 
     def _names_for(self, name: str) -> str:
-        """The end of a message about a ``name`` that is unknown."""
+        """Return the end of a message about an unknown ``name``."""
         known = self.scene_names()
         if not known:
             return f", or put it into {str(self.scenes)!r} and give its name"
@@ -91,19 +91,19 @@ class Project:
         return text.rstrip("; ")
 
     def depth(self, scene: MeasuredScene) -> int:
-        """The ``max_depth`` at which a scene is rendered unless said.
+        """Return the default ``max_depth`` of a scene.
 
-        That of presets/benchmark.toml if there is one, else that of the scene's file.
+        That of presets/benchmark.toml if it exists, else that of the scene's file.
         """
         benchmark = self.root / "presets" / "benchmark.toml"
         return depth_in(benchmark, read_toml(benchmark) if benchmark.is_file() else {}, scene)
 
     def preset(self, name: str) -> Path:
-        """A preset by its file or by its name in presets/; the file may not be there."""
+        """Return the path of a preset, by file or name; it may not exist."""
         return self._found(Path(name), self.root / "presets" / f"{name}.toml")
 
     def results(self, name: str) -> Path:
-        """What a sweep has left, by its folder or by its name in results/; it may not be there."""
+        """Return the results of a sweep, by folder or name; they may not exist."""
         return self._found(Path(name), self.root / "results" / name)
 
     @staticmethod
@@ -112,10 +112,10 @@ class Project:
 
 
 def depth_in(file: Path, preset: dict, scene: MeasuredScene) -> int:
-    """The ``max_depth`` at which a preset, as read from a TOML ``file``, renders a scene.
+    """Return the ``max_depth`` at which a preset from a TOML ``file`` renders a scene.
 
-    Its own, else that of all scenes, else that of the scene's file. Raises ``CommandError`` for what is no
-    such number.
+    The preset's for the scene, else the preset's, else that of the scene's file. Raises ``CommandError`` for
+    an invalid value.
     """
     own = table_of(file, "scene", preset.get("scene", {})).get(scene.name, {})
     merged = preset | table_of(file, f"scene.{scene.name}", own)

@@ -1,11 +1,11 @@
-"""The technique pyramid of a scene: what each strategy (s, t) makes of it.
+"""The technique pyramid of a scene: the contribution of each strategy (s, t).
 
-A row for each path length of k = 2, 3, ... edges with the k + 2 ways (s, t) to make such paths, s light
-vertices and t camera vertices, brightened by 2^(k-1); strategies that contribute nothing are left out.
+A row for each path length of k = 2, 3, ... edges with its k + 2 strategies (s, t), s light vertices and t
+camera vertices, brightened by 2^(k-1); strategies without contribution are left out.
 
-Written are, by ``-o NAME.exr``, that file with the image and the layers ``weighted.s{S}t{T}.R`` ... and
-``unweighted.s{S}t{T}.R`` ..., NAME.png, the image, and the pyramids NAME_weighted.png, which adds up to
-the image, and NAME_unweighted.png, in which each panel is an estimate by itself.
+``-o NAME.exr`` writes that file with the image and the layers ``weighted.s{S}t{T}.R`` ... and
+``unweighted.s{S}t{T}.R`` ..., the image NAME.png, and the pyramids NAME_weighted.png, whose sum is the image,
+and NAME_unweighted.png, in which each panel is an estimate by itself.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ import matplotlib.pyplot as plt
 
 KINDS = ("weighted", "unweighted")
 
-SHORTEST = 2  # edges: of single ones the emitters themselves are seen
+SHORTEST = 2  # edges: single ones show the emitters only
 
 
 def technique_images(image, names: list, kind: str) -> dict:
-    """``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``.
+    """Return ``weighted`` or ``unweighted`` images of the strategies by ``(k, s, t)``.
 
-    They have the shape of ``image`` (..., 3), and come out of a render whose last channels have these
-    ``names``.
+    Of shape ``image`` (..., 3), from a render whose last channels have ``names``.
     """
     first = image.shape[-1] - len(names)
     found = {}
@@ -52,7 +51,7 @@ def technique_images(image, names: list, kind: str) -> dict:
 
 
 def render(file: MeasuredScene, options: Pyramid | Namespace):
-    """The film after a render with technique images, and these, weighted and unweighted."""
+    """Return the film after a render, and technique images, weighted and unweighted."""
     scene = file.load(options.resolution)
     parameters = {"type": "bdpt", "strategy_images": True, "heuristic": options.heuristic}
     integrator = integrator_of(parameters, options.max_depth)
@@ -65,7 +64,7 @@ def render(file: MeasuredScene, options: Pyramid | Namespace):
 
 
 def panels(images: dict) -> dict:
-    """Those `technique_images` to which anything contributes, but for single edges.
+    """Return the nonzero `technique_images` of two or more edges.
 
     Raises ``CommandError`` if there are none.
     """
@@ -79,7 +78,7 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """Draw the pyramid as a picture: rows of path lengths, s rising to the right."""
+    """Draw the pyramid: rows of path lengths, s increasing to the right."""
     lengths = sorted({k for k, _, _ in found})
     rows = [[key for key in found if key[0] == k] for k in lengths]
     columns = max(len(row) for row in rows)
@@ -91,7 +90,7 @@ def draw(found: dict, path: Path, exposure: float):
     for i, row in enumerate(rows):
         bottom = 1 - (i + 1) / len(rows)
         for j, (k, s, t) in enumerate(row):
-            # Rows are centred, which makes the pyramid.
+            # Centred rows form the pyramid.
             left = margin + panel * (j + (columns - len(row)) / 2)
             box = (left / wide, bottom, 0.97 * panel / wide, (1 - title / high) / len(rows))
             axis = figure.add_axes(box)
@@ -108,7 +107,7 @@ def draw(found: dict, path: Path, exposure: float):
 def pictured(
     project: Project, scene: str, options: Pyramid | Namespace
 ) -> tuple[dict[str, Path], dict[str, dict]]:
-    """Render and write the pyramids of a scene: files of the pictures, images of the strategies, by kind."""
+    """Render and write a scene's pyramids; returns files, and images by kind."""
     if options.max_depth < SHORTEST:
         raise CommandError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     file = project.scene(scene)
@@ -126,7 +125,7 @@ def pictured(
 
 
 def run(options: Namespace) -> int:
-    """Render, write, say what was written, as the command line ``options`` say."""
+    """Render and write the pyramids that the command-line ``options`` request."""
     mi.set_variant(VARIANT)
     pictures, _ = pictured(Project(options.project), options.scene, options)
     print(*pictures.values(), sep="\n")

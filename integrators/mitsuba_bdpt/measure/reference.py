@@ -1,8 +1,8 @@
-"""Reference images with an error estimate of their own, as they are stored.
+"""Stored reference images, with an estimate of their own error.
 
-Files lie in the project's references/: EXR in half precision (single, if the user gave the image) with the
-image (R, G, B), half the difference of two halves of its samples (difference.R ...), which is one sample of
-its own error, and the provenance as JSON in the header, with what a bias check needs. `making` makes them.
+Files lie in the project's references/: EXR in half precision (single, if given by the user) with the image
+(R, G, B), half the difference of two halves of its samples (difference.R ...), a sample of its own error, and
+the provenance as JSON in the header, with the data of bias checks. `making` makes them.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference image, its error, and what made it.
+    """A reference image, its error, and its provenance.
 
     ``image`` and ``difference`` (height, width, 3), half the difference of the halves; ``means`` for bias
-    checks, None if too few renders made it; ``provenance`` what made it.
+    checks, None if too few renders made it.
     """
 
     image: np.ndarray
@@ -41,34 +41,35 @@ class Reference:
 
     @property
     def error(self) -> float:
-        """Its own relMSE."""
+        """The reference's own relMSE."""
         return rel_mse(self.image + self.difference, self.image)
 
     @property
     def merged(self) -> bool:
-        """Whether it has the light that only `merging` finds, blurred by a little."""
+        """Whether it contains light that only `merging` samples, slightly blurred."""
         made_by = self.provenance["integrator"]
         return isinstance(made_by, dict) and made_by.get("merging", False)
 
     @property
     def given(self) -> bool:
-        """Whether it is an image of the user's (`given`): then its own error is not among what it holds."""
+        """Whether the user gave the image (`given`); its own error is then not stored."""
         return "given" in self.provenance
 
     def share_of(self, image, trim: float) -> float:
-        """What its own error adds to ``rel_mse(image, self.image, trim)``."""
+        """Return the share of its own error in ``rel_mse(image, self.image, trim)``."""
         return reference_rel_mse(self.difference, image, self.image, trim)
 
 
 def reference_path(project: Project, name: str, resolution: int, max_depth: int) -> Path:
-    """Where the reference of a scene lies."""
+    """Return the path of a scene's reference."""
     return project.references / f"{name}_{resolution}_{max_depth}.exr"
 
 
 def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
-    """The command line that makes the reference of the scene that is ``called`` so, or goes on with it.
+    """Return the command line that makes or refines the reference of a scene.
 
-    Of a dictionary, the call in Python. ``more``: further options and their values.
+    ``called``: the scene's name; for a dictionary, returns the call in Python. ``more``: further options and
+    their values.
     """
     if called in project.given:
         options = {"resolution": resolution, "max_depth": max_depth} | dict(
@@ -81,9 +82,9 @@ def make_command(project: Project, called: str, resolution: int, max_depth: int,
 
 
 def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_depth: int) -> Reference:
-    """The stored reference; raises ``CommandError`` with the command that makes it if it cannot serve.
+    """Return the stored reference.
 
-    That is if there is none, or if it was made of another version of the scene's file.
+    Raises ``CommandError``, with the command that makes it, if it is missing or of another scene file.
     """
     path = reference_path(project, scene.name, resolution, max_depth)
     make = make_command(project, project.called(scene), resolution, max_depth)
@@ -103,12 +104,12 @@ def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_
 
 
 def too_few(name: str, make: str) -> str:
-    """What is said of a reference without `Means`, and the command that goes on with it."""
+    """Return the message about a reference without `Means`, with a remedy."""
     return f"the reference of {name} has too few renders for a bias check; go on by {make}"
 
 
 def read_reference(path: Path) -> Reference:
-    """The reference in a file, whatever scene it was made of; raises ``CommandError`` if it is none."""
+    """Read a reference from a file; raises ``CommandError`` if it is none."""
     (image, difference), header = read_layers(path, "", "difference.")
     try:
         provenance = json.loads(header["provenance"])
@@ -121,7 +122,7 @@ def read_reference(path: Path) -> Reference:
 
 
 def write(path: Path, reference: Reference):
-    """Write a reference; whoever looks at ``path`` never sees half a file."""
+    """Write a reference atomically."""
     brightest = float(reference.image.max())
     if brightest > HALF_MAX and not reference.given:
         raise CommandError(
@@ -129,13 +130,13 @@ def write(path: Path, reference: Reference):
         )
     layers = {"": reference.image, "difference.": reference.difference}
     header = reference.provenance | {"rel_mse": reference.error, "means": kept_of(reference.means)}
-    # What a user gives has values that nobody can change.
+    # Given images keep their exact values.
     dtype = np.float32 if reference.given else np.float16
     write_layers(path, layers, {"provenance": json.dumps(header)}, dtype)
 
 
 def means_of(kept) -> Means | None:
-    """`Means` of what the provenance keeps of them: those of an exact image have no end of freedom."""
+    """Return the `Means` in a provenance; freedom is infinite for exact images."""
     if kept is None:
         return None
     return Means(
@@ -152,7 +153,7 @@ def means_of(kept) -> Means | None:
 
 
 def kept_of(means: Means | None):
-    """The reverse of `means_of`, for JSON."""
+    """Inverse of `means_of`, for JSON."""
     if means is None:
         return None
     plain = {name: asdict(getattr(means, name)) for name in ("columns", "whole")}
@@ -164,7 +165,7 @@ def kept_of(means: Means | None):
 
 
 def source_digest() -> str:
-    """SHA-256 of the source files of what renders, shortened."""
+    """Return a shortened SHA-256 of the package's source files."""
     others = (PACKAGE / "cli", PACKAGE / "measure")
     files = sorted(PACKAGE.rglob("*.py"))
     return digest(*(file for file in files if not any(map(file.is_relative_to, others))))[:12]

@@ -1,9 +1,9 @@
 """Tables and plots of a sweep.
 
-From rows.parquet and probes.json in a folder come the plots and README.md with all tables beside them. Goals
-and explanations of what is not as one expects are read from goals.toml and notes.toml, if there are any. The
-parts of another Markdown file between the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too,
-NAME being ``goals``, ``efficiency`` or ``gallery`` (of images in ../images/gallery).
+Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them. Goals
+and explanations are read from goals.toml and notes.toml, if present. Parts of another Markdown file between
+the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``goals``, ``efficiency`` or
+``gallery`` (of images in ../images/gallery).
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ from .tables import ranged, ratio, said, table
 
 
 def load(project: Project, folder: Path) -> tuple[Results, dict]:
-    """The data of a folder, and the references of its scenes by name.
+    """Return the results in a folder, and the references of its scenes by name.
 
-    Raises ``CommandError`` if no sweep has filled it, and if the errors were taken against other references
-    than those of the ``project``.
+    Raises ``CommandError`` if there are none, or if errors are against other references than the
+    ``project``'s.
     """
     try:
         rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
@@ -86,16 +86,16 @@ def load(project: Project, folder: Path) -> tuple[Results, dict]:
 
 
 def _reference_command(project: Project, rows: list[dict], scene: str) -> str:
-    """The command line that goes on with the reference of a scene, of which rows know the name alone."""
+    """Return the command line that refines the reference of a scene."""
     row = next(row for row in rows if row["scene"] == scene)
     called = scene if scene in project.scene_names() else f"{scene}.xml"
     return make_command(project, called, row["resolution"], row["max_depth"])
 
 
 def efficiency_table(results: Results) -> str:
-    """Per scene, against each rival: trimmed and raw; missing energy where the rival fails the bias check.
+    """Efficiency per scene and rival, trimmed and raw; missing energy where biased.
 
-    A table for the scenes of each set of rivals: with media others are rendered than without.
+    A table per set of rivals: scenes with media have others.
     """
     groups = {}
     for scene in results.scenes:
@@ -105,7 +105,7 @@ def efficiency_table(results: Results) -> str:
 
 
 def _efficiencies(results: Results, rivals, scenes) -> str:
-    """A part of `efficiency_table`."""
+    """Return a part of `efficiency_table`."""
     head = ["scene", *(f"over {rival}, {kind}" for rival in rivals for kind in ("trimmed", "raw"))]
     with_all = NONE in results.methods[1:]
     head += [f"over {NONE}, trimmed"] * with_all
@@ -129,9 +129,9 @@ def _efficiencies(results: Results, rivals, scenes) -> str:
 
 
 def gaps_table(results: Results) -> str:
-    """Table of how much of the error single values carry: raw over trimmed relMSE.
+    """Table of raw over trimmed relMSE: how much of the error few values carry.
 
-    Of the first integrator and of the scene's first of `Results.standard`, scenes with most of it first.
+    For the first integrator and the first of `Results.standard`, by decreasing ratio.
     """
     ours, rivals = results.methods[0], _first_rivals(results)
     rows = []
@@ -144,17 +144,17 @@ def gaps_table(results: Results) -> str:
 
 
 def _first_rivals(results: Results) -> list[str]:
-    """The first of `Results.standard` of each scene, each once; that of all if none was rendered."""
+    """Return the first of `Results.standard` in any scene, without repetitions."""
     firsts = [name for scene in results.scenes for name in results.standard_in(scene)[:1]]
     return list(dict.fromkeys(firsts)) or results.standard[:1]
 
 
-GALLERY = "../images/gallery"  # from docs/reports/figures.md
+GALLERY = "../images/gallery"  # relative to docs/reports/figures.md
 GALLERY_COLUMNS = 3
 
 
 def gallery(results: Results) -> str:
-    """Images of all scenes, a few in a row, with the efficiency over the stronger `path` beneath."""
+    """Images of all scenes, with the efficiency over the stronger `path`."""
     cells = []
     for scene in results.scenes:
         try:
@@ -173,12 +173,12 @@ def gallery(results: Results) -> str:
 
 
 def estimate(x) -> str:
-    """Value (interval)."""
+    """Format value (interval)."""
     return f"{x.value:.2f} ({x.low:.2f} to {x.high:.2f})"
 
 
 def checks_table(results: Results, made: dict, notes: dict) -> str:
-    """Per scene: cost per sample, slopes, bias checks; what is not as expected and has no note is marked."""
+    """Cost per sample, slopes and bias checks per scene; marks unexpected ones."""
     ours = results.methods[0]
     rival = " or ".join(_first_rivals(results) or RIVALS[:1])
     head = ["scene", f"cost of a sample over {rival}", f"{NONE} over {rival}", "slope"]
@@ -220,7 +220,7 @@ def _slope(results, scene, notes) -> str:
 
 
 def _chosen(row) -> str:
-    """What the pilot of a render chose last, as parameters; empty without a pilot."""
+    """Return the pilot's last choice as parameters; empty without a pilot."""
     decisions = json.loads(row["decisions"] or "null")
     last = decisions[-1] if decisions else None
     if last is None:
@@ -231,7 +231,7 @@ def _chosen(row) -> str:
 
 
 def _pilot_share(row) -> float:
-    """Share that pilots and decisions have of a scene's first render, whose pilots the others remember."""
+    """Return the share of pilots and decisions in a scene's first render."""
     first = row.get("seconds_pilot")
     if first is None:
         raise Refused("rows of a version that remembered no pilots")
@@ -239,7 +239,7 @@ def _pilot_share(row) -> float:
 
 
 def _rays_per_sample(rows) -> str:
-    """Of the first render: closest hits, camera and light; shadow rays of s = 1, t = 1, inner connections."""
+    """Rays per sample: camera, light; shadow rays of s = 1, t = 1, inner."""
     if not rows or rows[0].get("rays_camera") is None:
         return "–"
     samples = rows[0]["spp"] * rows[0]["width"] * rows[0]["height"]
@@ -250,7 +250,7 @@ def _rays_per_sample(rows) -> str:
 
 
 def choices_table(results: Results) -> str:
-    """What the pilots chose and left out, what they cost, and rays per sample."""
+    """Table of the pilots' choices and costs, skipped strategies, and rays per sample."""
     head = ["scene", "chosen (number of renders)", "left out in the first render"]
     head += ["share of the pilot in the first render"]
     head += ["closest hits and shadow rays per sample", f"the same, {NONE}"]
@@ -277,9 +277,9 @@ def choices_table(results: Results) -> str:
 
 
 def _verdict(check, merged: bool) -> str:
-    """Whether a bias check is passed, with the surplus of energy and its interval, in percent.
+    """Format a bias check, with the surplus of energy and its interval in percent.
 
-    ``merged``: the reference has light that only `merging` finds, of which a render without it has none.
+    ``merged``: the reference contains light that only `merging` samples.
     """
     half = 50 * (check.missing.high - check.missing.low)
     failed = "fails by what `merging` finds" if merged and check.missing.low > 0 else "**failed**"
@@ -288,7 +288,7 @@ def _verdict(check, merged: bool) -> str:
 
 
 def stronger(results: Results) -> str:
-    """What efficiencies by budget are over, in words."""
+    """Name the baselines of efficiencies by budget."""
     names = results.standard or [RIVALS[0]]
     if set(names) <= {*RIVALS, *MEDIA_RIVALS}:
         media = (
@@ -299,7 +299,7 @@ def stronger(results: Results) -> str:
 
 
 def budgets_table(results: Results) -> str:
-    """How the efficiency over the strongest of `Results.standard` depends on the budget."""
+    """Table of the efficiency over the strongest of `Results.standard`, by budget."""
     budgets = sorted({row["budget"] for row in results.rows})
     head = ["scene", *(f"{b} spp, {kind}" for b in budgets for kind in ("trimmed", "raw"))]
     lines = []
@@ -317,13 +317,13 @@ def budgets_table(results: Results) -> str:
 
 
 def _maker(kept) -> str:
-    """What made a reference."""
+    """Name the integrator that made a reference."""
     by = kept.provenance["integrator"]
     return by if isinstance(by, str) else f"`{by['type']}`" + (", `merging`" if kept.merged else "")
 
 
 def references_table(made: dict) -> str:
-    """What each scene is compared with."""
+    """Table of the references."""
     head = ["scene", "max_depth", "by", "samples per pixel", "own relMSE", "epsilon of relMSE"]
     lines = []
     for scene, kept in made.items():
@@ -344,7 +344,7 @@ def references_table(made: dict) -> str:
 
 
 def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
-    """Over the strongest path tracer that passes the bias check; where none does, what they lack."""
+    """Efficiency over the strongest unbiased path tracer; else their missing energy."""
     try:
         return ranged(results.against_path(scene, error))
     except Biased as why:
@@ -353,7 +353,7 @@ def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
         return f"{why} (against their error all the same: {', '.join(found)})"
 
 
-# Pairs that are asked for near 1 until the interval of their median is so narrow.
+# Pairs required near 1, until the interval of their median is this narrow.
 MANY, NARROW = 20, 0.04
 
 
@@ -364,7 +364,7 @@ def _near(found: Summary) -> str:
 
 
 def _near_one(results: Results, scene: str) -> str:
-    """Over each of `Results.standard`."""
+    """Efficiency over each of `Results.standard`."""
     return "; ".join(
         f"{said(lambda r=rival: results.fair_efficiency(scene, r), _near)} over {rival}"
         for rival in results.standard_in(scene) or RIVALS
@@ -372,7 +372,10 @@ def _near_one(results: Results, scene: str) -> str:
 
 
 def _worst(results: Results) -> str:
-    """Of the scenes in which a path tracer passes the bias check; those that cannot be judged are named."""
+    """Smallest efficiency over scenes with an unbiased path tracer.
+
+    Names the scenes that cannot be judged.
+    """
     found, others = {}, []
     for scene in results.scenes:
         try:
@@ -395,7 +398,7 @@ def _against_none(results: Results) -> str:
 
 
 def _mean_over_none(results: Results, scenes: list[str]) -> str:
-    """The mean over the scenes that can be judged, by the errors and by the spread over seeds."""
+    """Mean over the judged scenes, by the errors and by the spread over seeds."""
     found = []
     for error in ("rel_mse_trimmed", "spread_trimmed"):
         medians = []
@@ -450,7 +453,7 @@ def _floor(results: Results) -> str:
 
 
 def _values(results, name) -> dict:
-    """What a probe measured of the same software as the rows."""
+    """Return a probe's results for the software of the rows."""
     probe = results.probes.get(name)
     if probe is None:
         raise Refused("not measured")
@@ -490,7 +493,7 @@ OF_A_SCENE = ("efficiency", "efficiency raw", "near one", "alone", "not aimed", 
 
 
 def checked_goals(file: Path, data: dict) -> list[dict]:
-    """The entries [[goal]] of goals.toml; raises ``CommandError`` for what is no goal."""
+    """Return the entries [[goal]] of goals.toml; raises ``CommandError`` if invalid."""
     if not data:
         return []
     goals = list_of(file, "goal", data.get("goal"), dict, "tables: write [[goal]] and the keys of each below")
@@ -511,7 +514,7 @@ def checked_goals(file: Path, data: dict) -> list[dict]:
 
 
 def goals_table(results: Results, goals) -> str:
-    """What is asked for beside what is measured."""
+    """Table of goals and measurements."""
     lines = []
     for goal in goals:
         names = [goal["scene"]] if "scene" in goal else []
@@ -528,7 +531,7 @@ def goals_table(results: Results, goals) -> str:
 
 
 def notes_text(notes: dict) -> str:
-    """Explanations, each with its scenes."""
+    """Format the explanations, each with its scenes."""
     lines = []
     for text in dict.fromkeys(notes.values()):
         scenes = ", ".join(f"`{scene}`" for scene in notes if notes[scene] == text)
@@ -537,7 +540,7 @@ def notes_text(notes: dict) -> str:
 
 
 def replace_part(text: str, name: str, part: str) -> str:
-    """``text`` with what is between the markers of ``name`` replaced; ``ValueError`` without them."""
+    """Replace the text between the markers of ``name``; ``ValueError`` without them."""
     pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
     if len(pattern.findall(text)) != 1:
         raise CommandError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
@@ -545,10 +548,10 @@ def replace_part(text: str, name: str, part: str) -> str:
 
 
 def machine(results: Results) -> str:
-    """Where and with what it was measured.
+    """Describe machine and software of the measurements.
 
-    Raises ``CommandError`` for rows of several machines or versions, and for those of one scene by several
-    sources of the plugin (a scene may be measured anew by itself).
+    Raises ``CommandError`` for rows of several machines or versions, or of one scene by several sources of
+    the plugin.
     """
     found, source_of, scenes = set(), {}, {}
     for row in results.rows:
@@ -572,7 +575,7 @@ MARK = "Made by `mitsuba-bdpt report`"
 
 
 def _introduction(results: Results) -> str:
-    """What the figures are, and where they were measured."""
+    """Introduce the figures, with machine and software."""
     return f"""# Benchmark
 
 {MARK} from the data beside it. Machine and versions: {machine(results)}.
@@ -589,7 +592,7 @@ holds the median in 90 % of cases, not 95 %).
 
 
 def page(results: Results, made: dict, goals: list, notes: dict) -> str:
-    """The page of all tables, as Markdown."""
+    """Return the page of all tables, as Markdown."""
     if unknown := sorted(set(notes) - set(results.scenes)):
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
     parts = [_introduction(results)]
@@ -638,7 +641,7 @@ have in common is left to the package's own tests.
 
 
 def run(options: Namespace) -> int:
-    """Write the report that the command line ``options`` ask for."""
+    """Write the report that the command-line ``options`` request."""
     project = Project(options.project)
     folder = project.results(options.folder)
     check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")

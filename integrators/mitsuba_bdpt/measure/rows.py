@@ -1,4 +1,4 @@
-"""The rows that a sweep leaves: errors of its images, files of cells, tables of all."""
+"""Rows of a sweep: errors of its images, files of cells, tables."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from .scenes import MeasuredScene, digest
 
 
 def cell_file(output: Path, cell: Cell) -> Path:
-    """Where a finished cell lies."""
+    """Return the path of a finished cell."""
     return output / "cells" / f"{cell.key}.json"
 
 
 def image_file(output: Path, cell: Cell) -> Path:
-    """Where its image lies."""
+    """Return the path of its image."""
     return output / "images" / cell.scene / f"{cell.key}.exr"
 
 
 def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
-    """A reference, and the SHA-256 of its file, taken before.
+    """Return a reference, and the SHA-256 of its file, computed before reading.
 
-    Should another one replace it meanwhile, the next run takes the errors anew.
+    If it is replaced meanwhile, the next run computes the errors again.
     """
     path = reference_path(project, scene.name, resolution, depth)
     sha256 = digest(path) if path.exists() else ""
@@ -43,17 +43,17 @@ def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int
 
 
 def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None:
-    """Write the image and the row of a cell, the errors against ``judge`` (see `judge_of`) added."""
+    """Write image and row of a cell, with errors against ``judge`` (see `judge_of`)."""
     write_layers(image_file(output, cell), {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
     found = row | errors(image, *judge, cell.seed == FIRST_SEED)
     write_json(cell_file(output, cell), found)
 
 
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
-    """All measures of an image.
+    """Return all error measures of an image.
 
-    ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not good enough for them.
-    HDR-FLIP takes longer than most renders: only where ``flip``, else None.
+    ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not good enough. HDR-FLIP is
+    slower than most renders: only with ``flip``, else None.
     """
     raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
     own = [ref.share_of(image, trim) for trim in (0.0, metrics.TRIM)]
@@ -80,9 +80,9 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
 
 
 def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
-    """The rows of those cells, ``wanted`` ones of a scene's ``cells``, that are finished.
+    """Return the rows of the finished cells among ``wanted``.
 
-    Their errors are taken anew where the reference is another now.
+    Computes errors again if the reference has changed.
     """
     project, scene, resolution, depth = cells.where()
     path, found = reference_path(project, scene.name, resolution, depth), []
@@ -100,7 +100,7 @@ def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
 
 
 def _image(output: Path, cell: Cell) -> np.ndarray:
-    """That of a finished cell; raises ``CommandError`` if it is gone."""
+    """Read the image of a finished cell; raises ``CommandError`` if it is missing."""
     try:
         (image,), _ = read_layers(image_file(output, cell), "")
     except (OSError, CommandError) as error:
@@ -110,9 +110,9 @@ def _image(output: Path, cell: Cell) -> np.ndarray:
 
 
 def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
-    """The rows of all finished ``cells`` of a scene of the ``preset``, in its order.
+    """Return the rows of all finished cells of a scene, in order.
 
-    (Those that were rendered: the cells of a source that was edited meanwhile have other names.)
+    Cells are those that were rendered: a source edited meanwhile changes their names.
     """
     wanted = {c.key: c for c in cells.planned()}
     if cells.more is not None:
@@ -123,10 +123,10 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
 
 
 def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[dict]) -> dict[str, dict]:
-    """`metrics.spread` of the renders of each integrator and budget, raw and trimmed, by the rows' keys.
+    """Return `metrics.spread` by the rows' keys, for each integrator and budget.
 
-    None where there are fewer than two, several numbers of samples, or no image any more. They are kept in
-    OUTPUT/spreads: reading thousands of images takes minutes.
+    Raw and trimmed; None for fewer than two renders, differing numbers of samples, or missing images. Cached
+    in OUTPUT/spreads, since reading the images is slow.
     """
     there = {row["key"]: row for row in table}
     groups: dict[tuple[str, int], list[Cell]] = {}
@@ -146,7 +146,7 @@ def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[dict]) 
 
 
 def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, dict]) -> dict[str, dict]:
-    """As `_spreads`, of renders that are compared, whose rows are ``there``."""
+    """Like `_spreads`, of the compared cells ``group``, whose rows are ``there``."""
     files = [image_file(output, cell) for cell in group]
     if (
         len(group) < 2
@@ -165,10 +165,7 @@ def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, dict
 
 
 def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:
-    """``table`` and the rows of other scenes that OUTPUT/rows.parquet has, as they are.
-
-    Of the scenes ``order``, and in their order.
-    """
+    """Return ``table`` and stored rows of other scenes, in ``order``."""
     file, done = output / "rows.parquet", {row["scene"] for row in table}
     try:
         others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
@@ -181,7 +178,7 @@ def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:
 
 
 def write_tables(table: list[dict], output: Path) -> None:
-    """rows.csv and rows.parquet, the same columns in both."""
+    """Write rows.csv and rows.parquet, with the same columns."""
     columns = list(dict.fromkeys(key for row in table for key in row))
     table = [{key: row.get(key) for key in columns} for row in table]
     with replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
@@ -190,7 +187,7 @@ def write_tables(table: list[dict], output: Path) -> None:
         writer.writerows(table)
     arrays = pa.Table.from_pylist(table)
     place = columns.index("tile_means")
-    means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits were written
+    means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits, as written
     with replacing(output / "rows.parquet") as temporary:
         pyarrow.parquet.write_table(
             arrays.set_column(place, "tile_means", means), temporary, compression="zstd"

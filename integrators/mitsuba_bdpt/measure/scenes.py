@@ -1,4 +1,4 @@
-"""Scenes as measurements load them, from files and dictionaries: at any size, with any sampler."""
+"""Scenes for measurements, from files and dictionaries, at any size and sampler."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ..media.media import media_of
 
 @dataclass(frozen=True)
 class _Look:
-    """Of a scene its ``integrator``, `has_media`, and the image's ``size``, or why it has none."""
+    """A scene's integrator, `has_media`, and the image's size or why it has none."""
 
     integrator: mi.Integrator
     has_media: bool
@@ -31,19 +31,19 @@ class _Look:
 
 
 class MeasuredScene(ABC):
-    """A scene by its ``name``, under which references and rows are kept."""
+    """A scene with a ``name``, the key of its references and rows."""
 
     name: str
 
     @property
     @abstractmethod
     def called(self) -> str:
-        """What messages call it."""
+        """Name for messages."""
 
     @property
     @abstractmethod
     def sha256(self) -> str:
-        """SHA-256 of all that it consists of, files that it names among it."""
+        """SHA-256 of the scene and of all files that it names."""
 
     @property
     @abstractmethod
@@ -52,14 +52,14 @@ class MeasuredScene(ABC):
 
     @abstractmethod
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        """What Mitsuba's parser makes of it."""
+        """Return the parser's state."""
 
     def _plain(self, definitions: dict) -> mi.Scene:
-        """The scene with its own film and sampler."""
+        """Return the scene with its own film and sampler."""
         return self._instantiated(definitions, None)
 
     def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
-        """The scene, its first sensor's sampler, which keeps its sample count, replaced by another type."""
+        """Return the scene with another type of sampler, of equal sample count."""
         config = mi.parser.ParserConfig(mi.variant())
         config.parallel = False
         state = self._parsed(config, definitions)
@@ -73,14 +73,12 @@ class MeasuredScene(ABC):
         return mi.parser.instantiate(config, state)  # pyright: ignore[reportReturnType]
 
     def load(self, resolution: int | None = None, sampler: str | None = None, **definitions):
-        """The ``mi.Scene`` with an image so many pixels wide and a sampler of the type ``sampler``.
+        """Load the scene, ``resolution`` pixels wide, with a ``sampler`` of this type.
 
-        The image keeps the film's proportions, the sampler is the first sensor's; what is None stays as it
-        is.
-
-        Where a file has parameters ``$resolution`` and ``$sampler`` these are set, as are those of
-        ``definitions``; else film and sampler are changed. Raises ``CommandError`` for a scene without
-        sensor, ``RuntimeError`` (of Mitsuba) for one that cannot be loaded.
+        Keeps the film's aspect ratio; the sampler is that of the first sensor. None keeps the scene's own.
+        Sets the parameters ``$resolution`` and ``$sampler`` if the file has them, as well as ``definitions``;
+        else changes film and sampler. Raises ``CommandError`` for a scene without sensor, ``RuntimeError``
+        (of Mitsuba) for an invalid one.
         """
         asked, known = {"resolution": resolution, "sampler": sampler}, self._parameters
         definitions |= {key: value for key, value in asked.items() if value is not None and key in known}
@@ -93,9 +91,9 @@ class MeasuredScene(ABC):
         return scene
 
     def size(self, resolution: int | None = None) -> tuple[int, int]:
-        """Width and height of the image.
+        """Return width and height of the image.
 
-        Raises ``CommandError`` for a film without colours, which no measure of errors takes.
+        Raises ``CommandError`` for a film without colours.
         """
         own = self._look.size
         if isinstance(own, CommandError):
@@ -104,11 +102,11 @@ class MeasuredScene(ABC):
             return own
         if "resolution" not in self._parameters:
             return _widened(own, resolution)
-        return _size_of(self.load(resolution), self.called)  # the file may set any size by its parameter
+        return _size_of(self.load(resolution), self.called)  # the file may compute the size
 
     @cached_property
     def max_depth(self) -> int:
-        """That of the scene's integrator; -1 (no limit) without one."""
+        """The integrator's ``max_depth``; -1 (no limit) without one."""
         return depth_of(self._look.integrator)
 
     @cached_property
@@ -124,11 +122,11 @@ class MeasuredScene(ABC):
 
     @cached_property
     def _look(self) -> _Look:
-        """What one loading, which may take long, tells of the scene."""
+        """Loads the scene once, which may be slow."""
         scene = self.load()
         try:
             size = _size_of(scene, self.called)
-        except CommandError as error:  # matters to those alone who ask for it
+        except CommandError as error:  # raised only when the size is needed
             size = error
         return _Look(scene.integrator(), has_media(scene), size)
 
@@ -164,10 +162,10 @@ class SceneFile(MeasuredScene):
 
 
 class DictionaryScene(MeasuredScene):
-    """A scene as the ``dictionary`` that ``mi.load_dict`` takes.
+    """A scene as a ``dictionary`` for ``mi.load_dict``.
 
-    Films and samplers are measured at other sizes and of other types than the dictionary's own: it has to
-    hold sensors and films as dictionaries, too. Raises ``CommandError`` for one that does not.
+    Raises ``CommandError`` unless sensors and films are dictionaries too: measurements change their size and
+    sampler.
     """
 
     def __init__(self, name: str, dictionary: Mapping[str, Any]):
@@ -207,14 +205,14 @@ class DictionaryScene(MeasuredScene):
 
 
 def _copied(dictionary: Mapping) -> dict:
-    """A dictionary that does not change when the user changes the one given."""
+    """Copy a dictionary deeply."""
     return {key: _copied(value) if isinstance(value, Mapping) else value for key, value in dictionary.items()}
 
 
 def _bytes_of(value: Any, where: str) -> Iterator[bytes]:
-    """All that makes a ``value`` of a scene dictionary, in its order; ``where`` it stands.
+    """Yield the bytes of a scene dictionary's ``value``; ``where``: its key.
 
-    Raises ``CommandError`` for objects of which it cannot be known whether they are the same another time.
+    Raises ``CommandError`` for objects whose content cannot be hashed.
     """
     if isinstance(value, Mapping):
         for key, held in value.items():
@@ -246,42 +244,39 @@ def _bytes_of(value: Any, where: str) -> Iterator[bytes]:
 
 
 def digest(*paths: Path) -> str:
-    """SHA-256 of files, one after the other."""
+    """Return the SHA-256 of concatenated files."""
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
 def has_media(scene: mi.Scene) -> bool:
-    """Whether rays of a scene can be in a medium: some sensor is in one, or some shape bounds one."""
+    """Return whether a sensor is in a medium, or a shape bounds one."""
     return bool(media_of(scene, scene.sensors()))
 
 
 def path_tracers(media: bool) -> tuple[str, ...]:
-    """Types of Mitsuba's path tracers that render a scene with or without media (`has_media`) as it is.
+    """Return Mitsuba's path tracers for a scene with or without media (`has_media`).
 
-    `path` sees no media; without them the others are the same path tracer, but slower.
+    `path` ignores media; without media the others are slower.
     """
     return ("volpath", "volpathmis") if media else ("path",)
 
 
 def depth_of(integrator) -> int:
-    """The ``max_depth`` of an integrator, which Mitsuba's own tell in their text alone; -1 without one."""
+    """Return an integrator's ``max_depth``; -1 without one. Mitsuba's only print it."""
     depth = getattr(integrator, "max_depth", None)
     if depth is None:
         found = re.search(r"\bmax_depth = (\d+)", str(integrator))
         depth = int(found[1]) if found else -1
-    return depth if depth < 2**31 else -1  # Mitsuba's own hold -1 without a sign
+    return depth if depth < 2**31 else -1  # Mitsuba's unlimited depth is unsigned
 
 
 def integrator_of(parameters: dict, depth: int):
-    """The plugin with these ``parameters``, ``type`` among them, at the ``max_depth`` of the scene."""
+    """Return the plugin with ``parameters`` (with ``type``) at ``max_depth``."""
     return mi.load_dict({"max_depth": depth} | parameters)
 
 
 def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) -> None:
-    """Raise ``CommandError`` if a plugin or its sampler cannot be made.
-
-    The plugin has these ``parameters`` and is called ``name``; ``sampler`` is the sampler's type.
-    """
+    """Raise ``CommandError`` if the plugin ``name`` or its ``sampler`` is invalid."""
     for what, make in (
         (f"integrator {name!r}", lambda: integrator_of(parameters, depth)),
         (f"sampler of {name!r}", lambda: mi.load_dict({"type": sampler}) if sampler else None),
@@ -294,7 +289,7 @@ def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) 
 
 
 def _size_of(scene: mi.Scene, called: str) -> tuple[int, int]:
-    """Width and height of the first sensor's image; raises ``CommandError`` as `MeasuredScene.size`."""
+    """Return width and height of the first sensor; raises like `MeasuredScene.size`."""
     film = choose_sensor(scene, 0).film()
     if film.base_channels_count() < 3:
         raise CommandError(
@@ -306,12 +301,12 @@ def _size_of(scene: mi.Scene, called: str) -> tuple[int, int]:
 
 
 def _widened(size: tuple[int, int], width: int) -> tuple[int, int]:
-    """A film's ``size`` made so many pixels wide."""
+    """Scale a film's ``size`` to a width."""
     return width, max(round(width * size[1] / size[0]), 1)
 
 
 def _resize(scene, width: int) -> None:
-    """Make the first sensor's film so many pixels wide, in its proportions, without a crop window."""
+    """Scale the first sensor's film to a width, without crop window."""
     old_width, old_height = choose_sensor(scene, 0).film().size()
     size = list(_widened((int(old_width), int(old_height)), width))
     changed = mi.traverse(scene.sensors()[0])
@@ -322,7 +317,7 @@ def _resize(scene, width: int) -> None:
 
 
 def _replace_sampler(nodes, sensor, kind: str) -> None:
-    """Give a ``sensor``, one of the ``nodes`` of a scene file, a sampler of another ``kind``."""
+    """Replace the sampler of ``sensor``, one of the ``nodes``, by another ``kind``."""
     properties = mi.Properties(kind)
     for key in sensor.props.keys():
         held = sensor.props[key]
@@ -336,14 +331,14 @@ def _replace_sampler(nodes, sensor, kind: str) -> None:
                 return
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Sampler, properties
-    # Before the list grows: what Python holds of its entries is then no longer there.
+    # Before the list grows, which invalidates Python's references to its entries.
     sensor.props["sampler"] = mi.Properties.ResolvedReference(len(nodes))
     nodes.append(node)
 
 
 @contextmanager
 def _names_resolved_beside(file: Path):
-    """Mitsuba looks for meshes and textures beside the ``file`` first."""
+    """Within, Mitsuba searches meshes and textures beside ``file`` first."""
     former = mi.file_resolver()
     own = mi.FileResolver(former)
     own.prepend(str(file.resolve().parent))

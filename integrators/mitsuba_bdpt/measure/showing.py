@@ -1,6 +1,6 @@
-"""How far a measurement is: a bar on standard error, as from the command render.
+"""Progress bars of measurements on standard error.
 
-Silent where that is no terminal. Words of the command itself belong before or after a bar, not inside.
+Silent elsewhere than on a terminal. Print before or after a bar, not inside.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 def bar() -> Progress:
-    """A bar that counts steps."""
+    """Return a bar that counts steps."""
     console = Console(stderr=True)
-    text = TextColumn("{task.description}", markup=False)  # names of integrators may hold brackets
+    text = TextColumn("{task.description}", markup=False)  # names of integrators may contain brackets
     columns = text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 @contextmanager
 def steps(total: int) -> Iterator[Callable[[str], None]]:
-    """A `bar` of so many steps; the result is to be called with a description where each begins."""
+    """A `bar` of ``total`` steps; call the result with a description at each step."""
     with bar() as shown:
         task, done = shown.add_task("", total=total), count()
         yield lambda text: shown.update(task, description=text, completed=next(done))
@@ -31,7 +31,7 @@ def steps(total: int) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def amount(text: str, total: float) -> Iterator[Callable[[float], None]]:
-    """As `steps`, of an amount such as seconds or samples; the result is to be called with what is done."""
+    """Like `steps`, for seconds or samples; call the result with the amount done."""
     with bar() as shown:
         task = shown.add_task(text, total=round(total))
         yield lambda done: shown.update(task, completed=min(round(done), round(total)))

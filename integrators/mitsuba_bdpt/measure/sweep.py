@@ -1,15 +1,15 @@
-"""Sweeps of run time against error: scenes x integrators x samples x seeds, one row per render.
+"""Sweeps of run time against error: scenes x integrators x samples x seeds.
 
-Presets (see `preset`) say what is rendered. For each scene, budget and seed all integrators follow one
-another, so that a noisy machine is noisy for all. Every finished render is a file of its own in OUTPUT/cells,
-named after a hash of all that determines it (parameters, scene, versions, the plugin's source), and is not
-rendered again; its image lies in OUTPUT/images. A cell that fails is reported and tried again the next time,
-and so is a scene of which no reference can be made. Errors are taken against the references of `making`,
-which are made first where there are none, and anew when a reference has become better; HDR-FLIP for the first
-seed alone, since it takes longer than most renders. On a cluster, renders that follow one another go to one
-worker together, which renders them one after the other; workers see the project under the same path, and have
-the same software. Probes are left out there.
-OUTPUT/rows.csv and OUTPUT/rows.parquet hold all rows of the preset, OUTPUT/probes.json what `probes` measure.
+A preset (see `preset`) names the renders. For each scene, budget and seed the integrators run consecutively,
+so that noise of the machine affects all. Each finished render is a file in OUTPUT/cells, named by a hash of
+all that determines it (parameters, scene, versions, the plugin's source), and is not repeated; its image is
+in OUTPUT/images. Failed cells, and scenes without reference, are reported and tried again by the next run.
+Errors are against the references of `making`, which are made first if missing; they are computed again when a
+reference changes. HDR-FLIP is computed for the first seed only, since it is slow.
+
+On a cluster, consecutive renders go to one worker; workers need the project under the same path, and the same
+software. Probes are left out there. OUTPUT/rows.csv and OUTPUT/rows.parquet have all rows, OUTPUT/probes.json
+the results of `probes`.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from .scenes import check_plugins
 
 
 class Sweep:
-    """A preset being rendered into a folder; ``failed``: what went wrong, a text each."""
+    """A preset being rendered into a folder; ``failed``: messages of failures."""
 
     def __init__(self, project: Project, preset: Preset, output: Path):
         self.project, self.preset, self.output, self.failed = project, preset, output, []
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
         self._judges, self._tried = {}, set()
-        self._progress, self._task = Progress(), TaskID(0)  # those of `run`, until then shown nowhere
+        self._progress, self._task = Progress(), TaskID(0)  # placeholders until `run`
 
     def prepare(self, seconds: float):
-        """Complain of what cannot be rendered, and make references that are missing.
+        """Check all cells, and make missing references, before rendering.
 
-        Before hours of rendering, not after; each reference for at most about so many ``seconds``. A scene
-        without one is left out, and noted in ``failed``: one scene must not cost the others.
+        Each reference takes at most about ``seconds``. A scene without one is skipped, and recorded in
+        ``failed``.
         """
         wanted = [(cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing]
         for cells, missing in wanted:
@@ -74,12 +74,12 @@ class Sweep:
         self.scenes, self._todo = [self.scenes[i] for i in kept], [self._todo[i] for i in kept]
 
     def _note(self, what: str, error: Exception):
-        """Keep a failure for the end; raises ``KeyboardInterrupt`` if it is none."""
+        """Record a failure; re-raises ``KeyboardInterrupt``."""
         raise_interrupt(error)
         self.failed.append(f"{what}: {' '.join(message(error).split())}")
 
     def rows(self) -> list[dict]:
-        """The rows of all finished cells; scenes of which they cannot be read are noted in ``failed``."""
+        """Return the rows of finished cells; unreadable scenes are recorded in ``failed``."""
         found = []
         for cells in self.scenes:
             try:
@@ -89,9 +89,9 @@ class Sweep:
         return found
 
     def run(self, progress: Progress, elsewhere=None):
-        """Render all that is not there yet, showing ``progress``.
+        """Render the missing cells, showing ``progress``.
 
-        On a cluster if ``elsewhere``, a `workers.Cluster` and the preset's text, is given.
+        ``elsewhere``: a `workers.Cluster` and the preset's text, to render on a cluster.
         """
         scenes, todo = self.scenes, self._todo
         probed = 0 if elsewhere else len(self.preset.probes)
@@ -118,16 +118,16 @@ class Sweep:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
                     kept[name] = key | {"values": probes.PROBES[name](self.project, rounds)}
                     write_json(file, kept)
-            except Exception as error:  # a probe must not cost the cells
+            except Exception as error:  # a probe must not end the sweep
                 self.failed.append(f"{name}: {error}")
             self._progress.advance(self._task)
 
     def _cell(self, bench: Bench, cell: Cell):
-        """Render a cell here."""
+        """Render a cell in this process."""
         self._progress.update(self._task, description=_description(cell))
         try:
             self._store(bench.cells, cell, measure(bench, cell))
-        except Exception as error:  # one cell must not cost the others
+        except Exception as error:  # one cell must not end the others
             self._note(_description(cell), error)
         self._progress.advance(self._task)
 
@@ -137,7 +137,7 @@ class Sweep:
         store(self.output, cell, *result, self._judges[cells.where()])
 
     def _remote(self, cluster, preset: str, scenes: list[Cells], todo: list[list[Cell]]):
-        """Render the cells of ``todo``, and those that follow from them, on a cluster."""
+        """Render the cells of ``todo``, and those that follow, on a cluster."""
         root = str(self.project.root.resolve())
         while any(
             todo := [missing or self._more(cells) for cells, missing in zip(scenes, todo, strict=True)]
@@ -162,7 +162,7 @@ class Sweep:
             todo = [[] for _ in scenes]
 
     def _more(self, cells: Cells) -> list[Cell]:
-        """The cells of a further seed, none if the interval is narrow enough, or there are enough of them."""
+        """Return the cells of a further seed; none if narrow enough or at the limit."""
         more, seeds = cells.more, cells.fewest()
         if more is None:
             return []
@@ -170,7 +170,7 @@ class Sweep:
             seeds += 1
         found = [c for seed in range(seeds) for c in cells.further(seed)]
         if not self._are_there(found):
-            return []  # one of them failed
+            return []  # a failed cell
         try:
             names = dict.fromkeys(cell.method for cell in cells.of(more.spp, FIRST_SEED, more.methods))
             widths = analysis.widths(read_rows(self.output, cells, found), list(names))
@@ -181,7 +181,7 @@ class Sweep:
             return []
         missing = [c for c in cells.further(seeds) if not self._is_there(c)]
         if not self._tried.isdisjoint(keys := {c.key for c in missing}):
-            return []  # one of them failed
+            return []  # a failed cell
         self._tried |= keys
         total = self._progress.tasks[self._task].total or 0
         self._progress.update(self._task, total=total + len(missing))
@@ -199,7 +199,7 @@ def _description(cell: Cell) -> str:
 
 
 def chosen(preset: Preset, names) -> Preset:
-    """The part of a preset about the scenes ``names``, without probes; raises ``CommandError`` for others."""
+    """Return a preset of some scenes, without probes; ``CommandError`` if unknown."""
     known = [subject.name for subject in preset.subjects]
     for name in names:
         if name not in known:
@@ -209,9 +209,9 @@ def chosen(preset: Preset, names) -> Preset:
 
 
 def poor_reference(cells: Cells, table: list[dict]) -> list[str]:
-    """What the report will refuse of the rows of a scene since its reference is too poor.
+    """Return messages about rows that the reference is too noisy for.
 
-    In its words, with the command that goes on with the reference.
+    Each with the command that refines the reference.
     """
     rows = analysis.select(table, scene=cells.subject.name)
     if not rows:
@@ -233,7 +233,7 @@ def poor_reference(cells: Cells, table: list[dict]) -> list[str]:
 
 
 def short_of_target(table: list[dict]) -> list[str]:
-    """A text about each integrator of which renders ended before they reached the preset's target error."""
+    """Return messages about integrators that ended before the preset's target error."""
     renders = {}
     for row in table:
         target = json.loads(row["parameters"]).get("target_error", 0)
@@ -250,7 +250,7 @@ def short_of_target(table: list[dict]) -> list[str]:
 
 
 def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[list[dict], list[str]]:
-    """Render what is missing of a ``preset`` and print how that went; all rows, and what failed."""
+    """Render the missing cells of a ``preset``; returns all rows, and failures."""
     if options.scheduler and project.given:
         raise CommandError(
             f"scheduler={options.scheduler} with scene={next(iter(project.given))!r}, a dictionary, is not "
@@ -260,7 +260,7 @@ def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[li
     output = options.output or project.root / "results" / file.stem
     whole = read_preset(file, project)
     part = chosen(whole, options.scenes) if options.scenes else whole
-    check_output(output / "rows.csv", ".csv")  # complain before hours of rendering, not after
+    check_output(output / "rows.csv", ".csv")  # fail before rendering
     sweep = Sweep(project, part, output)
     sweep.prepare(options.reference_seconds)
     with showing.bar() as progress:
@@ -282,7 +282,7 @@ def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[li
 
 
 def run(options: Namespace) -> int:
-    """Sweep as the command line ``options`` say; the exit status is 1 if a cell or a scene failed."""
+    """Sweep as the command-line ``options`` request; returns 1 if anything failed."""
     mi.set_variant(VARIANT)
     _, failed = swept(Project(options.project), options.preset, options)
     return 1 if failed else 0

@@ -1,4 +1,4 @@
-"""Markdown tables, and how their figures are written."""
+"""Formats Markdown tables and their figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from .efficiency import refused_share
 
 
 def table(head, rows) -> str:
-    """A Markdown table; bars and ends of lines in a name or a text do not end a cell."""
+    """Return a Markdown table; escapes bars and line ends."""
     lines = [head, ["---"] * len(head), *rows]
     return "".join("| " + " | ".join(map(_cell, line)) + " |\n" for line in lines)
 
@@ -17,17 +17,17 @@ def _cell(text: str) -> str:
 
 
 def ratio(x: float) -> str:
-    """A ratio with three digits."""
+    """Format a ratio with three digits."""
     return f"{x:.3g}x" if x < 999.5 else f"{round(x, -1):.0f}x"
 
 
 def ranged(found: Summary) -> str:
-    """Median (smallest–largest)."""
+    """Format median (smallest–largest)."""
     return f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]})"
 
 
 def said(figure, form=ranged) -> str:
-    """Format a figure, or the reason for which there is none."""
+    """Format a figure, or the reason why there is none."""
     try:
         return form(figure())
     except NotJudged as why:

@@ -1,6 +1,6 @@
-"""The one stopwatch of the scripts for renders in this process: seconds of a whole one.
+"""Times whole renders in this process.
 
-What a new process takes is measured in that process, see `probes`.
+For times of a new process see `probes`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def timed(scene, integrator, spp: int, seed: int) -> tuple[np.ndarray, float]:
-    """Image (height, width, 3) and wall seconds of a render, of nothing that was queued before it."""
+    """Return image (height, width, 3) and wall seconds of a render."""
     dr.sync_thread()
     started = time.perf_counter()
     image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)
