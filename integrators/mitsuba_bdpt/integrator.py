@@ -278,7 +278,6 @@ NO_DERIVATIVES = (
 
 
 def _result(film, develop: bool, evaluate: bool) -> mi.TensorXf:
-    """Return the result of ``mi.Integrator.render``."""
     if develop:
         result = film.develop()
         dr.schedule(result)

@@ -45,7 +45,6 @@ def share_done(report: Report, limit: float | None = None) -> float:
 
 
 def seconds_left(report: Report, limit: float | None = None) -> float:
-    """Return the expected remaining seconds."""
     left = report.seconds * (report.spp_total / max(report.spp_done, 1e-9) - 1)
     return max(0.0, min(left, limit - report.seconds)) if limit else left
 

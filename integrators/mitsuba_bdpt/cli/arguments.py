@@ -83,7 +83,6 @@ class Parser(argparse.ArgumentParser):
         return removed.remedy(name) or did_you_mean(name, known)
 
     def add_command(self, name: str, help_text: str) -> Parser:
-        """Return the parser of a new command."""
         if self._subparsers_action is None:
             self._subparsers_action = self.add_subparsers(dest="command", required=True, metavar="COMMAND")
         made = self._subparsers_action.add_parser(
@@ -93,12 +92,10 @@ class Parser(argparse.ArgumentParser):
         return made
 
     def _commands_with(self, option: str) -> list[str]:
-        """Return the commands that have this ``option``."""
         return [name for name, parser in self._commands.items() if option in parser._options] or [self.prog]
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
     parser = Parser(
         prog="mitsuba_bdpt",
         description="Bidirectional path tracing for Mitsuba 3.",
@@ -170,7 +167,6 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_render_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of ``render``."""
     add_scene_arguments(parser)
     add = parser.add_argument
     text = "EXR file to write, a PNG comes beside it, folders are made; default: renders/SCENE.exr"

@@ -439,7 +439,6 @@ def plain(value):
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float) -> str:
-    """Return the closing line."""
     width, height = size
     parts = [
         f"{output}: {outcome.seconds:.1f} s",

@@ -25,8 +25,6 @@ def number(kind: type, least: float, most: float = math.inf) -> Callable[[str], 
 
 
 def within(bounds: Number) -> Callable[[str], float]:
-    """Return an argparse type: a number within ``bounds``."""
-
     def parse(text: str) -> float:
         with contextlib.suppress(ValueError):
             if bounds.holds(value := bounds.kind(text)):
@@ -73,7 +71,6 @@ def frames(text: str) -> list[int]:
 
 
 def resume(text: str) -> str:
-    """One of `RESUME`."""
     if text not in RESUME:
         scene = "; write the scene before --resume" if text.lower().endswith(".xml") else ""
         raise argparse.ArgumentTypeError(f"got {text!r}, which must be {', '.join(RESUME)} or nothing{scene}")

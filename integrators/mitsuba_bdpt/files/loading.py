@@ -231,7 +231,6 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
 
 
 def _films(state: mi.parser.ParserState) -> list:
-    """Return the nodes of all films."""
     return [node for node in state.nodes if node.type == mi.ObjectType.Film]
 
 
@@ -555,7 +554,6 @@ def integrator_properties(
 
 
 def choose_sensor(scene: mi.Scene, index: int) -> mi.Sensor:
-    """Return the sensor with this `index`."""
     sensors = scene.sensors()
     if not sensors:
         raise CommandError("The scene has no sensor; add one to the scene file.")

@@ -57,12 +57,10 @@ class Channels:
 
     @property
     def of_features(self) -> slice:
-        """Slice of the features."""
         return slice(self.weight + 1, self.weight + 1 + self.features)
 
     @property
     def of_stokes(self) -> slice:
-        """Slice of the Stokes channels."""
         return slice(self.of_features.stop, self.of_features.stop + self.stokes)
 
     @property
@@ -131,7 +129,6 @@ class Accumulator:
 
     @property
     def alpha(self) -> bool:
-        """Whether the film keeps alpha."""
         return bool(self._channels.alpha)
 
     def put_camera(self, position, values, active):

@@ -42,8 +42,6 @@ class MappedNormals:
 
 
 class _Map:
-    """A bump or normal map."""
-
     def __init__(self, bsdf: mi.BSDF):
         self.bsdf, self._flips = bsdf, _flips(bsdf)
         self.bumps = bsdf.class_name() == "BumpMap"

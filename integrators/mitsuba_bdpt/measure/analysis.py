@@ -82,7 +82,6 @@ def summary(values) -> Summary:
 
 
 def select(rows, **wanted) -> list[dict]:
-    """Return the rows with these values."""
     return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
 
 
@@ -221,7 +220,6 @@ def bias(rows, reference: Means) -> BiasCheck:
 
 
 def geometric_mean(values) -> float:
-    """exp(mean(log))."""
     return math.exp(float(np.mean(np.log(values))))
 
 

@@ -35,13 +35,11 @@ class Bench:
         self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
 
     def scene(self, sampler: str):
-        """Return the scene with that sampler."""
         if sampler not in self._scenes:
             self._scenes[sampler] = self._file.load(self._resolution, sampler)
         return self._scenes[sampler]
 
     def integrator(self, cell: Cell):
-        """Return the integrator of a cell."""
         if cell.parameters not in self._integrators:
             self._integrators[cell.parameters] = integrator_of(dict(cell.parameters), self._depth)
         return self._integrators[cell.parameters]

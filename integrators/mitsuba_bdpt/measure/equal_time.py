@@ -52,7 +52,6 @@ class Shot:
 
     @property
     def caption(self) -> str:
-        """Caption of the image."""
         return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.rel_mse:.2g} (trimmed)"
 
 

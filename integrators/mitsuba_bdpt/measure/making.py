@@ -158,7 +158,6 @@ class Job:
 
     @cached_property
     def depth(self) -> int:
-        """The ``max_depth``."""
         return self.max_depth or self.project.depth(self.scene)
 
     @property
@@ -300,7 +299,6 @@ def _same(stored: Reference, **wanted) -> bool:
 
 
 def provenance_of(job: Job, **more) -> dict:
-    """Return the provenance of a reference, with ``more``."""
     return {
         "scene": job.scene.name,
         "scene_sha256": job.scene_sha256,

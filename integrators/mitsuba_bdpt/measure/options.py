@@ -106,7 +106,6 @@ class Options:
 
 
 def options_of(kind: type) -> list[Field]:
-    """Return the fields of a dataclass of options."""
     return [found for found in fields(kind) if "bounds" in found.metadata]
 
 

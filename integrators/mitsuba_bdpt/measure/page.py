@@ -168,7 +168,6 @@ def lines(results: Results) -> list[list]:
 
 
 def plots(results: Results) -> str:
-    """Return the plots, embedded."""
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / f"{name}.png" for name in PLOTS}
         if results.rivals:
@@ -185,7 +184,6 @@ def plots(results: Results) -> str:
 
 
 def page(folder: Path, results: Results, made: dict) -> str:
-    """The whole page."""
     data = {
         "columns": list(COLUMNS),
         "rows": lines(results),

@@ -76,7 +76,6 @@ class Method:
     seeds: int | None
 
     def takes_part_in(self, scene: MeasuredScene) -> bool:
-        """Return whether it renders a scene."""
         if self.scenes is not None and scene.name not in self.scenes:
             return False
         return self.media is None or self.media == scene.has_media
@@ -93,7 +92,6 @@ class Subject:
 
     @property
     def name(self) -> str:
-        """That of the scene."""
         return self.scene.name
 
 
@@ -115,8 +113,6 @@ class More:
 
 @dataclass(frozen=True)
 class Preset:
-    """A sweep."""
-
     subjects: tuple
     methods: tuple
     resolution: int
@@ -155,7 +151,6 @@ def _names(path, key, value) -> list[str]:
 
 
 def _methods(path, entries, scenes) -> tuple:
-    """Return the integrators of a preset."""
     list_of(path, "integrator", entries, dict, "tables: write [[integrator]] and the keys of each below")
     methods = tuple(_method(path, dict(entry), scenes) for entry in entries)
     if len({m.name for m in methods}) < len(methods):

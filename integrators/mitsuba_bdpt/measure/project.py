@@ -34,12 +34,10 @@ class Project:
 
     @property
     def scenes(self) -> Path:
-        """Folder of named scenes."""
         return self.root / "scenes"
 
     @property
     def references(self) -> Path:
-        """Folder of reference images."""
         return self.root / "references"
 
     @property
@@ -48,7 +46,6 @@ class Project:
         return self.root / "renders"
 
     def scene_names(self) -> list[str]:
-        """Return the names of scenes."""
         return sorted(path.stem for path in self.scenes.glob("*.xml"))
 
     def scene(self, name: str) -> MeasuredScene:

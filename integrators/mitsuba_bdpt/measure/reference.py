@@ -61,7 +61,6 @@ class Reference:
 
 
 def reference_path(project: Project, name: str, resolution: int, max_depth: int) -> Path:
-    """Return the path of a scene's reference."""
     return project.references / f"{name}_{resolution}_{max_depth}.exr"
 
 

@@ -105,7 +105,6 @@ def efficiency_table(results: Results) -> str:
 
 
 def _efficiencies(results: Results, rivals, scenes) -> str:
-    """Return a part of `efficiency_table`."""
     head = ["scene", *(f"over {rival}, {kind}" for rival in rivals for kind in ("trimmed", "raw"))]
     with_all = NONE in results.methods[1:]
     head += [f"over {NONE}, trimmed"] * with_all
@@ -173,7 +172,6 @@ def gallery(results: Results) -> str:
 
 
 def estimate(x) -> str:
-    """Format value (interval)."""
     return f"{x.value:.2f} ({x.low:.2f} to {x.high:.2f})"
 
 
@@ -323,7 +321,6 @@ def _maker(kept) -> str:
 
 
 def references_table(made: dict) -> str:
-    """Table of the references."""
     head = ["scene", "max_depth", "by", "samples per pixel", "own relMSE", "epsilon of relMSE"]
     lines = []
     for scene, kept in made.items():

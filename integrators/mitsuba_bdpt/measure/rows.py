@@ -23,12 +23,10 @@ from .scenes import MeasuredScene, digest
 
 
 def cell_file(output: Path, cell: Cell) -> Path:
-    """Return the path of a finished cell."""
     return output / "cells" / f"{cell.key}.json"
 
 
 def image_file(output: Path, cell: Cell) -> Path:
-    """Return the path of its image."""
     return output / "images" / cell.scene / f"{cell.key}.exr"
 
 

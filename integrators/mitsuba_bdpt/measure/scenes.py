@@ -205,7 +205,6 @@ class DictionaryScene(MeasuredScene):
 
 
 def _copied(dictionary: Mapping) -> dict:
-    """Copy a dictionary deeply."""
     return {key: _copied(value) if isinstance(value, Mapping) else value for key, value in dictionary.items()}
 
 

@@ -197,12 +197,10 @@ class Render:
             self.decide()
 
     def _use_plan(self):
-        """Use the present plan from now on."""
         if self.kernel.plan is not self.plan:
             self.kernel = self._kernel()
 
     def _kernel(self) -> Kernel:
-        """Return the kernel of the present plan."""
         kernel = Kernel(self.prepared, self.plan, self.settings, mis.Heuristic(self.settings.heuristic))
         if self.planner.threshold and self.plan.roulette:
             kernel.set_threshold(dr.opaque(mi.Float64, self.planner.threshold))
@@ -345,7 +343,6 @@ class Render:
         return image
 
     def _identity(self) -> dict:
-        """Return `snapshot.identity` of this render."""
         return identity(self.settings, self.accumulator, int(self.points.seed[0]), self.spp)
 
     def resume(self, snapshot: Snapshot, apart_from=()):
