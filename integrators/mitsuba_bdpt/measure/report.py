@@ -229,7 +229,7 @@ def _chosen(row) -> str:
 
 
 def _pilot_share(row) -> float:
-    """Return the share of pilots and decisions in a scene's first render."""
+    """Return the pilots' share of a scene's first render; later ones reuse them."""
     first = row.get("seconds_pilot")
     if first is None:
         raise Refused("rows of a version that remembered no pilots")

@@ -332,7 +332,7 @@ class Render:
         return Snapshot(self._identity(), passes, progress, arrays)
 
     def _image(self, reported: int):
-        """Return the image of the report after ``reported`` passes; raises as `_snapshot`."""
+        """Return the image of the report after ``reported`` passes; see `_snapshot`."""
         if len(self.passes) != reported:
             raise UsageError(
                 f"image() of the report after {reported} passes came too late; only the newest report has one"
