@@ -70,7 +70,7 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
 
 # A candidate whose sample costs c times as much has to gain c^CAUTION, since predictions are inexact; see
 # experiments, "Choice of strategies".
-CAUTION = 0.3
+CAUTION = 0.15
 
 # `certainty` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
