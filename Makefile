@@ -100,7 +100,7 @@ same: $(INSTALLED)
 	$(VENV)/bin/python scripts/versus.py $(BEFORE) --same --pairs 1 --spp 16
 	$(VENV)/bin/python scripts/stress.py --same $(wildcard $(BEFORE)/docs/stress.json $(BEFORE)/docs/reports/stress.json)
 
-# Planted bugs, and whether the tests see them: half an hour.
+# Planted bugs, and whether the tests see them: an hour.
 mutants: $(INSTALLED)
 	$(VENV)/bin/python scripts/mutants.py
 

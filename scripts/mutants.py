@@ -1,6 +1,6 @@
 """Plants bugs in a copy of the package, one at a time, and checks that the tests see them.
 
-    python scripts/mutants.py                  # all, half an hour
+    python scripts/mutants.py                  # all, an hour
     python scripts/mutants.py hidden adjoint   # those with such a word in their name
     python scripts/mutants.py --list           # what is replaced by what
     python scripts/mutants.py --unchanged      # the same tests on a copy without bugs: they have to pass
