@@ -44,6 +44,7 @@ from ..transport.kernel import trace
 from ..transport.plan import Plan
 from . import emission, isolated, moments
 from .configuration import WEIGHTINGS, Weighting
+from .even_sky import UNIFORM
 from .moments import FINE, GROUPS, PER_PIXEL, SAMPLE, SPLAT, SUMS, Isolated, Layout, Moments, tile_of
 
 if TYPE_CHECKING:
@@ -326,6 +327,7 @@ def measure(
         found = replace(found, isolated=found.isolated[:, :0])
     known = {"kinds": prepared.traits.asked.kinds, "far": prepared.emitters.far_share}
     known["media"] = float(prepared.space is not None)
+    known["uniform"] = float(prepared.emitters.contrast <= UNIFORM)
     return replace(found, rays=found.rays | known)
 
 
