@@ -65,10 +65,6 @@ if TYPE_CHECKING:
 # experiments, "Choice of strategies".
 RAREST = 1024
 
-# The same bound in a render of up to SHORT samples: favours the trimmed error, which is what a preview shows,
-# over the mean error of many renders. See experiments, "Choice of strategies", short renders.
-SHORT, RAREST_IN_SHORT = 1 << 18, 16
-
 # Factor of the squared size of a path that a weighting cannot sample; `moments.RULED_OUT` then rules out
 # weightings that miss a millionth of a pixel or more. Smaller misses must pass: rounding leaves cosines of
 # 1e-20 between points of one plane, and densities that are 0 in single precision.
@@ -268,11 +264,6 @@ class Pilot:
         return dr.select(c.active & (c.s + c.t > 2), mi.Float64(_mean_colour(c)), 0)
 
 
-def rarest(stands_for: float, lanes: int) -> float:
-    """See `RAREST`; each of ``lanes`` represents ``stands_for`` samples of the render."""
-    return RAREST_IN_SHORT if stands_for * lanes <= SHORT else max(stands_for, RAREST)
-
-
 def measure(
     prepared: PreparedScene,
     plan: Plan,
@@ -298,7 +289,7 @@ def measure(
         kappa_direct=1.0,
         roulette=False,
     )
-    all_lanes, kernel = lanes, Kernel(prepared, everything, settings, mis.ByClass())
+    kernel = Kernel(prepared, everything, settings, mis.ByClass())
     found = None
     guiding = guiding and everything.guidable
     if guiding:
@@ -316,7 +307,7 @@ def measure(
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
-    pilot = Pilot(region, batch, rarest(stands_for, all_lanes), prepared.space is not None, listener)
+    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None, listener)
     # Samples outside nets use independent numbers: products of samples give the squared mean.
     points = Points(settings.points, seed)
     counts = trace(kernel, pilot, batch, points, samples)
