@@ -52,7 +52,7 @@ def pictures(folder: Path, spp: int) -> None:
     import matplotlib.pyplot as plt
 
     mi.set_variant("llvm_ad_spectral_polarized")
-    method = mi.load_dict({"type": "bdpt", "max_depth": 8, "stokes": True})
+    method = mi.load_dict({"type": "bdpt", "max_depth": 8, "layers": "stokes"})
     image = np.array(method.render(mi.load_string(TABLE, parallel=False), spp=spp, seed=0))
     shown = np.clip(image[..., :3], 0, None)
     exposed = np.clip(shown / np.quantile(shown, 0.97), 0, 1) ** (1 / 2.2)

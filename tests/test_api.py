@@ -51,7 +51,7 @@ def test_statistics_are_of_their_declared_type():
     """Expected: a render's statistics have all keys that `Statistics` requires, no others than it declares,
     and values of the declared types.
     """
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2, "variance": True, "skip": "impossible"})
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2, "layers": "variance", "skip": "impossible"})
     scene = mi.cornell_box()
     scene["sensor"]["film"].update(width=8, height=8)
     integrator.render(mi.load_dict(scene), spp=8, develop=False)

@@ -106,9 +106,9 @@ def image(bdpt, scene, **keywords):
         ({"spp_per_pass": -1}, "spp_per_pass=-1"),
         ({"timeout": "soon"}, "timeout='soon'"),
         ({"timeout": float("nan")}, "timeout=nan"),
-        ({"strategy_images": True}, "strategy_images.*max_depth"),
-        ({"strategy_images": True, "max_depth": 0}, "strategy_images.*max_depth"),
-        ({"strategy_images": "yes"}, "strategy_images='yes'"),
+        ({"layers": "strategies"}, "layers=strategies.*max_depth"),
+        ({"layers": "strategies", "max_depth": 0}, "layers=strategies.*max_depth"),
+        ({"merging": "yes"}, "merging='yes'"),
         ({"max_deph": 3}, "max_deph=3 is not a parameter; did you mean max_depth.*rr_depth"),
         ({"samples_per_pass": 3}, "samples_per_pass=3.*use spp_per_pass"),
         ({"lightImage": False}, "lightImage=False is not a parameter; it is of Mitsuba 0.6.*light_paths=0"),
@@ -146,7 +146,7 @@ def test_defaults():
     s = bdpt.settings
     assert (bdpt.max_depth, bdpt.rr_depth, s.hide_emitters, s.heuristic) == (-1, 5, False, "balance")
     assert (s.skip, s.light_paths, s.connections, s.points) == ("auto", "auto", "auto", "sobol")
-    assert (s.strategy_images, s.spp_per_pass, s.timeout) == (False, 0, -1)
+    assert (s.layers, s.spp_per_pass, s.timeout) == ((), 0, -1)
     assert bdpt.statistics == {}
     assert "max_depth = -1" in str(integrator()) and "skip = none" in str(integrator(skip="none"))
 
@@ -789,7 +789,7 @@ def test_strategy_images_name_every_strategy():
     """Expected: weighted and unweighted RGB layers for each (s, t) up to max_depth, k + 2 of each length
     k, in the film and in aov_names(); weighted ones add up to the image (1e-4).
     """
-    bdpt = integrator(max_depth=3, strategy_images=True, skip="none")
+    bdpt = integrator(max_depth=3, layers="strategies", skip="none")
     names = bdpt.aov_names()
     expected = {
         f"{kind}.s{s}t{k + 1 - s}.{c}"
@@ -810,7 +810,7 @@ def test_strategy_images_name_every_strategy():
 
 def test_strategy_images_check_their_memory():
     """Expected: refused in words before anything is rendered."""
-    bdpt = integrator(max_depth=30, strategy_images=True)
+    bdpt = integrator(max_depth=30, layers="strategies")
     with pytest.raises(ValueError, match="2048x2048 with max_depth=30 needs about .* GiB"):
         bdpt.render(glowing_sphere(size=2048), spp=1)
 
@@ -882,7 +882,7 @@ def test_layers_count_among_what_a_film_takes(monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: memory.Available(300 * 64 * 64, "the machine's memory"))
     scene = glowing_sphere(size=64)
     assert image(integrator(), scene, spp=8).shape == (64, 64, 3)
-    for more in ({"variance": True}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
+    for more in ({"layers": "variance"}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
         with pytest.raises(
             ValueError, match="bdpt: the film of 64 x 64 pixels takes .* GiB .the machine's memory.; render"
         ):
@@ -1382,7 +1382,7 @@ def test_a_small_lamp_keeps_its_light_however_many_splats_it_has(strategy_images
             },
         }
     )
-    keys = {"max_depth": 1, "skip": "none", "strategy_images": strategy_images}
+    keys = {"max_depth": 1, "skip": "none", "layers": "strategies" if strategy_images else ""}
     one, many = (image(integrator(spp_per_pass=n, **keys), scene, spp=512) for n in (512, 8))
     assert 0 < (one[..., 0] > 1).sum() < 5
     np.testing.assert_allclose(one, many, rtol=1e-5, atol=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.removed import REMOVED
-from mitsuba_bdpt.settings import PARAMETERS, Settings
+from mitsuba_bdpt.settings import LAYERS, PARAMETERS, Settings
 
 
 def test_a_plugin_without_parameters_has_the_defaults():
@@ -29,7 +29,45 @@ def test_the_manual_lists_all():
     for name, parameter in PARAMETERS.items():
         assert manual.count(f" * - {name}\n") == table.count(f"| `{name}` |") == 1
         assert all(f"``{choice}``" in parameter.meaning for choice in parameter.choices)
+    assert all(f"``{layer}``" in PARAMETERS["layers"].meaning for layer in LAYERS)
     assert "| `max_depth` | `-1` | Longest path in edges, as in `path` (with media as in" in table
+
+
+@pytest.mark.parametrize(
+    ("given", "layers"),
+    [
+        ("", ()),
+        ("variance", ("variance",)),
+        ("strategies, variance", ("variance", "strategies")),
+        ("denoised,denoised", ("denoised",)),
+    ],
+)
+def test_layers_are_a_list(given, layers):
+    """Expected: any order, and spaces, make the same parameter, which is written as a list again."""
+    method = mi.load_dict({"type": "bdpt", "max_depth": 3, "layers": given})
+    assert method.settings.layers == layers
+    assert f"layers = {','.join(layers)},\n" in str(method)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("denoise", "layers='denoise': there is no layer 'denoise'; did you mean denoised?"),
+        ("variance;stokes", "there is no layer 'variance;stokes'"),
+        ("variance,", "there is no layer ''.*variance, denoised, stokes, strategies"),
+        (True, "layers=True must be a list such as 'variance,denoised'"),
+        (False, "layers=False must be a list"),
+    ],
+)
+def test_bad_layers_are_refused(given, words):
+    with pytest.raises((ValueError, TypeError, RuntimeError), match=words):
+        mi.load_dict({"type": "bdpt", "layers": given})
+
+
+def test_a_target_error_estimates_the_variance():
+    """Expected: the layers of the variance, which the error follows from, without asking for them."""
+    assert "variance.R" in mi.load_dict({"type": "bdpt", "target_error": 0.1}).aov_names()
+    assert mi.load_dict({"type": "bdpt"}).aov_names() == []
 
 
 @pytest.mark.parametrize("entry", REMOVED)

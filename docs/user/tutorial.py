@@ -99,10 +99,10 @@ assert again.statistics["decisions"] == decisions
 # * `light_paths=0`: path tracing with better points; for scenes without caustics, when every render is very short.
 # * `skip=none`, `light_paths=1`, `connections=all`: everything, for comparisons with other renderers.
 # * `heuristic`: `balance` is the best or nearly so; `power` helps where one strategy is nearly without noise.
-# * `variance=true`: error bars, and `target_error` to stop at one.
+# * `layers=variance`: error bars, and `target_error` to stop at one.
 
 # %%
-bars = mi.load_dict({"type": "bdpt", "max_depth": 8, "variance": True, "target_error": 0.02})
+bars = mi.load_dict({"type": "bdpt", "max_depth": 8, "target_error": 0.02})
 image = bars.render(box, spp=4096, seed=3)
 reference = bdpt.render(box, spp=2048, seed=9)
 done, error = sum(bars.statistics["passes"]), bars.statistics["error"]
@@ -117,7 +117,7 @@ assert error <= 0.02
 # those of paths with three edges. `mitsuba-bdpt pyramid SCENE` writes an image of all lengths.
 
 # %%
-layered = mi.load_dict({"type": "bdpt", "max_depth": 3, "strategy_images": True})
+layered = mi.load_dict({"type": "bdpt", "max_depth": 3, "layers": "strategies"})
 film = np.array(layered.render(box, spp=256))
 names = layered.aov_names()
 layers = film[..., -len(names) :]
@@ -218,7 +218,7 @@ print(sum(bdpt.statistics["passes"]), "samples per pixel")
 #
 # The floor of a basin: the lamp shines on it through water, and the camera sees it through water. Such a path
 # (specular-diffuse-specular, SDS) has no edge that can be connected, and only camera subpaths that happen to hit the lamp
-# find it: fireflies. By default photons guide them where a pilot finds that it pays (`photon_guiding`). Vertex merging,
+# find it: fireflies. By default photons guide them where a pilot finds that it pays (`guiding`). Vertex merging,
 # which is photon mapping for these paths alone, finds the light of point lamps too, is biased by a blur of about a pixel, and
 # converges to the right image ([the method](../method/sds_paths.md#vertex-merging-of-sds-paths)).
 
@@ -231,7 +231,7 @@ water = {
 basin = mi.load_dict(dictionary | {"water": water})
 ways = {
     "path": path,
-    "photon_guiding=never": mi.load_dict({"type": "bdpt", "max_depth": 8, "photon_guiding": "never"}),
+    "guiding=never": mi.load_dict({"type": "bdpt", "max_depth": 8, "guiding": "never"}),
     "bdpt": bdpt,
     "merging=true": mi.load_dict({"type": "bdpt", "max_depth": 8, "merging": True}),
 }

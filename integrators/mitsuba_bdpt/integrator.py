@@ -58,7 +58,8 @@ Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``N
 that is called with a `rendering.PassReport` after each pass.
 
 Not supported, and refused in words: scalar and Metal variants, derivatives (all other methods of
-``integrator`` ignore gradients), renders under ``dr.freeze``, ``strategy_images`` on a ``specfilm``. In
+``integrator`` ignore gradients), renders under ``dr.freeze``, all ``layers`` but ``variance`` on
+a ``specfilm``. In
 scenes with participating media edges count as in ``volpath``; the medium that an emitter declares is ignored,
 as by ``volpath``: it is found from the boundaries around it. Threads need a scene each: Mitsuba's film
 belongs to it. Emitters and sensors of every kind take part; where one cannot have a strategy (a sensor of a
@@ -252,8 +253,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         """Not supported; raises ``UnsupportedError``."""
         raise UnsupportedError(
             "cannot be nested in another integrator (aov, moment, stokes): light subpaths contribute to "
-            "pixels other than their own; render with bdpt itself and its parameters aovs, variance (for "
-            "moment) and stokes (the command's --integrator bdpt takes those of aov and stokes over)"
+            "pixels other than their own; render with bdpt itself and its parameters aovs and layers "
+            "(variance for moment, stokes); --integrator bdpt of the command takes aov and stokes over"
         )
 
     def render_forward(self, *args, **kwargs):
@@ -266,7 +267,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
 
     def to_string(self) -> str:
         """Return the parameters, one per line."""
-        values = {name: getattr(self.settings, name) for name in PARAMETERS} | {"max_depth": self.max_depth}
+        values = {name: getattr(self.settings, name) for name in PARAMETERS}
+        values |= {"max_depth": self.max_depth, "layers": ",".join(self.settings.layers)}
         lines = "".join(f"  {k} = {v},\n" for k, v in values.items())
         return f"BDPTIntegrator[\n{lines}]"
 

@@ -18,7 +18,7 @@ from .image.colour import Bands, film_colours
 from .image.layers import layer_names
 from .image.stokes import POLARIZED
 from .planning.configuration import read_decisions
-from .settings import LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
+from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
 # Meaning of numeric arguments of a render, for messages; for parameters see `settings.PARAMETERS`.
 ARGUMENTS = {
@@ -135,12 +135,24 @@ def _aovs(value, name: str) -> str:
     return value
 
 
+def _layers(value, name: str) -> tuple[str, ...]:
+    """The layers, in the order of `LAYERS`."""
+    text = _string(value, name)
+    given = [word.strip() for word in text.split(",")] if text else []
+    for word in given:
+        if word not in LAYERS:
+            remedy = f"{did_you_mean(word, LAYERS)}Layers: {', '.join(LAYERS)}"
+            raise UsageError(f"{name}={_shown(value)}: there is no layer {word!r}; {remedy}")
+    return tuple(word for word in LAYERS if word in given)
+
+
 # Readers of parameters with their own syntax.
 _READERS = {
     "max_depth": _max_depth,
     "light_paths": _light_paths,
     "decisions": _decisions,
     "aovs": _aovs,
+    "layers": _layers,
 }
 _READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice}
 
@@ -193,24 +205,20 @@ def _check_together(settings: Settings):
     if settings.strategy_images and not 0 < settings.max_depth < UNLIMITED:
         depth = -1 if settings.max_depth == UNLIMITED else settings.max_depth
         raise UsageError(
-            f"strategy_images needs a finite max_depth of 1 or greater, not {depth}; "
+            f"layers=strategies needs a finite max_depth of 1 or greater, not {depth}; "
             "set max_depth, for example to 5"
         )
     by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
     if settings.decisions and (by_hand or settings.strategy_images):
         raise UsageError(
-            "decisions together with light_paths, connections, skip or strategy_images is "
+            "decisions together with light_paths, connections, skip or layers=strategies is "
             "contradictory; leave out one or the other"
         )
     _check_layers(settings)
     if settings.stokes and not mi.is_polarized:
         raise UsageError(
-            f"stokes=True needs a polarized variant, {mi.variant()} has no Stokes vectors; use one, for "
+            f"layers=stokes needs a polarized variant, {mi.variant()} has no Stokes vectors; use one, for "
             "example mi.set_variant('llvm_ad_spectral_polarized')"
-        )
-    if settings.target_error and not settings.variance:
-        raise UsageError(
-            f"target_error={settings.target_error} follows from the variance; set variance to true"
         )
 
 
@@ -266,19 +274,19 @@ def check_film(sensor, settings: Settings):
     colour = film_colours(sensor, settings.stokes)
     if settings.stokes and isinstance(colour, Bands):
         raise UnsupportedError(
-            f"stokes=True is not possible with film {named(sensor.film())} of class SpecFilm: these layers "
+            f"layers=stokes is not possible with film {named(sensor.film())} of class SpecFilm: these layers "
             "are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
     if settings.strategy_images and isinstance(colour, Bands):
         raise UnsupportedError(
-            f"strategy_images=True is not possible with film {named(sensor.film())} of class SpecFilm: "
+            f"layers=strategies is not possible with film {named(sensor.film())} of class SpecFilm: "
             "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
     count = len(features.feature_names(settings.aovs))
     if settings.denoise:
         if isinstance(colour, Bands):
             raise UnsupportedError(
-                f"denoise=True is not possible with film {named(sensor.film())} of class SpecFilm: the "
+                f"layers=denoised is not possible with film {named(sensor.film())} of class SpecFilm: the "
                 "denoiser knows RGB images only; use hdrfilm"
             )
         denoising.check_installed()

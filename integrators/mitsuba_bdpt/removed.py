@@ -8,12 +8,18 @@ from __future__ import annotations
 # By name: a parameter, "parameter=value", a command, an option, "--option value".
 REMOVED = {
     "heuristic=maximum": "use balance, whose variance is lower (E. Veach's thesis, section 9.2)",
-    "heuristic=uniform": "use balance; for unweighted estimates of all strategies set strategy_images",
+    "heuristic=uniform": "use balance; for unweighted estimates of all strategies set layers=strategies",
     "merging_radius": "leave it out: the radius is about a pixel and shrinks from pass to pass; for a "
     "smaller one render more samples, or a larger film",
     "stored_vertices": "leave it out; for path tracing alone set light_paths=0",
     "points=sampler": "use sobol, which is as good as Mitsuba's best sampler; the scene's sampler gives the "
     "number of samples alone",
+    "photon_guiding": "use guiding: always, never, or emission to guide emission alone",
+    "emission_guiding": "use guiding: never, or photons to guide BSDF sampling alone",
+    "strategy_images": "use layers=strategies",
+    "variance": "use layers=variance",
+    "denoise": "use layers=denoised",
+    "stokes": "use layers=stokes",
     "until_error": "use target_error",
     "--until-error": "use --target-error",
     "--keep-checkpoint": "a finished render cannot be continued; for more samples render with another --seed "

@@ -23,10 +23,10 @@ DEFAULT_STORED = 64
 HEURISTICS = ("balance", "power")
 SKIP = ("auto", "impossible", "none")
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
-GUIDING = ("auto", "always", "never")
-EMISSION_GUIDING = ("auto", "never")
+GUIDING = ("auto", "always", "photons", "emission", "never")
 CONNECTIONS = ("auto", "all", "one", "none")
 POINTS = ("sobol", "independent")
+LAYERS = ("variance", "denoised", "stokes", "strategies")
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,9 @@ def _parameter(default: Value, what: str, meaning: str, **bounds: Any) -> Any:
     return _converted(default, default, what, meaning, **bounds)
 
 
-def _converted(default: Value, value: Value | None, what: str, meaning: str, **bounds: Any) -> Any:
+def _converted(
+    default: Value, value: Value | tuple[str, ...] | None, what: str, meaning: str, **bounds: Any
+) -> Any:
     """A field of `Settings` that holds ``value`` for the parameter's ``default``."""
     text = " ".join(meaning.split())
     return field(default=value, metadata={"parameter": Parameter(default, what, text, **bounds)})
@@ -77,7 +79,10 @@ class Internals:
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters, checked. ``max_depth`` is `UNLIMITED` for -1, ``decisions`` a tuple or None."""
+    """The parameters, checked.
+
+    ``max_depth`` is `UNLIMITED` for -1, ``decisions`` a tuple or None, ``layers`` in the order of `LAYERS`.
+    """
 
     max_depth: int = _converted(
         -1,
@@ -138,19 +143,13 @@ class Settings:
         """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
         as the floor of a pool) by vertex merging with photons: consistent, not unbiased.""",
     )
-    photon_guiding: str = _parameter(
+    guiding: str = _parameter(
         "auto",
-        "when s = 0 is guided",
-        """Photon-guided BSDF sampling of SDS paths from emitters with area, unbiased: ``auto`` (where the
-        pilot predicts a gain), ``always`` (where it is possible) or ``never``.""",
+        "what is guided",
+        """Learned sampling where the pilot predicts a gain (``auto``): photons guide BSDF sampling of SDS
+        paths, and tables guide emission; ``photons`` or ``emission`` allows one of them, ``never`` neither;
+        ``always`` uses photons wherever it is possible.""",
         choices=GUIDING,
-    )
-    emission_guiding: str = _parameter(
-        "auto",
-        "when emission is guided",
-        """Guides light subpaths towards where they matter, as the pilot has learned, unbiased: ``auto``
-        (where the pilot predicts a gain) or ``never``.""",
-        choices=EMISSION_GUIDING,
     )
     decisions: tuple[Any, ...] | None = _converted(
         "",
@@ -159,41 +158,25 @@ class Settings:
         """Decisions of an earlier render to use instead of a pilot: its ``statistics["decisions"]`` as
         JSON.""",
     )
-    strategy_images: bool = _parameter(
-        False,
-        "true or false",
-        """Adds the layers ``weighted.s{S}t{T}`` and ``unweighted.s{S}t{T}`` of each strategy; needs a finite
-        ``max_depth``.""",
-    )
-    variance: bool = _parameter(
-        False,
-        "true or false",
-        """Adds the layers ``variance.R``, ``.G``, ``.B``: the variance of each pixel, estimated from 8
-        independent parts of the render.""",
-    )
-    denoise: bool = _parameter(
-        False,
-        "true or false",
-        """Adds the layers ``denoised.R``, ``.G``, ``.B``: the image denoised by Intel's Open Image Denoise,
-        which is biased (extra ``[denoise]``).""",
-    )
-    stokes: bool = _parameter(
-        False,
-        "true or false",
-        """Adds the layers ``S0.R`` to ``S3.B``: the Stokes vector of each pixel, as Mitsuba's ``stokes``;
-        polarized variants only.""",
-    )
-    target_error: float = _parameter(
-        0.0,
-        "the relMSE to stop at, or 0 for none",
-        "Stops the render when its estimated relMSE is at most this, 0 for never; needs ``variance``.",
-        low=0,
-    )
     aovs: str = _parameter(
         "",
         "a string, for example 'albedo:albedo,nn:sh_normal'",
         """Adds feature layers by pairs ``name:kind`` as Mitsuba's ``aov``, for example
         ``albedo:albedo,nn:sh_normal``.""",
+    )
+    layers: tuple[str, ...] = _converted(
+        "",
+        (),
+        "a list such as 'variance,denoised'",
+        """Adds other layers to the image, a list of ``variance`` (of each pixel), ``denoised`` (by Intel's
+        Open Image Denoise), ``stokes`` (Stokes vectors) and ``strategies`` (an image of each).""",
+    )
+    target_error: float = _parameter(
+        0.0,
+        "the relMSE to stop at, or 0 for none",
+        """Stops the render when its estimated relMSE is at most this, 0 for never; adds the layer
+        ``variance``.""",
+        low=0,
     )
     spp_per_pass: int = _parameter(
         0,
@@ -213,6 +196,26 @@ class Settings:
     def varied(self, **internals: Any) -> Settings:
         """These settings with other values of `Internals`."""
         return replace(self, internals=replace(self.internals, **internals))
+
+    @property
+    def variance(self) -> bool:
+        """Whether the variance of each pixel is estimated, from independent parts of the render."""
+        return "variance" in self.layers or self.target_error > 0
+
+    @property
+    def denoise(self) -> bool:
+        """Whether there are layers of the denoised image."""
+        return "denoised" in self.layers
+
+    @property
+    def stokes(self) -> bool:
+        """Whether there are layers of the Stokes vector."""
+        return "stokes" in self.layers
+
+    @property
+    def strategy_images(self) -> bool:
+        """Whether there are layers of each strategy."""
+        return "strategies" in self.layers
 
     @property
     def strategy_depth(self) -> int:

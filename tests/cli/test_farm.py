@@ -281,7 +281,7 @@ def test_statistics_are_a_file(capsys):
     """Expected: what the header of the image has, with settings and memory, as JSON without Infinity or NaN;
     a folder that is made; an error before the render where it cannot be written."""
     arguments = [*SMALL, "--spp", "8", "-o", "a.exr", "--statistics"]
-    assert main([*arguments, "new/a.json", "-P", "variance=true"]) == 0
+    assert main([*arguments, "new/a.json", "-P", "layers=variance"]) == 0
     text = Path("new/a.json").read_text()
     assert "Infinity" not in text and "NaN" not in text
     found = json.loads(text)

@@ -214,7 +214,7 @@ def test_an_interruption_inside_a_pass(monkeypatch):
     """Rationale: Ctrl-C comes while a pass is being traced, not between two. Expected: what is written is the
     state after the last whole pass (here also the end of a replicate), and the render that goes on from it
     is the uninterrupted one, its estimate of the error included."""
-    arguments = [*ARGUMENTS, "--spp", "63", "-P", "variance=true"]  # too few for a pilot
+    arguments = [*ARGUMENTS, "--spp", "63", "-P", "layers=variance"]  # too few for a pilot
     assert main([*arguments, "-o", "whole.exr"]) == 0
     original, close_pass, waits, closed = Meter.wait, Accumulator.close_pass, [], []
 
@@ -338,7 +338,6 @@ def test_until_an_error(capsys):
         (["--integrator", "path", "--scheduler", "x:1"], "scheduler is for the integrator bdpt"),
         (["--time", "2", "-P", "timeout=3"], "-P timeout=3 together with --time 2 is not possible"),
         (["--target-error", "1", "-P", "target_error=2"], "-P target_error=2 together with --target-error 1"),
-        (["--target-error", "1", "-P", "variance=false"], "-P variance=False together with --target-error 1"),
         (["--integrator", "path", "--target-error", "1"], "target_error is for the integrator bdpt"),
     ],
 )
@@ -356,7 +355,7 @@ def test_defaults_of_the_command_line():
 def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):
     """Expected: with the parameters instead of --target-error the checkpoint goes as well when the error is
     reached, and the closing line says so when it is not."""
-    asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "variance=true", "-o", "a.exr"]
+    asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "layers=variance", "-o", "a.exr"]
     assert main([*asked, "--spp", "1024", "-P", "target_error=0.5"]) == 0
     assert not Path("a.checkpoint.npz").exists() and "asked for" not in capsys.readouterr().out
     assert rendered.image("a.exr")[1]["spp"] < 1024

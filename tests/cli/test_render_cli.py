@@ -288,6 +288,23 @@ def test_bdpt_in_place_of_stokes_has_its_layers(around):
         loaded(around, "--integrator", "bdpt")
 
 
+def test_denoise_adds_to_the_layers(around):
+    """Expected: ``--denoise`` keeps the layers of the command line, of the file's own `bdpt`, and of an
+    integrator around it."""
+    given = "-P", "layers=variance"
+    assert loaded(around, "--integrator", "bdpt", "--denoise").settings.layers == ("denoised",)
+    assert loaded(around, "--integrator", "bdpt", "--denoise", *given).settings.layers == (
+        "variance",
+        "denoised",
+    )
+    own = '<integrator name="img" type="bdpt"><string name="layers" value="variance"/>'
+    text = re.sub('<integrator name="img"[^>]*>', own, around.read_text())
+    around.write_text(text.replace('type="aov">', 'type="stokes">'))
+    polarized = "-m", "llvm_ad_mono_polarized"
+    settings = loaded(around, "--integrator", "bdpt", "--denoise", *polarized).settings
+    assert settings.layers == ("variance", "denoised", "stokes")
+
+
 def test_direct_is_replaced_with_its_depth(around):
     """Rationale: `direct` has no `max_depth`, and what took its place went on without end. Expected: emission
     and direct light, inside of others too, unless the command line says otherwise."""
@@ -383,7 +400,7 @@ def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
         (["-P", "nonsense=1"], "nonsense"),
         (["-Dnonsense=1"], "nonsense"),
         (["--integrator", "no_such_plugin"], "no_such_plugin"),
-        (["-Pstrategy_images=true", "-Pmax_depth=17", "--integrator=bdpt"], "smaller max_depth"),
+        (["-Players=strategies", "-Pmax_depth=17", "--integrator=bdpt"], "smaller max_depth"),
         (["--integrator", "bdpt", "-P", "max_depth=0.5"], "TypeError: bdpt: max_depth=0.5 must be"),
     ],
 )
@@ -632,7 +649,7 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
                 'type="aov"><string name="aovs" value="a:depth"/><integrator type="bdpt">',
             ),
             ["-P", "aovs=b:depth", "--integrator", "scene"],
-            "the command's --integrator bdpt takes those of aov and stokes over",
+            "--integrator bdpt of the command takes aov and stokes over",
         ),
     ],
 )

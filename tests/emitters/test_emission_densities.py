@@ -516,7 +516,7 @@ def test_aimed_light_subpaths(name):
     """
     scene, images = meadow(FROM_INFINITY[name]), {}
     integrator = mi.load_dict(
-        {"type": "bdpt", "max_depth": 2, "light_paths": 1, "strategy_images": True, "hide_emitters": True}
+        {"type": "bdpt", "max_depth": 2, "light_paths": 1, "layers": "strategies", "hide_emitters": True}
     )
     assert Emitters(scene).disks.details is not None
     renders = np.array([np.array(integrator.render(scene, seed=s, spp=1024)) for s in range(24)], dtype=float)

@@ -322,7 +322,7 @@ def test_rotated_environment_by_light_tracing_alone():
     confidence interval, below 10 %. Statistic: Welch over tiles, 16 seeds.
     """
     scene = mi.load_dict(room() | {"lamp": EMITTERS["rotated envmap"]()})
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     a, b = render(scene, bdpt, range(16), 512), render(scene, bdpt, range(50, 66), 256)
     agree(tiles(layer(a, bdpt, "unweighted.s2t1"), 8), tiles(layer(b, bdpt, "unweighted.s1t2"), 8), 0.1)
 
@@ -474,7 +474,7 @@ def test_every_camera_sees_what_path_sees(name):
     12 % and 2 %. Statistic: Welch over tiles, 10 seeds a side.
     """
     scene = mi.load_dict(room(CAMERAS[name]()) | {"lamp": EMITTERS["point"]()})
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
     agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
     path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
@@ -498,7 +498,7 @@ def test_near_and_far_clip():
             },
         }
     )
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
     agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
     path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
@@ -512,7 +512,7 @@ def test_thin_lens_at_its_default_focus_distance():
     """
     sensor = perspective() | {"type": "thinlens", "aperture_radius": 0.02}
     scene = mi.load_dict(room(sensor) | {"lamp": EMITTERS["point"]()})
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
     agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
     path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
@@ -563,7 +563,7 @@ def check_strategies_agree(lamp):
     (0,2) equals (1,1), and (0,3), (1,2) and (2,1) equal each other. Tolerance: the confidence interval, below
     4 % and 10 % of the mean. Statistic: Welch over tiles, 10 seeds a side."""
     scene = mi.load_dict(room() | {"lamp": lamp})
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     a, b, c = (render(scene, bdpt, range(s, s + 10), 512) for s in (0, 50, 100))
 
     def images(x, name):
@@ -808,7 +808,7 @@ def test_lamps_that_do_not_tell_their_points(lamp):
     below 6 %. Statistic: Welch over tiles, 10 seeds a side.
     """
     odd, other = {"lamp": lamp()}, {"other": EMITTERS["point"]()}
-    everything = integrator(skip="none", max_depth=3, strategy_images=True)
+    everything = integrator(skip="none", max_depth=3, layers="strategies")
     alone = render(mi.load_dict(room() | odd), everything, range(100, 110), 512)
     hits = sum(layer(alone, everything, f"unweighted.s0t{t}") for t in (2, 3, 4))
     assert hits.mean() > 0.01

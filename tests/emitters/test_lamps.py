@@ -52,7 +52,7 @@ def check_sums(scene, depth=2, spp=512, width=0.03, seeds=SEEDS):
     carries light. Statistic: Student's t-test of the differences of the image's means over seeds, Sidak over
     the path lengths, at 1e-4, and 1e-4 of the mean for rounding; their standard error is below ``width`` of
     the mean."""
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": "none", "strategy_images": True})
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": "none", "layers": "strategies"})
     names = bdpt.aov_names()
     means = np.array([np.array(bdpt.render(scene, seed=s, spp=spp)).mean((0, 1)) for s in range(seeds)])
     layers = dict(zip(names, means[:, -len(names) :].T.astype(float), strict=True))

@@ -485,7 +485,7 @@ def test_lamps_at_the_origin_are_seen_from_afar_in_fog(kind):
         "sensor": seen_by([0, -29, 7], [0, 0, 0], 5, medium={"type": "ref", "id": "fog"}),
         "lamp": lamp | {"emitter": {"type": "area", "radiance": 5.0}},
     }
-    integrator = {"type": "bdpt", "max_depth": 1, "skip": "none", "strategy_images": True}
+    integrator = {"type": "bdpt", "max_depth": 1, "skip": "none", "layers": "strategies"}
     scene = mi.load_dict(scene)
     image = np.array(mi.render(scene, integrator=mi.load_dict(integrator), spp=64, seed=0))
     names = [channel.name for channel in scene.sensors()[0].film().bitmap().struct_()]

@@ -19,7 +19,7 @@ def cornell(**changes):
 
 def bdpt(**parameters):
     # Each render asks one pilot: none about tables of emission.
-    return mi.load_dict({"type": "bdpt", "max_depth": 6, "emission_guiding": "never", **parameters})
+    return mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "photons", **parameters})
 
 
 def bumpy(offset=0.0):

@@ -106,7 +106,7 @@ for option, kind, name in (("-v", resource.RLIMIT_AS, "VmSize"), ("-d", resource
 print(json.dumps(found))
 """
 
-FILMS = {"plain": {}, "aovs": {"aovs": "a:albedo,b:sh_normal,d:depth"}, "variance": {"variance": True}}
+FILMS = {"plain": {}, "aovs": {"aovs": "a:albedo,b:sh_normal,d:depth"}, "variance": {"layers": "variance"}}
 
 
 @pytest.fixture(scope="module")

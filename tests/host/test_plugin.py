@@ -93,20 +93,19 @@ PARAMETER_SETS = (
         "connections": "one",
         "points": "independent",
         "merging": True,
-        "photon_guiding": "never",
-        "emission_guiding": "never",
-        "variance": True,
+        "guiding": "never",
+        "layers": "variance,denoised",
         "target_error": 0.01,
         "aovs": "a:albedo,b:depth",
         "spp_per_pass": 16,
         "timeout": 12.5,
     },
-    {"max_depth": 3, "strategy_images": True},
+    {"max_depth": 3, "layers": "strategies"},
     {"decisions": DECISIONS},
 )
 
 
-@pytest.mark.parametrize("changed", PARAMETER_SETS, ids=["numbers and texts", "strategy_images", "decisions"])
+@pytest.mark.parametrize("changed", PARAMETER_SETS, ids=["numbers and texts", "strategies", "decisions"])
 def test_parameters_are_written(changed):
     """Expected: an integrator read from the written file has the settings of the dictionary, none of which is
     the default.
@@ -119,11 +118,8 @@ def test_parameters_are_written(changed):
 
 
 def test_all_parameters_are_written():
-    """Expected: `test_parameters_are_written` tries every parameter but two booleans, of which one needs a
-    package and one a polarized variant.
-    """
-    tried = {name for changed in PARAMETER_SETS for name in changed}
-    assert set(PARAMETERS) - tried == {"denoise", "stokes"}
+    """Expected: `test_parameters_are_written` tries every parameter."""
+    assert set(PARAMETERS) == {name for changed in PARAMETER_SETS for name in changed}
 
 
 def test_scalar_variants_are_refused():

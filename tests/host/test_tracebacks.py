@@ -14,7 +14,7 @@ MISTAKES = {
         {"type": "aov", "aovs": "d:depth", "nested": {"type": "bdpt"}},
         "cannot be nested in another integrator",
     ),
-    "variance": ({"type": "bdpt", "variance": True}, "variance=True with spp=4 is not possible"),
+    "variance": ({"type": "bdpt", "layers": "variance"}, "layers=variance with spp=4 is not possible"),
 }
 
 # A cell of a notebook, run by IPython without one, and one whose error has nothing to do with the plugin.
@@ -28,7 +28,8 @@ shell = IPython.core.interactiveshell.InteractiveShell.instance()
 shell.run_cell('''
 import mitsuba_bdpt, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-mi.render(mi.load_dict(mi.cornell_box()), integrator=mi.load_dict({"type": "bdpt", "variance": True}), spp=4)
+integrator = mi.load_dict({"type": "bdpt", "layers": "variance"})
+mi.render(mi.load_dict(mi.cornell_box()), integrator=integrator, spp=4)
 ''')
 shell.run_cell("raise RuntimeError('of the user')")
 """
@@ -60,8 +61,8 @@ def test_other_tracebacks_are_as_they_were(capsys):
     for error in (ValueError("bdpt"), RuntimeError("one's own")):
         sys.excepthook(type(error), error, None)
         assert capsys.readouterr().err.splitlines()[-1] == f"{type(error).__name__}: {error}"
-    with pytest.raises(ValueError, match="variance=True") as caught:
-        mi.load_dict({"type": "bdpt", "variance": True}).render(scene({"type": "path"}), spp=4)
+    with pytest.raises(ValueError, match="layers=variance") as caught:
+        mi.load_dict({"type": "bdpt", "layers": "variance"}).render(scene({"type": "path"}), spp=4)
     assert tracebacks.last_line(caught.value) == ""
 
 
@@ -72,6 +73,6 @@ def test_the_last_line_in_a_notebook():
     done = subprocess.run(
         [sys.executable, "-c", IN_IPYTHON], capture_output=True, text=True, timeout=PATIENCE
     )
-    assert done.stderr.strip().startswith("bdpt: variance=True with spp=4 is not possible"), done.stderr
+    assert done.stderr.strip().startswith("bdpt: layers=variance with spp=4 is not possible"), done.stderr
     assert "see above" in done.stdout
     assert done.stdout.strip().endswith(": of the user")

@@ -162,7 +162,7 @@ def bdpt(**parameters):
             {"principal_point_offset_x": 0.1},
             {"spp_per_pass": 2},
         ),
-        ({"rfilter": "lanczos"}, {}, {"variance": True, "strategy_images": True}),
+        ({"rfilter": "lanczos"}, {}, {"layers": "variance,strategies"}),
         ({"pixel_format": "luminance_alpha"}, {}, {"max_depth": 0}),
     ],
     ids=["plain", "hidden emitters", "thin lens, border", "crop, passes", "all layers", "depth 0"],
@@ -178,7 +178,7 @@ def test_features_are_those_of_aov(film_keys, sensor_keys, parameters, monkeypat
     monkeypatch.setattr(Points, "_draw", fixed(Points._draw))
     target = scene(sensor(film(**film_keys), sampler={"type": "fixed"}, **sensor_keys))
     integrator = bdpt(**parameters)
-    spp = 16 if "variance" in parameters else 4
+    spp = 16 if "layers" in parameters else 4
     names, result = integrator.aov_names(), layers(integrator, target, spp)
     assert names[: len(ALL_NAMES)] == ALL_NAMES
     held = layer_names(target)
@@ -341,7 +341,7 @@ def test_bad_features_are_named(aovs, message):
     """Expected: ValueError before anything is rendered, with parameter, value and remedy. (Mitsuba puts
     what a constructor raises into a RuntimeError.)"""
     with pytest.raises((ValueError, RuntimeError), match=f"(?s)UsageError.*bdpt: aovs='{aovs}'.*{message}"):
-        bdpt(aovs=aovs, variance=True, strategy_images=True)
+        bdpt(aovs=aovs, layers="variance,strategies")
 
 
 def test_features_must_be_text():

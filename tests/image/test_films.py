@@ -199,7 +199,7 @@ def test_variance_of_bands():
     """
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(rfilter="gaussian"))
-    bdpt = integrator(max_depth=3, variance=True)
+    bdpt = integrator(max_depth=3, layers="variance")
     result = renders(scene, bdpt, range(12), 16)
     assert layer_names(scene) == ["visible", "infrared", "variance.visible", "variance.infrared"]
     images, estimates = result[..., :2], result[..., 2:]
@@ -227,9 +227,9 @@ def test_strategy_images_of_bands_are_refused():
     wrong. Expected: the parameter and the remedy are named, by render and by explain."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film())
-    bdpt = integrator(max_depth=3, strategy_images=True)
+    bdpt = integrator(max_depth=3, layers="strategies")
     for call in (bdpt.render, bdpt.explain):
-        with pytest.raises(NotImplementedError, match="strategy_images=True.*SpecFilm.*use hdrfilm"):
+        with pytest.raises(NotImplementedError, match="layers=strategies.*SpecFilm.*use hdrfilm"):
             call(scene)
 
 

@@ -20,7 +20,7 @@ def scene(rfilter="box", width=12, sampler="independent"):
 
 
 def bdpt(**parameters):
-    return mi.load_dict({"type": "bdpt", "max_depth": 4, "variance": True} | parameters)
+    return mi.load_dict({"type": "bdpt", "max_depth": 4, "layers": "variance"} | parameters)
 
 
 def renders(integrator, target, seeds, spp):
@@ -126,8 +126,8 @@ def test_the_image_is_as_good_with_it():
     integrator = bdpt()
     a = renders(integrator, target, range(8), 100)[..., :3]
     assert sum(integrator.statistics["passes"]) == 100
-    b = renders(bdpt(variance=False), target, range(20, 28), 100)
-    assert b.shape[-1] == 3 and "error" not in bdpt(variance=False).statistics
+    b = renders(bdpt(layers=""), target, range(20, 28), 100)
+    assert b.shape[-1] == 3 and "error" not in bdpt(layers="").statistics
     assert a.mean() == pytest.approx(b.mean(), rel=0.02)
 
 
@@ -141,14 +141,14 @@ def test_schedule_of_replicates():
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
     assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)
     assert all(s.done == 0 and s.size == s.of for s in steps[2:])
-    assert [s.replicate for s in schedule.schedule(camera, 19, bdpt(variance=False).settings, True)] == [0, 0]
+    assert [s.replicate for s in schedule.schedule(camera, 19, bdpt(layers="").settings, True)] == [0, 0]
 
 
 def test_launches_on_a_gpu(monkeypatch):
     """Rationale: a GPU traces a pass of 2^21 camera subpaths in less time than Python records it. Expected:
     the passes of a large image have eight times as many samples there.
     """
-    settings = bdpt(variance=False).settings
+    settings = bdpt(layers="").settings
     camera = SimpleNamespace(region=SimpleNamespace(size=(1024, 1024)))
     assert schedule.pass_sizes(camera, 64, settings, False) == [2] * 32
     monkeypatch.setattr(schedule.dr, "backend_v", lambda _: schedule.dr.JitBackend.CUDA)
@@ -164,13 +164,13 @@ def test_interrupted_before_there_is_a_spread():
 
 
 def test_too_few_samples_are_refused():
-    with pytest.raises(ValueError, match=r"variance=True with spp=7 .* at least 8 samples per pixel"):
+    with pytest.raises(ValueError, match=r"layers=variance with spp=7 .* at least 8 samples per pixel"):
         bdpt().render(scene(), spp=7)
 
 
 def test_beside_strategy_images():
     """Expected: layers of both, the variance first; technique images still add up to the image."""
-    target, integrator = scene(), bdpt(strategy_images=True)
+    target, integrator = scene(), bdpt(layers="strategies,variance")
     names = integrator.aov_names()
     result = np.array(integrator.render(target, spp=32))
     layers = dict(zip(names, np.moveaxis(result[..., 3:], -1, 0), strict=True))

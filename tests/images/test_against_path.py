@@ -236,7 +236,7 @@ def test_bumped_surfaces_equal_path(nested, lamp):
     if lamp == "point":
         # k = 2 alone: nothing is seen directly.
         direct = renders(scene, path(2), 24, 64, 4000)
-        images = bdpt(2, skip="none", strategy_images=True)
+        images = bdpt(2, skip="none", layers="strategies")
         start = 3 + 2 * 6 + 2 * 6 + 3 + 1  # RGB, k = 1, (0,3) and (1,2), weighted (2,1), green
         splats = np.stack(
             [

@@ -74,7 +74,7 @@ def test_every_strategy_through_a_blend_from_behind():
     ball = {"type": "sphere", "center": [0, 1, 0], "radius": 0.5, "bsdf": blend(FROSTED, MATTE)}
     light = {"type": "point", "position": [0, 1, 0], "intensity": 5.0}
     scene = above_a_floor((0, 1.2, 4), 2, MATTE, ball=ball, light=light)
-    found, names = images(scene, 256, max_depth=3, strategy_images=True)
+    found, names = images(scene, 256, max_depth=3, layers="strategies")
     layers = found[..., found.shape[-1] - len(names) :].mean((1, 2))
 
     def unweighted(strategy):

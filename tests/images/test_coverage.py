@@ -131,7 +131,7 @@ def test_pair(emitter, sensor):
     out of sight (`path` misses it where the sensor has area).
     """
     scene = parts.pair(emitter, sensor)
-    method = bdpt(strategy_images=True)
+    method = bdpt(layers="strategies")
     images = renders(scene, method, SAMPLES, 0)
     other = parts.pair(emitter, sensor, reference=True)
     with evaluated_mode(emitter == "timed_sunsky"):
@@ -328,7 +328,7 @@ def test_directionalarea_by_inner_connections():
     Expected: for k = 3 their unweighted images agree, and so does (2,1) with the image for k = 2, in the
     scene of a floor, a ball and a box. Statistic: Student's t-test of the differences.
     """
-    method = bdpt(strategy_images=True)
+    method = bdpt(layers="strategies")
     images = renders(parts.pair("directionalarea", "perspective"), method, 4 * SAMPLES, 0)
     inner, splat = (layer(images, method, "unweighted", s, 4 - s) for s in (2, 3))
     precise(inner, 0.02, "inner")
@@ -403,7 +403,7 @@ def test_meter_reads_the_known_irradiance(lamp):
     `scene_parts` gives to the pair, and from all together. Statistic: Student's t-test against it.
     """
     scene = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS), "lamp": LAMPS_ABOVE[lamp]()})
-    method = bdpt(max_depth=1, strategy_images=True)
+    method = bdpt(max_depth=1, layers="strategies")
     images = renders(scene, method, SAMPLES, 0)
     known = irradiance_above(lamp) * CHANNELS.sum()
     found = [st.compare_known(tiles(images), known, lamp)]
@@ -490,7 +490,7 @@ def test_lens_sees_a_point():
     sensor = parts.thinlens(0.4, 3.0, origin=(0, 0, 0), target=(0, 0, 1), fov=50, size=8)
     lamp = {"type": "point", "position": [0.1, 0.05, 1.5], "intensity": 2.0}
     scene = mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp})
-    method = bdpt(max_depth=1, strategy_images=True)
+    method = bdpt(max_depth=1, layers="strategies")
     images = renders(scene, method, 16 * SAMPLES, 0)
     r, phi = np.meshgrid(0.4 * np.sqrt((np.arange(200) + 0.5) / 200), 2 * np.pi * np.arange(200) / 200)
     dist2 = (0.1 - r * np.cos(phi)) ** 2 + (0.05 - r * np.sin(phi)) ** 2 + 1.5**2

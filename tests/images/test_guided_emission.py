@@ -377,8 +377,8 @@ def test_it_gains_and_says_so():
     0.85. Trimmed, of means over five seeds; the reference has 4,096 samples.
     """
     scene = spotlit()
-    reference = np.mean([rendered(scene, 50 + i, 512, emission_guiding="never")[0] for i in range(8)], axis=0)
-    never = [rendered(scene, i, emission_guiding="never") for i in range(5)]
+    reference = np.mean([rendered(scene, 50 + i, 512, guiding="photons")[0] for i in range(8)], axis=0)
+    never = [rendered(scene, i, guiding="photons") for i in range(5)]
     auto = [rendered(scene, i) for i in range(5)]
     errors = [np.mean([rel_mse(image, reference, TRIM) for image, _ in of]) for of in (auto, never)]
     decision = auto[0][1].statistics["decisions"][0]
@@ -387,7 +387,7 @@ def test_it_gains_and_says_so():
     assert errors[0] < 0.85 * errors[1], errors
     text = auto[0][1].explain(scene, spp=64)
     assert "used: guided emission (light subpaths are aimed; the pilot predicts that" in text
-    assert "skipped (by hand): guided emission: emission_guiding=never" in never[0][1].explain(scene, spp=64)
+    assert "skipped (by hand): guided emission: guiding=photons" in never[0][1].explain(scene, spp=64)
 
 
 def test_light_that_path_tracing_would_find_alone():
@@ -396,12 +396,12 @@ def test_light_that_path_tracing_would_find_alone():
     """
     scene = mi.load_file(str(SCENES / "window_room.xml"), resolution=128)
     ways = {}
-    for guiding in ("never", "auto"):
-        _, method = rendered(scene, spp=64, emission_guiding=guiding)
+    for guiding in ("photons", "auto"):
+        _, method = rendered(scene, spp=64, guiding=guiding)
         decision = method.statistics["decisions"][0]
         ways[guiding] = decision["light_paths"], decision["emission"] is not None
         asked = method.statistics["pilots"]["asked"]
-    assert ways["never"] == (0.0, False)
+    assert ways["photons"] == (0.0, False)
     assert ways["auto"][0] > 0 and ways["auto"][1] and asked == 2
 
 
@@ -414,7 +414,7 @@ def test_where_nothing_is_gained_nothing_changes():
     eye = parts.perspective(origin=[0, 0, 1], target=[0, 0, 0], fov=90) | {"film": parts.film(32)}
     scene = mi.load_dict({"type": "scene", "sensor": eye, "ball": ball, "light": light})
     a, method = rendered(scene)
-    b, _ = rendered(scene, emission_guiding="never")
+    b, _ = rendered(scene, guiding="photons")
     np.testing.assert_allclose(a, b, **ROUNDING)
     (why,) = (s["why"] for s in method.statistics["skipped"] if s["class"] == "guided emission")
     assert "less than 93% would pay" in why

@@ -138,7 +138,7 @@ def test_large_lamps_look_as_without(case, samples):
     if case == "lens":
         scene = mi.load_dict(under_glass(ball(), kind="thinlens"))
     a = images(scene, 128, 8, decisions=guided(samples))
-    b = images(scene, 128, 8, first=100, photon_guiding="never")
+    b = images(scene, 128, 8, first=100, guiding="emission")
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
@@ -149,8 +149,8 @@ def test_a_wide_lens():
     scene = under_glass(ball(), kind="thinlens")
     scene["sensor"] |= LENS
     scene = mi.load_dict(scene)
-    a = images(scene, 256, 8, photon_guiding="always", skip="none")
-    b = images(scene, 256, 8, first=100, photon_guiding="never", skip="none")
+    a = images(scene, 256, 8, guiding="always", skip="none")
+    b = images(scene, 256, 8, first=100, guiding="emission", skip="none")
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
@@ -172,14 +172,14 @@ def test_parameters(parameters):
     shows the lamp itself.)
     """
     scene = mi.load_dict(under_glass(ball()))
-    a = images(scene, 128, 8, photon_guiding="always", **parameters)
-    b = images(scene, 128, 8, first=100, photon_guiding="never")
+    a = images(scene, 128, 8, guiding="always", **parameters)
+    b = images(scene, 128, 8, first=100, guiding="emission")
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
 @cache
 def unchanged():
-    return images(under_glass(ball()), 128, 8, photon_guiding="never")
+    return images(under_glass(ball()), 128, 8, guiding="emission")
 
 
 @pytest.mark.parametrize("change", ["crop window", "border", "features", "instance"])
@@ -215,7 +215,7 @@ def test_glass_caustics_under_a_large_lamp(how):
         how
     ]
     a = images(scene, 64, 8, max_depth=8, **parameters)
-    b = images(scene, 64, 8, first=100, max_depth=8, photon_guiding="never")
+    b = images(scene, 64, 8, first=100, max_depth=8, guiding="emission")
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
@@ -225,7 +225,7 @@ def test_a_lamp_below_the_plate():
     """
     scene = mi.load_dict(under_glass(ball(0.1) | {"center": [0.5, 0.0, 0.2]}))
     a = images(scene, 128, 8, decisions=guided(4))
-    b = images(scene, 128, 8, first=100, photon_guiding="never")
+    b = images(scene, 128, 8, first=100, guiding="emission")
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
 
 
@@ -235,7 +235,7 @@ def test_small_lamps_without_fireflies():
     """
     scene = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}))
     a = images(scene, 64, 12, decisions=guided(4))
-    b = images(scene, 64, 12, first=100, photon_guiding="never")
+    b = images(scene, 64, 12, first=100, guiding="emission")
     st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
     assert a.var(axis=0).mean() < 0.1 * b.var(axis=0).mean()
 
@@ -246,7 +246,7 @@ def test_without_photons():
     """
     lamp = {"type": "rectangle", "to_world": transform().translate([0, 0, 2.5]).scale(0.2)}
     scene = mi.load_dict(under_glass(lamp | {"emitter": {"type": "area", "radiance": 10.0}}))
-    a, b = (images(scene, 16, 1, photon_guiding=when) for when in ("always", "never"))
+    a, b = (images(scene, 16, 1, guiding=when) for when in ("always", "emission"))
     np.testing.assert_allclose(a, b, **ROUNDING)
 
 
@@ -276,8 +276,8 @@ def test_the_pilot_guides_where_it_pays():
     assert better and all("; not chosen: without guided s=0" in row for row in better)
     again = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": json.dumps(found["decisions"])})
     np.testing.assert_allclose(np.array(mi.render(scene, integrator=again, spp=16)), image, **ROUNDING)
-    never = mi.load_dict({"type": "bdpt", "max_depth": 6, "photon_guiding": "never"})
-    assert "skipped (by hand): guided s=0: photon_guiding=never" in never.explain(scene, spp=16)
+    never = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "emission"})
+    assert "skipped (by hand): guided s=0: guiding=emission" in never.explain(scene, spp=16)
     assert "guided s=0" not in method.explain(mi.load_dict(mi.cornell_box()), spp=16)
 
 
@@ -463,7 +463,7 @@ def test_no_photon_of_the_guide_is_dropped(monkeypatch):
     """Expected: with memory for one photon at first the same image, to the rounding of sums."""
     scene = mi.load_dict(under_glass(ball(0.1)))
     monkeypatch.setattr("mitsuba_bdpt.transport.photons.photon_pass.FEWEST_PHOTONS", 1 << 8)
-    a = images(scene, 16, 1, photon_guiding="always")
+    a = images(scene, 16, 1, guiding="always")
     monkeypatch.setattr("mitsuba_bdpt.transport.photons.photon_pass._CAPACITY", 0.0)
-    b = images(scene, 16, 1, photon_guiding="always")
+    b = images(scene, 16, 1, guiding="always")
     np.testing.assert_allclose(a, b, **ROUNDING)

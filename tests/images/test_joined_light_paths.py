@@ -349,9 +349,9 @@ def test_single_samples_are_looked_at_one_light_subpath_at_a_time():
     """
     scene = cornell()
     method = mi.load_dict({"type": "bdpt", "max_depth": 6})
-    with pytest.raises(Exception, match="set emission_guiding=never"):
+    with pytest.raises(Exception, match="set guiding=photons"):
         recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "emission_guiding": "never"})
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "photons"})
     recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)
     assert method.statistics["decisions"][0]["joined"] == 1
     method = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": decided()})

@@ -110,7 +110,7 @@ def test_every_path_length_in_the_unit_sphere(kind, name):
     """
     depth, (parameters, tolerance) = 5, CONFIGURATIONS[name]
     scene, answer = sphere_lit_by(kind)
-    bdpt = integrator(max_depth=depth, rr_depth=100, strategy_images=True, **parameters)
+    bdpt = integrator(max_depth=depth, rr_depth=100, layers="strategies", **parameters)
     images = render(scene, bdpt, range(16), 256)
     found = layers(images, bdpt)
     lengths = range(1 if kind == "emission" else 2, depth + 1)
@@ -171,7 +171,7 @@ def test_all_strategies_of_sensors_with_area(sensor, heuristic, kind):
     interval, below 2e-2 for sums and 0.15 for single strategies. Statistic: t-test over 16 seeds.
     """
     scene, answer = sensor(kind)
-    bdpt = integrator(max_depth=3, rr_depth=100, strategy_images=True, skip="none", heuristic=heuristic)
+    bdpt = integrator(max_depth=3, rr_depth=100, layers="strategies", skip="none", heuristic=heuristic)
     spp = 1 << 15 if sensor is metered_sphere else 1 << 13
     images = render(scene, bdpt, range(16), spp)
     found = layers(images, bdpt)
@@ -373,7 +373,7 @@ def test_borders_of_a_furnace_are_flat(rfilter, border):
     with all strategies. Statistic: t-test over 16 seeds.
     """
     scene, answer = sphere_lit_by("point", camera(rfilter=rfilter, size=16, sample_border=border))
-    bdpt = integrator(max_depth=3, strategy_images=True, skip="none")
+    bdpt = integrator(max_depth=3, layers="strategies", skip="none")
     images = render(scene, bdpt, range(16), 320)
     ring = np.ones((16, 16), dtype=bool)
     ring[1:-1, 1:-1] = False

@@ -108,7 +108,7 @@ def test_no_spikes_inside_a_bumpy_sphere(kind):
     5 to 10 (normal map).
     """
     scene = inside_of_a_sphere(rough(kind))
-    bdpt = integrator(max_depth=8, rr_depth=50, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=8, rr_depth=50, skip="none", layers="strategies")
     image = render(scene, bdpt, [1], 256)
     for name in (None, *(f"weighted.s{k + 1 - t}t{t}" for k in range(3, 9) for t in (1, 2))):
         pixels = (image[..., :3] if name is None else layer(image, bdpt, name))[0].mean(-1)
@@ -127,7 +127,7 @@ def test_light_side_agrees_with_camera_side_on_bumpy_surfaces(kind):
     Statistic: Welch, 16 seeds a side.
     """
     scene = inside_of_a_sphere(rough(kind))
-    bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=3, rr_depth=50, skip="none", layers="strategies")
     images, others = render(scene, bdpt, range(16), 256), render(scene, bdpt, range(50, 66), 256)
     for s, t in ((2, 1), (2, 2), *([(3, 1)] if kind.endswith("unflipped") else [])):
         reference = layer(others, bdpt, f"unweighted.s1t{s + t - 1}")
@@ -225,7 +225,7 @@ def test_shading_normals_of_a_coarse_mesh(tmp_path):
             },
         }
     )
-    bdpt = integrator(max_depth=4, rr_depth=50, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=4, rr_depth=50, skip="none", layers="strategies")
     images, others = render(scene, bdpt, range(16), 256), render(scene, bdpt, range(50, 66), 256)
     agree(
         tiles(layer(images, bdpt, "unweighted.s2t1")),
@@ -276,7 +276,7 @@ def test_emitter_mesh_with_vertex_normals(tmp_path, transform, flip, inside):
             },
         }
     )
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     images, others = render(scene, bdpt, range(12), 256), render(scene, bdpt, range(50, 62), 256)
     hit = layer(images, bdpt, "unweighted.s0t3")
     if hit.max() == 0:
@@ -312,7 +312,7 @@ def test_emitter_meshes_are_lit_on_one_side():
                 },
             }
         )
-        bdpt = integrator(max_depth=1, skip="none", strategy_images=True)
+        bdpt = integrator(max_depth=1, skip="none", layers="strategies")
         images = render(scene, bdpt, range(2), 64)
         hit, sampled = (layer(images, bdpt, f"unweighted.s{s}t{2 - s}").mean() for s in (0, 1))
         assert (hit > 0) == (sampled > 0)
@@ -369,7 +369,7 @@ def test_environment_does_not_depend_on_other_objects(environment):
             }
             | far
         )
-        bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+        bdpt = integrator(max_depth=2, skip="none", layers="strategies")
         images = render(scene, bdpt, range(16), 256)
         splat = layer(images, bdpt, "unweighted.s2t1").mean((1, 2, 3))
         known(splat, 0.4, tolerance)
@@ -411,7 +411,7 @@ def test_crop_window_equals_the_region_of_the_whole(rfilter):
             }
         )
 
-    bdpt = integrator(max_depth=3, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=3, skip="none", layers="strategies")
     whole = render(scene(), bdpt, range(16), 128)[:, 5:15, 9:21]
     part = render(
         scene(crop_offset_x=7, crop_offset_y=3, crop_width=16, crop_height=14), bdpt, range(50, 66), 128
@@ -451,7 +451,7 @@ def test_narrow_spot_on_a_matte_floor(fov):
             },
         }
     )
-    bdpt = integrator(max_depth=2, skip="none", strategy_images=True, points="independent")
+    bdpt = integrator(max_depth=2, skip="none", layers="strategies", points="independent")
     images = render(scene, bdpt, range(64), spp)
     mean, total = images[..., :3].mean(0), images[..., :3].var(0, ddof=1).sum()
     splats, direct = (
@@ -538,7 +538,7 @@ def test_brightness_does_not_depend_on_where_panes_lamp_and_camera_are(lamp_pane
                     "bsdf": {"type": "null"},
                 }
         scene = mi.load_dict(scene)
-        bdpt = integrator(max_depth=edges, rr_depth=50, skip="none", strategy_images=True)
+        bdpt = integrator(max_depth=edges, rr_depth=50, skip="none", layers="strategies")
         images = render(scene, bdpt, range(16), 512)
         total = sum(
             layer(images, bdpt, f"weighted.s{s}t{edges + 1 - s}").mean((1, 2, 3)) for s in range(edges + 1)
@@ -569,7 +569,7 @@ def test_emitters_with_unequal_sampling_weights(weights):
             },
         }
     )
-    bdpt = integrator(max_depth=3, rr_depth=50, skip="none", strategy_images=True)
+    bdpt = integrator(max_depth=3, rr_depth=50, skip="none", layers="strategies")
     images = render(scene, bdpt, range(16), 256)
     for s in (1, 2, 3):
         known(layer(images, bdpt, f"unweighted.s{s}t{4 - s}").mean((1, 2, 3)), 0.25, 0.06)
@@ -603,7 +603,7 @@ def test_directional_light_on_a_wide_floor():
                 },
             }
         )
-        bdpt = integrator(max_depth=2, skip="none", strategy_images=True)
+        bdpt = integrator(max_depth=2, skip="none", layers="strategies")
         images = render(scene, bdpt, range(16), 256)
         known(layer(images, bdpt, "unweighted.s1t2").mean((1, 2, 3)), expected, 1e-3)
         splat = tiles(layer(images, bdpt, "unweighted.s2t1"), 8)

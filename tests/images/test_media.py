@@ -143,7 +143,7 @@ def layers(tiles):
 @cache
 def techniques(name, side):
     """Layers of renders with technique images; sides 0 and 1 have different seeds."""
-    return layers(parts.tile_means(load(name), bdpt(strategy_images=True), 64, 1000 + 1000 * side, SEEDS))
+    return layers(parts.tile_means(load(name), bdpt(layers="strategies"), 64, 1000 + 1000 * side, SEEDS))
 
 
 @cache
@@ -234,7 +234,7 @@ def test_each_class_with_hits(name, pair, monkeypatch):
     """
     original = planner.plan
     monkeypatch.setattr(planner, "plan", lambda *args: replace(original(*args), **PAIRS[pair]))
-    ours = layers(parts.tile_means(load(name), bdpt(strategy_images=True), 64, 9000, SEEDS))
+    ours = layers(parts.tile_means(load(name), bdpt(layers="strategies"), 64, 9000, SEEDS))
     family = [
         st.compare_images(weighted_sum(ours, k), path_lengths(name)[k], f"k={k}")
         for k in range(3 if pair == "inner" else 2, DEPTH + 1)
@@ -251,7 +251,7 @@ def test_thinned_light_subpaths(monkeypatch):
     monkeypatch.setattr(planner, "plan", lambda *args: replace(original(*args), **PAIRS["inner"]))
     for module in (inputs, light_path):
         monkeypatch.setattr(module, "KEPT", 2)
-    ours = layers(parts.tile_means(load("fog"), bdpt(strategy_images=True), 64, 12000, SEEDS))
+    ours = layers(parts.tile_means(load("fog"), bdpt(layers="strategies"), 64, 12000, SEEDS))
     family = [st.compare_images(weighted_sum(ours, k), path_lengths("fog")[k], f"k={k}") for k in (3, 4)]
     st.assert_agree(st.Comparisons.join(family), at_least=20)
 

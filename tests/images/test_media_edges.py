@@ -33,7 +33,7 @@ def assert_agree(a, b):
 
 def unweighted(scene, depth, spp, **parameters):
     """``{(k, s): (seeds, channels)}``: each strategy alone, and the weighted sum of each length as s = -1."""
-    found = means(scene, 100, spp, depth, strategy_images=True, **ALL, **parameters)[:, 3:]
+    found = means(scene, 100, spp, depth, layers="strategies", **ALL, **parameters)[:, 3:]
     split = found.reshape(SEEDS, -1, 2, 3)
     alone = {(k, s): split[:, i, 1] for i, (k, s, _) in enumerate(strategies(depth))}
     for k in range(1, depth + 1):

@@ -221,11 +221,11 @@ def test_joins_start_on_the_right_side_of_a_boundary():
         }
     )
     expected = _lit_face(scene.sensors()[0], 0.2)
-    for way in ({"light_paths": 0}, {"skip": "none", "strategy_images": True}, {}):
+    for way in ({"light_paths": 0}, {"skip": "none", "layers": "strategies"}, {}):
         method = parts.integrator(max_depth=2, **way)
         images = parts.images(scene, method, 1024, 1, 12).mean((1, 2))
         found = {"image": images[:, :3].mean(1)}
-        if "strategy_images" in way:
+        if "layers" in way:
             assert method.statistics["rays"]["light"]
             first = images.shape[1] - len(method.aov_names()) + method.aov_names().index("unweighted.s2t1.R")
             found["t=1"] = images[:, first : first + 3].mean(1)

@@ -567,7 +567,7 @@ def test_no_photon_is_dropped(monkeypatch):
 # -- renders -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("parameters", [{}, {"variance": True}], ids=str)
+@pytest.mark.parametrize("parameters", [{}, {"layers": "variance"}], ids=str)
 def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     """Rationale: radius and photons of a pass follow from the passes done (of the replicate). Expected: the
     image of a render that went on is that of the one that never stopped.
@@ -650,7 +650,7 @@ def test_merges_do_not_outweigh_what_is_better(monkeypatch):
 def strategy_images(scene, spp, seeds, **more):
     """Images and layers of the first colour by name, each (seeds, height, width)."""
     parameters = {"max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
-    method = internals.bdpt(**parameters | {"strategy_images": True} | more)
+    method = internals.bdpt(**parameters | {"layers": "strategies"} | more)
     found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
     found = np.array(found, dtype=np.float64)
     names = method.aov_names()
@@ -734,7 +734,7 @@ def test_a_lens_where_photons_are_aimed(monkeypatch):
 
 def layers_of_merges(scene, first=0):
     """(seeds, height, width) of the first colour of the merges."""
-    method = mi.load_dict({"type": "bdpt", "max_depth": 5, "merging": True, "strategy_images": True})
+    method = mi.load_dict({"type": "bdpt", "max_depth": 5, "merging": True, "layers": "strategies"})
     at = 3 + method.aov_names().index("weighted.merged.R")
     found = [mi.render(scene, integrator=method, spp=64, seed=first + i) for i in range(16)]
     return np.array([np.array(image, dtype=np.float64)[..., at] for image in found])

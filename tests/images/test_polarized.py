@@ -41,7 +41,7 @@ def at(*steps):
 
 
 def bdpt(**parameters):
-    return mi.load_dict({"type": "bdpt", "stokes": True, **parameters})
+    return mi.load_dict({"type": "bdpt", "layers": "stokes", **parameters})
 
 
 def layers(scene, integrator, spp, seed=0):
@@ -375,7 +375,7 @@ def test_strategies_agree_in_every_component(monkeypatch):
     scene = mi.load_dict(
         {"type": "scene", "sensor": views.camera(), "wall": wall, "lamp": lamp, "other": other}
     )
-    method = bdpt(skip="none", rr_depth=100, max_depth=depth, strategy_images=True)
+    method = bdpt(skip="none", rr_depth=100, max_depth=depth, layers="stokes,strategies")
 
     def unweighted(first_seed):
         images = [
@@ -407,7 +407,8 @@ def test_what_polarizes_nothing_is_as_in_other_variants():
         mi.set_variant(variants.of(variant))
         scene = mi.cornell_box()
         scene["sensor"]["film"].update(width=24, height=24, rfilter={"type": "box"})
-        method = {"type": "bdpt", "light_paths": 1, "connections": "one", "stokes": mi.is_polarized}
+        stokes_layers = "stokes" if mi.is_polarized else ""
+        method = {"type": "bdpt", "light_paths": 1, "connections": "one", "layers": stokes_layers}
         found.append(np.array(mi.load_dict(method).render(mi.load_dict(scene), spp=16, seed=3)))
     plain, polarized = found
     shown = polarized[..., : plain.shape[2]]
@@ -422,7 +423,7 @@ def test_the_first_layer_is_the_image(rfilter):
     """
     camera = views.camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0))
     camera["film"]["rfilter"] = {"type": rfilter}
-    method = bdpt(max_depth=4, skip="none", aovs="dd:depth", variance=True)
+    method = bdpt(max_depth=4, skip="none", aovs="dd:depth", layers="stokes,variance")
     scene = room(floor(ROUGH), ball({"type": "dielectric"}), sensor=camera)
     image = np.array(method.render(scene, spp=8, seed=0))
     assert method.aov_names()[:13] == [*stokes.NAMES, "dd.T"]
@@ -486,7 +487,7 @@ def test_guided_paths_are_polarized():
     ``path``, which finds the lamp if it is large.
     """
     large = seen_through_glass(0.25)
-    guided = ours(large, 0, max_depth=8, photon_guiding="always")
+    guided = ours(large, 0, max_depth=8, guiding="always")
     st.assert_agree(st.compare_images(guided, judged(large, max_depth=8)), at_least=30)
 
 
@@ -496,9 +497,9 @@ def test_isolated_paths_are_polarized():
     which is the lamp itself, is merged, and it is polarized.
     """
     small = seen_through_glass(0.1)
-    method = bdpt(max_depth=8, rr_depth=100, photon_guiding="always")
+    method = bdpt(max_depth=8, rr_depth=100, guiding="always")
     theirs = np.stack([layers(small, method, 512, 100 + i).mean((0, 1)) for i in range(RUNS)])
-    method = bdpt(max_depth=8, rr_depth=100, merging=True, skip="none", strategy_images=True)
+    method = bdpt(max_depth=8, rr_depth=100, merging=True, skip="none", layers="stokes,strategies")
     images = [np.array(method.render(small, spp=64, seed=i), dtype=np.float64) for i in range(16)]
     first = images[0].shape[2] - len(method.aov_names())
     mine = np.stack([image[..., first : first + 12][..., FIRST].mean((0, 1)) for image in images])
@@ -625,7 +626,7 @@ def test_what_cannot_be_done_is_said():
     ):
         bdpt().render(scene, spp=1)
     mi.set_variant(variants.of("mono"))
-    with pytest.raises((ValueError, RuntimeError), match="stokes=True needs a polarized variant"):
+    with pytest.raises((ValueError, RuntimeError), match="layers=stokes needs a polarized variant"):
         bdpt()
     mi.set_variant(variants.of("spectral_polarized"))
     film = {
@@ -635,6 +636,6 @@ def test_what_cannot_be_done_is_said():
         "band": {"type": "spectrum", "value": [(400.0, 1.0), (700.0, 1.0)]},
     }
     scene = room(floor(ROUGH), sensor=views.camera() | {"film": film})
-    with pytest.raises(NotImplementedError, match="stokes=True is not possible with film"):
+    with pytest.raises(NotImplementedError, match="layers=stokes is not possible with film"):
         bdpt().render(scene, spp=1)
     assert np.isfinite(np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=1))).all()

@@ -35,7 +35,7 @@ def by_a_mirror():
     return scene
 
 
-@pytest.mark.parametrize("way", [{"merging": True}, {"photon_guiding": "always"}], ids=["merging", "guided"])
+@pytest.mark.parametrize("way", [{"merging": True}, {"guiding": "always"}], ids=["merging", "guided"])
 @pytest.mark.parametrize(
     "described, edges", [(through_the_plate, 6), (by_a_mirror, 5)], ids=["plate", "mirror"]
 )
@@ -47,7 +47,7 @@ def test_no_path_is_longer_than_max_depth(described, edges, way):
     scene = mi.load_dict(described())
     for depth in (edges - 1, edges):
         settings = {"max_depth": depth, "skip": "impossible"}
-        a, b = (images(scene, 16, 1, **settings, **w) for w in (way, {"photon_guiding": "never"}))
+        a, b = (images(scene, 16, 1, **settings, **w) for w in (way, {"guiding": "emission"}))
         assert np.allclose(a, b, **ROUNDING) == (depth < edges)
 
 
@@ -147,10 +147,10 @@ def test_light_subpaths_with_two_diffuse_vertices(monkeypatch):
 
     scene = lit_by_a_wall()
     settings = {"skip": "none", "max_depth": 7}
-    expected = images(scene, 256, 1, photon_guiding="never", **settings)
+    expected = images(scene, 256, 1, guiding="emission", **settings)
     monkeypatch.setattr(photon_guide, "draw", draw)
     monkeypatch.setattr(photon_guide, "density", density)
-    found = images(scene, 256, 1, photon_guiding="always", **settings)
+    found = images(scene, 256, 1, guiding="always", **settings)
     np.testing.assert_allclose(found, expected, **ROUNDING)
     assert (expected > 0).sum() > 8
 
@@ -164,6 +164,6 @@ def test_a_sun_with_hide_emitters():
     pixels[10:12, 8:10] = 200.0
     sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": transform().rotate([1, 0, 0], 90)}
     scene = mi.load_dict(under_glass(sky))
-    a = images(scene, 32, 6, photon_guiding="always", hide_emitters=True)
-    b = images(scene, 32, 6, first=100, photon_guiding="never", hide_emitters=True)
+    a = images(scene, 32, 6, guiding="always", hide_emitters=True)
+    b = images(scene, 32, 6, first=100, guiding="emission", hide_emitters=True)
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)

@@ -335,7 +335,7 @@ DEPTH = 4
 
 def unweighted(scene, first_seed):
     """Tile means of each strategy's own image, {(s, t): (runs, tiles)}; layers are RGB in every variant."""
-    integrator = bdpt(skip="none", rr_depth=100, max_depth=DEPTH, strategy_images=True)
+    integrator = bdpt(skip="none", rr_depth=100, max_depth=DEPTH, layers="strategies")
     tiles = renders(scene, integrator, 64, first_seed)
     layers = tiles[..., -6 * len(strategies(DEPTH)) :].reshape(RUNS, TILES**2, -1, 2, 3) @ CHANNELS
     return {(s, t): layers[:, :, i, 1] for i, (_, s, t) in enumerate(strategies(DEPTH))}

@@ -161,7 +161,7 @@ def layers(tiles):
 @cache
 def techniques(name, side, options=()):
     """Layers of 32 renders with technique images; sides 0 and 1 have different seeds."""
-    integrator = bdpt(strategy_images=True, **dict(options))
+    integrator = bdpt(layers="strategies", **dict(options))
     return layers(renders(load(name), integrator, 64, 1000 + 1000 * side))
 
 
@@ -298,7 +298,7 @@ def test_unweighted_strategies_ignore_counts_and_coefficients():
     Expected: with a quarter of the light subpaths and kappa = n / 4 it has the mean that it has
     with all of them. Statistic: Welch per tile, Sidak; Kolmogorov-Smirnov.
     """
-    thinned = bdpt(strategy_images=True, light_paths=0.25, skip="impossible")
+    thinned = bdpt(layers="strategies", light_paths=0.25, skip="impossible")
     thinned = layers(renders(load("rough metal"), thinned, 64, 11000))
     full = techniques("rough metal", 0)
     family = [
@@ -326,7 +326,7 @@ def test_weighted_layers_are_the_image(options):
     Expected: in one render RGB equals the sum of the weighted layers to 1e-4 of the image's mean
     (sums of 64 x 30 float32 numbers per pixel, in another order). No statistic.
     """
-    integrator = bdpt(strategy_images=True, **options)
+    integrator = bdpt(layers="strategies", **options)
     image = mi.render(load("glass and metal"), integrator=integrator, spp=64, seed=3)
     image = np.array(image, dtype=float)
     parts = image[..., 3:].reshape(SIZE, SIZE, -1, 2, 3)[..., 0, :]

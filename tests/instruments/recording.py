@@ -165,9 +165,9 @@ def render(scene, integrator, least, spp: int, seed: int):
 
     def trace(traced, image, batch, points, of):
         if traced.guide is not None:
-            raise CommandError("paths that are guided are not looked at; set photon_guiding=never")
+            raise CommandError("paths that are guided are not looked at; set guiding=never")
         if traced.plan.emission is not None:  # whose densities nobody but the kernel knows
-            raise CommandError("paths whose emission is guided are not looked at; set emission_guiding=never")
+            raise CommandError("paths whose emission is guided are not looked at; set guiding=photons")
         if traced.plan.joined > 1:
             raise CommandError(
                 "decisions: lanes with several light subpaths are not looked at; set joined=1 in them"

@@ -177,7 +177,7 @@ def results():
     rows += noisy("path multijitter", 16, rel_mse=0.016, rel_mse_trimmed=0.016)
     rows += noisy("bdpt skip=none", 16, seconds=3.0) + noisy("ptracer", 16, 0.5)
     rows += noisy("bdpt skip=impossible", 16, seconds=1.5)
-    rows += noisy("bdpt emission_guiding=never", 16, rel_mse_trimmed=0.05, spread_trimmed=0.06)
+    rows += noisy("bdpt guiding=photons", 16, rel_mse_trimmed=0.05, spread_trimmed=0.06)
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
     values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}

@@ -581,13 +581,13 @@ def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
     """Expected: cells that cannot be rendered (the variance of fewer samples than it needs) fail, are named,
     and the others are there."""
     making.make(job(3))
-    bad = 'type = "bdpt"\nname = "bad"\nvariance = true'
+    bad = 'type = "bdpt"\nname = "bad"\nlayers = "variance"'
     path = preset_file(folder, PRESET.replace('type = "path"', bad))
     words = path, "-o", folder / "out"
     assert swept(*words) == 1
     out = capsys.readouterr().out
     assert (
-        len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad: bdpt: variance=True", out)) == 4
+        len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad: bdpt: layers=variance", out)) == 4
         and ": 4 rows" in out
     )
 

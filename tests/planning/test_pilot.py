@@ -243,7 +243,7 @@ def test_rare_paths_count_by_how_often_they_are_made():
 def test_open_ends_are_not_counted_on():
     """Expected: a render whose samples are only a bound gets the pilot of 2^20, and rare paths count by
     that."""
-    for parameters in ({"timeout": 5.0}, {"target_error": 0.1, "variance": True}):
+    for parameters in ({"timeout": 5.0}, {"target_error": 0.1}):
         assert budget.expected_samples(bdpt(**parameters).settings, 1 << 30) == 1 << 20
         assert budget.expected_samples(bdpt(**parameters).settings, 1 << 18) == 1 << 18
     assert budget.expected_samples(bdpt().settings, 1 << 30) == 1 << 30
@@ -616,7 +616,7 @@ def test_what_renders_do_not_meet_does_not_decide(monkeypatch):
     one of these seeds says 4.5). Without guided emission, which makes light subpaths better than that."""
     file = Path(__file__).parents[2] / "scenes" / "window_room.xml"
     target = mi.load_file(str(file), resolution=128)
-    integrator = bdpt(max_depth=target.integrator().max_depth, emission_guiding="never")
+    integrator = bdpt(max_depth=target.integrator().max_depth, guiding="photons")
     for seed in range(6):
         monkeypatch.setattr(Planner, "pilot_seed", seed)
         render = rendering.Render(target, target.sensors()[0], integrator.settings, seed, 64)
@@ -635,7 +635,7 @@ def test_not_asked():
         ({"connections": "one"}, long, 32),
         ({"skip": "impossible"}, long, 32),
         ({"max_depth": 0}, long, 32),
-        ({"strategy_images": True, "max_depth": 3}, long, 32),
+        ({"layers": "strategies", "max_depth": 3}, long, 32),
     ):
         integrator = bdpt(**parameters)
         integrator.render(target, spp=spp)
@@ -735,7 +735,7 @@ def test_asked_again_in_long_renders():
 def test_replicates_have_one_decision():
     """Rationale: images that are made in different ways do not say how far one of them is off. Expected: with
     `variance` a long render asks one pilot, also when its first replicate has passes after 32 samples."""
-    integrator = bdpt(variance=True, spp_per_pass=8)
+    integrator = bdpt(layers="variance", spp_per_pass=8)
     integrator.render(caustic(64), spp=512)
     assert [d["pass"] for d in integrator.statistics["decisions"]] == [0]
 
@@ -835,8 +835,8 @@ def test_decisions_by_two_hands():
     text = json.dumps([decision(ALONE, 1, "none").record()])
     with pytest.raises(RuntimeError, match="decisions together with light_paths, connections, skip"):
         bdpt(decisions=text, light_paths=1)
-    with pytest.raises(RuntimeError, match="skip or strategy_images is contradictory"):
-        bdpt(decisions=text, strategy_images=True)
+    with pytest.raises(RuntimeError, match="skip or layers=strategies is contradictory"):
+        bdpt(decisions=text, layers="strategies")
     with pytest.raises(RuntimeError, match="decisions=3 must be a string"):
         bdpt(decisions=3)
 

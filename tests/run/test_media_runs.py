@@ -33,7 +33,9 @@ def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 16} | parameters)
 
 
-@pytest.mark.parametrize("parameters", [{"skip": "none"}, {"variance": True, "aovs": "dd:depth"}], ids=str)
+@pytest.mark.parametrize(
+    "parameters", [{"skip": "none"}, {"layers": "variance", "aovs": "dd:depth"}], ids=str
+)
 def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     """Rationale: what a lane carries in media (channels, tracking, thinned vertices) belongs to no
     snapshot, and must start anew the same. Expected: image, layers and counts, those of media included,
@@ -60,11 +62,11 @@ def test_variance_and_target_error():
     a fifth (2,000 degrees of freedom, but of pixels that differ), and a render until an error ends at it.
     """
     target = misty()
-    images = [np.array(bdpt(variance=True).render(target, seed=seed, spp=64)) for seed in range(10)]
+    images = [np.array(bdpt(layers="variance").render(target, seed=seed, spp=64)) for seed in range(10)]
     found = np.var([image[..., :3] for image in images], axis=0, ddof=1).mean()
     stated = np.mean([image[..., 3:] for image in images])
     assert stated == pytest.approx(found, rel=0.2)
-    integrator = bdpt(variance=True, target_error=0.05)
+    integrator = bdpt(target_error=0.05)
     integrator.render(target, seed=2, spp=1 << 14, develop=False)
     assert integrator.statistics["error"] <= 0.05 and sum(integrator.statistics["passes"]) < 1 << 14
 

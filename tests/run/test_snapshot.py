@@ -28,9 +28,9 @@ def bdpt(**parameters):
     [
         ("box", {}, 1),
         ("gaussian", {"skip": "none"}, 3),
-        ("box", {"variance": True, "aovs": "dd:depth"}, 5),
-        ("box", {"variance": True, "target_error": 1e-9}, 9),
-        ("box", {"strategy_images": True}, 2),
+        ("box", {"layers": "variance", "aovs": "dd:depth"}, 5),
+        ("box", {"target_error": 1e-9}, 9),
+        ("box", {"layers": "strategies"}, 2),
         ("box", {"light_paths": 0, "points": "independent"}, 2),
     ],
 )
@@ -48,7 +48,7 @@ def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
     np.testing.assert_allclose(image, expected, **ROUNDING)
     for name in ("rays", "connections", "passes", "decisions", "skipped"):
         assert resumed.statistics[name] == whole.statistics[name], name
-    if "variance" in parameters:
+    if whole.settings.variance:
         assert resumed.statistics["error"] == pytest.approx(whole.statistics["error"], rel=1e-3)
 
 
@@ -137,9 +137,9 @@ def test_joined_variance_is_that_of_all_replicates():
     16 images, whose weighted mean and squares are taken here in one go; the joined order does not matter.
     """
     target = scene()
-    a, b = (part(target, seed, spp, variance=True) for seed, spp in ((1, 16), (2, 32)))
-    image = np.array(bdpt(skip="impossible", variance=True).assemble(a.joined(b), target))
-    swapped = np.array(bdpt(skip="impossible", variance=True).assemble(b.joined(a), target))
+    a, b = (part(target, seed, spp, layers="variance") for seed, spp in ((1, 16), (2, 32)))
+    image = np.array(bdpt(skip="impossible", layers="variance").assemble(a.joined(b), target))
+    swapped = np.array(bdpt(skip="impossible", layers="variance").assemble(b.joined(a), target))
     np.testing.assert_allclose(image, swapped, **ROUNDING)
     halves = [half for s in (a, b) for half in s.progress.halves]
     assert [(half.count, half.spp) for half in halves] == [(4, 8), (4, 8), (4, 16), (4, 16)]
@@ -222,7 +222,7 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
     """Expected: a render until an error stops at 32, 64, 128, … spp, the first at which its estimate is
     small enough; what it reports is that estimate, also in its last report."""
     target, reports = scene(), []
-    integrator = bdpt(variance=True, target_error=0.004)
+    integrator = bdpt(target_error=0.004)
     integrator.on_pass = reports.append
     integrator.render(target, seed=2, spp=1 << 14, develop=False)
     done = sum(integrator.statistics["passes"])
@@ -235,9 +235,8 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
 @pytest.mark.parametrize(
     ("parameters", "error", "message"),
     [
-        ({"target_error": 0.1}, ValueError, "set variance to true"),
-        ({"target_error": -1.0, "variance": True}, ValueError, "the relMSE to stop at, or 0 for none"),
-        ({"target_error": "low", "variance": True}, TypeError, "must be a number"),
+        ({"target_error": -1.0}, ValueError, "the relMSE to stop at, or 0 for none"),
+        ({"target_error": "low"}, TypeError, "must be a number"),
     ],
 )
 def test_bad_parameters(parameters, error, message):

@@ -37,10 +37,7 @@ SENSIBLE = {
     "hide_emitters": (False, True),
     "merging": (False, True),
     "light_paths": ("auto", 0, 1, "1/2", 0.25, "1/16"),
-    "strategy_images": (False, True),
-    "variance": (False, True),
-    "denoise": (False, True),
-    "stokes": (False,),  # of polarized variants alone
+    "layers": ("", "strategies", "variance", "denoised", "variance,denoised"),  # stokes: polarized alone
     "target_error": (0.0, 0.1),
     "spp_per_pass": (0, 1, 3),
     "timeout": (-1.0, 0.0, 1e9),
@@ -48,8 +45,7 @@ SENSIBLE = {
     "skip": ("auto", "impossible", "none"),
     "connections": ("auto", "all", "one", "none"),
     "points": ("sobol", "independent"),
-    "photon_guiding": ("auto", "always", "never"),
-    "emission_guiding": ("auto", "never"),
+    "guiding": ("auto", "always", "photons", "emission", "never"),
     "aovs": ("", "albedo:albedo", "dd:depth,nn:sh_normal"),
     "decisions": ("", "[]"),
 }

@@ -38,7 +38,7 @@ def _explained(name: str) -> Outcome:
     """The worst samples of a scene found anew."""
     depth = benchmark_depth(name)
     scene = load_scene(name, resolution=RESOLUTION)
-    unguided = {"photon_guiding": "never", "emission_guiding": "never"}
+    unguided = {"guiding": "never"}
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth} | unguided)
     target = _target(name, depth)
     found = []

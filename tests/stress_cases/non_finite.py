@@ -270,7 +270,7 @@ COUNTED = {
         "texels of a reflectance NaN, layers of the variance",
         TWO,
         reflecting,
-        BY_CAMERA | {"variance": True},
+        BY_CAMERA | {"layers": "variance"},
         2,
     ),
 }
@@ -302,9 +302,9 @@ def counted_cases():
         case("feature", "texels of an albedo NaN, shown by `aovs`", ("feature",)),
         _case(
             "strategy-images-nan",
-            "half a plate's BSDF has the value NaN: all layers of `strategy_images`",
+            "half a plate's BSDF has the value NaN: all layers of `layers=strategies`",
             TWIN,
-            lambda: compared(_poisoned("eval"), NAN, EVERYTHING | {"strategy_images": True}),
+            lambda: compared(_poisoned("eval"), NAN, EVERYTHING | {"layers": "strategies"}),
         ),
     ]
 

@@ -285,7 +285,7 @@ def _turned(subject: Subject) -> Outcome:
             for place, seeds in ((Place(), range(5)), (SMALL, range(10, 15)))
         )
         pairs.append((turned, plain))
-    scaled = _equal(subject, SMALL, {"1e4": LARGE}, NEAR, emission_guiding="never")
+    scaled = _equal(subject, SMALL, {"1e4": LARGE}, NEAR, guiding="photons")
     return together({"turned": family(pairs, MOST_ERROR), "scaled": scaled})
 
 
@@ -358,7 +358,7 @@ def _cases():
             f"{words}, turned by 35.7° about (1, 2, 3), lengths times 1e-4 and 1e4",
             "tile means as of the plain scene (other seeds, 5 a side): Welch's t-test with Šidák at 1e-3, "
             f"standard error of a tile below {100 * MOST_ERROR:g} % of the mean; at 1e-4 the image and the "
-            f"decision of 1e4, seed for seed (`emission_guiding=never`: a path that rounding sends another "
+            f"decision of 1e4, seed for seed (`guiding=photons`: a path that rounding sends another "
             f"way changes the tables, and so all draws): {100 * DRAWN:g} % of the pixels may differ by more "
             f"than {NEAR:g} of the mean, where rounding does that, the image's mean by {MEANS:g}; defaults "
             "and all strategies",

@@ -113,7 +113,7 @@ def _kept_by_dr_jit() -> int:
 PLAIN = (({}, SIZE, 1),)
 IN_TURN = (
     ({}, 48, 64),
-    ({"variance": True}, SIZE, 16),
+    ({"layers": "variance"}, SIZE, 16),
     *(({"aovs": "albedo:albedo,nn:sh_normal"}, SIZE, 1), ({"points": "independent"}, SIZE, 1)) * 6,
     *(({"skip": "none"}, SIZE, 1), *PLAIN) * 3,
 )

@@ -592,7 +592,7 @@ def test_normal_mapped_glass_from_both_sides():
     from welch import assert_agree, compare_images, tile_means
 
     scene = pane_scene(16)
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "skip": "none", "strategy_images": True})
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "skip": "none", "layers": "strategies"})
     first = 3 + 6 * 7  # after RGB and the strategies of k = 1 (3) and k = 2 (4)
     sides = {"camera": [], "light": []}
     for seed in range(32):

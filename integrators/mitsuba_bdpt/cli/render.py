@@ -35,8 +35,8 @@ UNLIMITED_SPP = 1 << 16
 PASS_SPP = 16
 """Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
 
-SETS = {"time": {"timeout"}, "target_error": {"target_error", "variance"}}
-"""The integrator's parameters that an option sets, see `loading.load`."""
+SETS = {"time": "timeout", "target_error": "target_error"}
+"""The integrator's parameter that an option sets, see `loading.load`."""
 
 
 IDENTITY = "bdptIdentity"
@@ -251,18 +251,13 @@ def check_options(options: Namespace) -> None:
                 "leave out one or the other."
             )
     properties = dict(options.properties)
-    if options.denoise and properties.get("denoise") is False:
-        raise CommandError(
-            "-P denoise=false together with --denoise is not possible; leave out one or the other."
-        )
-    for option, names in SETS.items():
-        for name in names & set(properties):
-            value = getattr(options, option)
-            if value is not None and not (name == "variance" and properties[name] is True):
-                raise CommandError(
-                    f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is "
-                    f"not possible: the option sets {name} itself; leave out one or the other."
-                )
+    for option, name in SETS.items():
+        value = getattr(options, option)
+        if value is not None and name in properties:
+            raise CommandError(
+                f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is not "
+                f"possible: the option sets {name} itself; leave out one or the other."
+            )
     checkpoints.check(options, options.output)
 
 

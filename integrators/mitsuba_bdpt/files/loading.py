@@ -29,8 +29,7 @@ DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
 """``max_depth`` of integrators whose paths end as early where the scene file gives them none."""
 
 NOT_CARRIED = {
-    "moment": "second moments, which bdpt does not have (its parameter variance adds the variance of each "
-    "pixel)",
+    "moment": "second moments, which bdpt does not have (its layers=variance is the variance of each pixel)",
 }
 """Integrators around another whose layers `bdpt` cannot have."""
 
@@ -166,15 +165,16 @@ def _load(options: Namespace) -> Loaded:
         if getattr(options, name) and used != "bdpt":
             raise CommandError(f"{name} is for the integrator bdpt, not for {used}; use --integrator bdpt.")
     if options.target_error is not None:
-        overrides |= {"target_error": options.target_error, "variance": True}
-    if options.denoise:
-        overrides["denoise"] = True
+        overrides["target_error"] = options.target_error
     if asked in AROUND and own != asked and (asked != "aov" or not overrides.get("aovs")):
         raise CommandError(
             f"integrator={asked} is for one around another, which the command line cannot "
-            "name: write both into the scene file (-P aovs=NAME:KIND and -P stokes=true add layers to bdpt)."
+            "name: write both into the scene file (for bdpt, -P aovs=NAME:KIND and -P layers=stokes do)."
         )
     kept = {} if node is None else replace_integrator(state.nodes, node, asked, overrides)
+    if options.denoise:
+        given = overrides if node is None else node.props
+        given["layers"] = _added(given.get("layers", ""), "denoised")
     said = _in_place_of(own, used, kept, asked)
     mi.parser.transform_all(config, state)
     # The stub says object; `_check_root` has verified that it is a scene.
@@ -484,6 +484,13 @@ def replace_integrator(
     return {name: node.props[name] for name in dict.fromkeys(kept)}
 
 
+def _added(layers: str, more: str) -> str:
+    """Return the parameter ``layers`` with one ``more``; the plugin rejects what is no text."""
+    if not isinstance(layers, str):
+        return layers
+    return f"{layers},{more}" if layers else more
+
+
 def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
     """Return the innermost properties, and what `bdpt` takes from outer integrators.
 
@@ -503,7 +510,7 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
                     f"the scene's integrator stokes needs a polarized variant, not {mi.variant()}; use for "
                     "example -m llvm_ad_spectral_polarized."
                 )
-            carried["stokes"] = True
+            carried["layers"] = "stokes"
         else:
             aovs += [prefix + pair for pair in features.pairs(node.props.get("aovs", ""))]
         if "timeout" in node.props:
@@ -512,6 +519,8 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
         prefix += f"{name}." if kind == "aov" else ""
     if kind == "bdpt":
         aovs += features.pairs(node.props.get("aovs", ""))
+        if "layers" in carried:
+            carried["layers"] = _added(node.props.get("layers", ""), carried["layers"])
     return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})
 
 

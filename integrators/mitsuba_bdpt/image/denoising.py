@@ -28,7 +28,8 @@ def check_installed() -> None:
         import mitsuba_oidn  # noqa: F401
     except ImportError as error:
         raise UsageError(
-            f"denoise=True needs mitsuba-oidn ({error}); install it with: pip install 'mitsuba-bdpt[denoise]'"
+            f"layers=denoised needs mitsuba-oidn ({error}); install it with: pip install "
+            "'mitsuba-bdpt[denoise]'"
         ) from error
 
 

@@ -60,7 +60,7 @@ def check_strategies(film, depth: int, merges: bool):
     needed = image_count(depth, merges) * width * height * 6 * (DOUBLE + ALL)
     if needed > STRATEGY_MEMORY:
         raise UsageError(
-            f"strategy_images at {width}x{height} with max_depth={depth} needs about "
+            f"layers=strategies at {width}x{height} with max_depth={depth} needs about "
             f"{needed / 2**30:.1f} GiB, more than {STRATEGY_MEMORY / 2**30:.0f} GiB; use a smaller "
             "film or max_depth"
         )

@@ -35,7 +35,7 @@ NONE = "bdpt skip=none"
 IMPOSSIBLE = "bdpt skip=impossible"
 INDEPENDENT = "bdpt points=independent"
 ALONE = "bdpt light_paths=0"
-UNAIMED = "bdpt emission_guiding=never"
+UNAIMED = "bdpt guiding=photons"
 LIGHT_TRACER = "ptracer"
 
 # Samples per pixel of the first integrator at which efficiencies are compared, if available.

@@ -53,7 +53,7 @@ def technique_images(image, names: list, kind: str) -> dict:
 def render(file: MeasuredScene, options: Pyramid | Namespace):
     """Return the film after a render, and technique images, weighted and unweighted."""
     scene = file.load(options.resolution)
-    parameters = {"type": "bdpt", "strategy_images": True, "heuristic": options.heuristic}
+    parameters = {"type": "bdpt", "layers": "strategies", "heuristic": options.heuristic}
     integrator = integrator_of(parameters, options.max_depth)
     check_channels(choose_sensor(scene, 0).film(), integrator.aov_names())
     with amount(f"{file.name}: samples per pixel", options.spp) as show:

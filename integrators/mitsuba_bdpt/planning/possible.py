@@ -46,13 +46,13 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     why = _why_not_merging(emitters, prepared.delta, bool(direct)) if settings.merging else ""
     merging = skip("merging", "impossible", why) if why else settings.merging
     why = _why_not_guided(prepared, settings, bool(hit), bool(direct))
-    if why and settings.photon_guiding == "always":
+    if why and settings.guiding == "always":
         skip("guided s=0", "impossible", why)
     guidable = not why
     if merging:  # a pilot may choose not to merge where s = 0 samples that light too
         guidable = guidable and not (emitters.unhittable or emitters.beams)
-    elif guidable and settings.photon_guiding == "never":
-        guidable = skip("guided s=0", "by hand", "photon_guiding=never")
+    elif guidable and settings.guiding in ("emission", "never"):
+        guidable = skip("guided s=0", "by hand", f"guiding={settings.guiding}")
     for name, why in emitters.left_out:
         skip(name, "impossible", why)
 
@@ -82,7 +82,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
         merging=merging,
-        guided=GUIDED[0] if guidable and not merging and settings.photon_guiding == "always" else 0,
+        guided=GUIDED[0] if guidable and not merging and settings.guiding == "always" else 0,
         guidable=guidable,
         teachable=teachable,
     )
@@ -101,8 +101,8 @@ def why_not_joined(prepared: PreparedScene, merging: bool) -> str:
 
 def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str] | None:
     """Level and reason why emission cannot be guided; None if it can."""
-    if settings.emission_guiding == "never":
-        return "by hand", "emission_guiding=never"
+    if settings.guiding in ("photons", "never"):
+        return "by hand", f"guiding={settings.guiding}"
     if not emitters.table_count:
         return (
             "impossible",

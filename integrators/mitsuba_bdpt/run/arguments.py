@@ -55,8 +55,9 @@ def samples_per_pixel(sensor, spp, settings) -> int:
             "too; set one of them to 1 or more"
         )
     if settings.variance and spp < REPLICATES:
+        of = "layers=variance" if "variance" in settings.layers else f"target_error={settings.target_error:g}"
         raise UsageError(
-            f"variance=True with spp={spp} is not possible; the variance needs at least {REPLICATES} "
+            f"{of} with spp={spp} is not possible; the variance needs at least {REPLICATES} "
             "samples per pixel, one for each independent part of the render"
         )
     return spp
