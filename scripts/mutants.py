@@ -1258,7 +1258,7 @@ MUTANTS = (
         "d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)",
         "d, si.wi, pdf_w = self._sample_direction(chosen.index, si, u_direction, active)\n"
         "        pdf_w = dr.maximum(dr.dot(si.sh_frame.n, d), 0) * dr.inv_pi",
-        ("tests/emitters/test_emission_tables.py::test_light_leaves_as_without_tables[rectangle]",),
+        ("tests/guided_emission/test_emission_tables.py::test_light_leaves_as_without_tables[rectangle]",),
     ),
     Mutant(
         "guided emission: s = 1 takes emission for not guided",
@@ -1275,7 +1275,7 @@ MUTANTS = (
         "density = self.guide.density(index, self.place(index, p, d * sign, active), active)",
         "density = self.guide.density(index, self.place(index, p, d, active), active)",
         (
-            "tests/emitters/test_emission_tables.py::test_next_event_estimation_and_hits_state_the_same[constant]",
+            "tests/guided_emission/test_emission_tables.py::test_next_event_estimation_and_hits_state_the_same[constant]",
         ),
     ),
     Mutant(
@@ -1292,65 +1292,65 @@ MUTANTS = (
         "emitters/disks.py",
         "turned = mi.Frame3f(mi.Vector3f(dr.dot(x, d), dr.dot(y, d), dr.dot(z, d)))\n    s, t",
         "return mi.Frame3f(d)\n    s, t",
-        ("tests/emitters/test_emission_tables.py::test_frames_do_not_depend_on_who_asks[n3]",),
+        ("tests/guided_emission/test_emission_tables.py::test_frames_do_not_depend_on_who_asks[n3]",),
     ),
     Mutant(
         "guided emission: directions of curved lamps are not turned",
         "emitters/area.py",
         "turned = dr.mulsign(turned, dr.dot(si.sh_frame.n, turned))",
         "pass",
-        ("tests/emitters/test_emission_tables.py::test_light_leaves_as_without_tables[sphere]",),
+        ("tests/guided_emission/test_emission_tables.py::test_light_leaves_as_without_tables[sphere]",),
     ),
     Mutant(
         "guided emission: points on the details' disk have the density of another cell",
         "emitters/disks.py",
         "density = dr.select(aimed, guided.density(p), density)",
         "pass",
-        ("tests/emitters/test_emission_tables.py::test_details_beside_tables[middle-130-False]",),
+        ("tests/guided_emission/test_emission_tables.py::test_details_beside_tables[middle-130-False]",),
     ),
     Mutant(
         "guided emission: what is learnt of curved lamps leaves out the cosine",
         "emitters/area.py",
         "curved = (1 - PLAIN) / (2 * dr.maximum(cos, _LEAST_COS))",
         "curved = (1 - PLAIN) / (2 * dr.maximum(cos * 0 + 1, _LEAST_COS))",
-        ("tests/emitters/test_emission_tables.py::test_what_tables_change_of_a_density[sphere]",),
+        ("tests/guided_emission/test_emission_tables.py::test_what_tables_change_of_a_density[sphere]",),
     ),
     Mutant(
         "guided emission: both halves of a pilot teach and judge",
-        "planning/emission.py",
+        "guided_emission/learning.py",
         "halves = [_fitted(half, times) for half in heard]",
         "halves = [_fitted(heard[1 - i], times) for i in range(HALVES)]",
         ("tests/images/test_guided_emission.py::test_noise_teaches_nothing[24]",),
     ),
     Mutant(
         "guided emission: tables that are blurred more come first",
-        "planning/emission.py",
+        "guided_emission/learning.py",
         "for times in BLURS[side]]",
         "for times in BLURS[side][::-1]]",
         ("tests/images/test_guided_emission.py::test_detail_is_kept_where_it_pays",),
     ),
     Mutant(
         "guided emission: tables that are blurred more are not tried",
-        "planning/emission.py",
+        "guided_emission/learning.py",
         "for times in BLURS[side]]",
         "for times in BLURS[side][:1]]",
         ("tests/images/test_guided_emission.py::test_noise_is_blurred_where_it_would_not_pay",),
     ),
     Mutant(
         "guided emission: the last cell of a row is found in rows of a power of two alone",
-        "emitters/emission_tables.py",
+        "guided_emission/tables.py",
         "cells -= step",
         "cells = step",
         (
             (
-                "tests/emitters/test_emission_tables.py::"
+                "tests/guided_emission/test_emission_tables.py::"
                 "test_warped_numbers_are_distributed_as_the_tables_say[24]"
             ),
         ),
     ),
     Mutant(
         "guided emission: what camera subpaths find is aimed at",
-        "planning/emission.py",
+        "guided_emission/learning.py",
         "density = density * np.sqrt((squares * _SHARES / _totals(density) ** 2).sum(axis=-1))",
         "density = density * np.sqrt((squares / _totals(density) ** 2).sum(axis=-1))",
         ("tests/images/test_guided_emission.py::test_the_best_table_of_unequal_shares",),

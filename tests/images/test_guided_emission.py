@@ -10,10 +10,10 @@ import pytest
 import scene_parts as parts
 import variants
 import welch as st
-from mitsuba_bdpt.emitters.emission_tables import EmissionTables, side_of
 from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.guided_emission import Cells, EmissionTables, learning, side_of
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
-from mitsuba_bdpt.planning import emission, pilot
+from mitsuba_bdpt.planning import pilot
 from mitsuba_bdpt.run import rendering
 from snapshots import ROUNDING, stopped
 from test_merging import images as rendered_images
@@ -23,14 +23,14 @@ from stress_cases.weights import Tally, weigh
 
 SCENES = Path(__file__).parents[2] / "scenes"
 T = mi.ScalarTransform4f
-CLASSES = emission.CLASSES
+CLASSES = learning.CLASSES
 
 
 def random_tables(scene, seed=1):
     """Tables of a scene's emitters, of neighbours that differ by up to 50."""
     emitters = Emitters(scene)
-    side = side_of(emitters.table_count)
-    densities = np.random.default_rng(seed).random((emitters.table_count, side, side)) ** 4 + 0.02
+    side = side_of(sum(emitters.tables))
+    densities = np.random.default_rng(seed).random((sum(emitters.tables), side, side)) ** 4 + 0.02
     return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), 0.5)
 
 
@@ -178,9 +178,9 @@ def test_weights_are_those_of_explicit_densities(lamps, heuristic):
 def heard_of(squares, odds, seed=0, noise=0.0):
     """What two halves of a pilot hear of these second moments (side, side), in one class of ``odds``."""
     rng = np.random.default_rng(seed)
-    heard = np.zeros((2, squares.size, emission.COLUMNS))
+    heard = np.zeros((2, squares.size, learning.COLUMNS))
     kind = int(np.clip(np.log2(odds) / 2 + CLASSES / 2, 0, CLASSES - 1))
-    share = emission.ODDS[kind] / (1 + emission.ODDS[kind])
+    share = learning.ODDS[kind] / (1 + learning.ODDS[kind])
     for half in range(2):
         found = (squares * np.exp(noise * rng.standard_normal(squares.shape))).ravel()
         heard[half, :, kind], heard[half, :, CLASSES], heard[half, :, CLASSES + 1] = (
@@ -198,7 +198,7 @@ def test_the_best_table_of_paths_that_emission_alone_makes():
     """
     x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 16))
     squares = np.exp(4 * x + 2 * y)
-    learnt = emission.learn(heard_of(squares, 4.0**4), 16, [1])
+    learnt = learning.learn(heard_of(squares, 4.0**4), 16, [1])
     root = np.sqrt(squares)
     expected = 0.25 + 0.75 * root / root.mean()
     np.testing.assert_allclose(learnt.tables.densities()[0], expected, rtol=0.08)
@@ -210,9 +210,9 @@ def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
     """Expected: no tables where emission has a 256th part in the densities, whatever the moments are."""
     squares = np.ones((16, 16))
     squares[3:5, 7:9] = 1e4
-    assert emission.learn(heard_of(squares, 4.0**-4), 16, [1]).whole > 0.95
+    assert learning.learn(heard_of(squares, 4.0**-4), 16, [1]).whole > 0.95
     few = heard_of(squares, 4.0**4) * 1e-3 + heard_of(np.full((16, 16), 1e4), 4.0**-4)
-    assert emission.learn(few, 16, [1]).whole > 0.95
+    assert learning.learn(few, 16, [1]).whole > 0.95
 
 
 def test_the_best_table_of_unequal_shares():
@@ -223,7 +223,7 @@ def test_the_best_table_of_unequal_shares():
     squares[:, :8] = 3.0
     often, seldom = heard_of(squares, 4.0**1), heard_of(squares, 4.0**-3)
     heard = np.where((np.arange(256) % 16 < 8)[None, :, None], seldom, often)
-    share = emission.ODDS / (1 + emission.ODDS)
+    share = learning.ODDS / (1 + learning.ODDS)
     whole = heard.sum(axis=0).reshape(16, 16, -1)[..., :CLASSES]
 
     def moment(high):
@@ -231,7 +231,7 @@ def test_the_best_table_of_unequal_shares():
         return (whole / (1 - share + density * share)).sum()
 
     least = min(moment(high) for high in np.linspace(0.05, 1.95, 400))
-    fitted = emission._fitted(heard.sum(axis=0).reshape(1, 16, 16, -1), 1)[0]
+    fitted = learning._fitted(heard.sum(axis=0).reshape(1, 16, 16, -1), 1)[0]
     found = (whole / (1 - share + fitted[..., None] * share)).sum()
     assert found < 1.02 * least
     assert moment(1.0) > 1.02 * least
@@ -274,8 +274,8 @@ def test_noise_teaches_nothing(side):
     even, odd = np.ones((side, side)), np.ones((side, side))
     odd[side // 4 : side // 2, side // 4 : side // 2] = 400
     for seed in range(20):
-        assert emission.learn(heard_of(even, 16.0, seed, noise=2.0), side, [1]).tables is None
-        assert emission.learn(heard_of(odd, 16.0, seed, noise=1.0), side, [1]).tables is not None
+        assert learning.learn(heard_of(even, 16.0, seed, noise=2.0), side, [1]).tables is None
+        assert learning.learn(heard_of(odd, 16.0, seed, noise=1.0), side, [1]).tables is not None
 
 
 def hill(side, height):
@@ -291,25 +291,25 @@ def test_detail_is_kept_where_it_pays():
     """
     squares = hill(24, 50)
     heard = heard_of(squares, 16.0, seed=4, noise=1.2)
-    narrow, wide = emission.BLURS[24]
-    ways = [emission._learnt(heard.reshape(2, 1, 24, 24, -1), times, [1]) for times in (narrow, wide)]
-    assert narrow < wide and ways[1].left < ways[0].left < emission.PAYS
-    assert emission.learn(heard, 24, [1]) == ways[0]
+    narrow, wide = learning.BLURS[24]
+    ways = [learning._learnt(heard.reshape(2, 1, 24, 24, -1), times, [1]) for times in (narrow, wide)]
+    assert narrow < wide and ways[1].left < ways[0].left < learning.PAYS
+    assert learning.learn(heard, 24, [1]) == ways[0]
 
 
 def test_noise_is_blurred_where_it_would_not_pay():
     """Expected: of moments that are noise over a wide hill 20 pilots learn twice as often by the wide blur as
     by the narrow one, which is used where both pay.
     """
-    narrow, wide = emission.BLURS[24]
+    narrow, wide = learning.BLURS[24]
     pays = {narrow: 0, wide: 0}
     for seed in range(20):
         heard = heard_of(hill(24, 20), 16.0, seed, noise=2.0)
-        ways = {n: emission._learnt(heard.reshape(2, 1, 24, 24, -1), n, [1]) for n in pays}
+        ways = {n: learning._learnt(heard.reshape(2, 1, 24, 24, -1), n, [1]) for n in pays}
         for n, learnt in ways.items():
             pays[n] += learnt.tables is not None
         both = all(learnt.tables is not None for learnt in ways.values())
-        assert emission.learn(heard, 24, [1]) == ways[narrow if both else wide]
+        assert learning.learn(heard, 24, [1]) == ways[narrow if both else wide]
     assert pays[wide] >= 2 * pays[narrow] > 0
 
 
@@ -317,7 +317,7 @@ def test_outliers_alone_teach_nothing():
     """Expected: no tables where all that is gained is in the cells with most, and the rest loses."""
     squares = np.exp(np.random.default_rng(2).standard_normal((16, 16)))
     squares[2, 3] = 1e5
-    assert emission.learn(heard_of(squares, 64.0), 16, [1]).tables is None
+    assert learning.learn(heard_of(squares, 64.0), 16, [1]).tables is None
 
 
 def test_emitters_without_a_part_are_left_alone():
@@ -325,7 +325,7 @@ def test_emitters_without_a_part_are_left_alone():
     squares = np.ones((2, 16, 16))
     squares[0, 4:8, 4:8] = 400
     squares[1] = 1e-3
-    learnt = emission.learn(heard_of(squares, 64.0), 16, [1, 1])
+    learnt = learning.learn(heard_of(squares, 64.0), 16, [1, 1])
     densities = learnt.tables.densities()
     assert densities[0].std() > 0.5 and (densities[1] == 1).all()
 
@@ -333,8 +333,8 @@ def test_emitters_without_a_part_are_left_alone():
 @pytest.mark.parametrize("value", [0.0, np.inf, np.nan])
 def test_nothing_heard(value):
     """Expected: no tables of nothing, and none of what is no number."""
-    heard = np.full((2, 256, emission.COLUMNS), value)
-    assert emission.learn(heard, 16, [1]) == emission.Learnt(None)
+    heard = np.full((2, 256, learning.COLUMNS), value)
+    assert learning.learn(heard, 16, [1]) == learning.Learnt(None)
 
 
 # -- renders --------------------------------------------------------------------------------------------
@@ -430,7 +430,7 @@ def test_many_lamps_have_small_tables_or_none():
         }
 
     many = mi.load_dict(parts.open_scene(**lamps(40)))
-    assert Emitters(many).placed().side == 8
+    assert Cells(Emitters(many)).side == 8
     most = mi.load_dict(parts.open_scene(**lamps(613)))
     text = mi.load_dict({"type": "bdpt", "max_depth": 4}).explain(most, spp=4)
     assert "guided emission: 613 tables would be needed, and 612 are the most" in text

@@ -11,8 +11,10 @@ from dataclasses import dataclass, field, fields
 
 import drjit as dr
 import numpy as np
-from mitsuba_bdpt.emitters.emission_tables import PLAIN, SKY_BINS, cell_at
+from mitsuba_bdpt.emitters.area import PLAIN
 from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.emitters.infinite import SKY_BINS
+from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.geometry.flat import is_flat
 from mitsuba_bdpt.run import rendering

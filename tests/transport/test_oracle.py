@@ -609,7 +609,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         merging=None,
         guide=None,
         without_isolated=False,
-        tells_emission=False,
+        cells=None,
         sensor_medium=None,
         scatters=True,
     )

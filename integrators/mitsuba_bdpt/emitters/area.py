@@ -21,10 +21,9 @@ from ..geometry.mitsubas_choices import (
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
 from ..host import renamed
 from ..host.introspection import children, named, number, own_parameters
-from .emission_tables import PLAIN, EmissionGuide, Factor, Place
 from .group import Context, Group, weight_over
 from .hit_only import HitOnlyEmitters
-from .records import Chosen, Direct, Emission, Hit
+from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .surfaces import Surfaces, spheres_of
 from .tables import Mask, look_up, rows, table
 from .textured import TexturedPoints, is_mapped
@@ -57,13 +56,16 @@ class _Sphere:
         )
 
 
+# Share of a curved light's directions sampled by the cosine where emission is guided.
+PLAIN = 0.25
+
 # Lower bound of the cosine that a density is divided by.
 _LEAST_COS = 1e-3
 
 
 @dataclass
 class _Table:
-    """Coordinates of the guiding table of an area light's emission.
+    """Coordinates of the square of an area light's directions.
 
     Flat lights (``flat`` 1): directions about the normal in the frame ``s``, ``t``, ``n``, stored because a
     frame built from a normal is mirrored by the sign of a zero. Curved lights: directions in world space, up

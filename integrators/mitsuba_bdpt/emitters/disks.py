@@ -2,7 +2,7 @@
 
 One disk covers the scene. If the scene has details, shapes that are small beside it and lie together, part of
 the subpaths starts on a second disk that covers these. Every density is that of the mixture. Where emission
-is guided (`emission_tables`), the tables replace the second disk unless the details are smaller than a cell.
+is guided, the guide's tables replace the second disk unless the details are smaller than a cell.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry.boxes import boxes
-from .emission_tables import Factor
+from .records import Factor
 
 # Longest side of a detail's bounding box, relative to the scene's.
 DETAIL = 0.25

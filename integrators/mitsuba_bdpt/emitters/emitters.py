@@ -14,16 +14,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UsageError
 from ..geometry import rounding
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
-from .emission_tables import Cell, EmissionGuide, EmissionTables, cell_at, side_of
 from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party, needs_evaluation
-from .records import Chosen, Direct, Emission, Hit
+from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .tables import Mask, inverse_table
 
 
@@ -45,7 +43,7 @@ class Emitters:
     * ``evaluated``: an emitter in the process, even of another scene, requires evaluated loops and calls.
     * ``left_out``: strategies that single emitters lack, with reasons.
     * ``groups`` of the scene; ``disks``: where light subpaths from infinity start, or None; ``shape_errors``.
-    * ``table_count``: tables of guided emission; ``side`` of the tables that `cell` refers to (else 0).
+    * ``tables``: squares of primary numbers of each emitter, see `place`; ``has_places``: it has `place`.
     """
 
     def __init__(self, scene: mi.Scene, facts: ShapeFacts | None = None):
@@ -58,7 +56,7 @@ class Emitters:
         registered = registered_emitters()
         self._summarize(emitters, types, weights)
         self.evaluated = any(map(needs_evaluation, registered))
-        self.groups, self.disks, self.side, self.first = (), None, 0, None
+        self.groups, self.disks, self.has_places = (), None, False
         if not emitters:
             return
         make_parameters_opaque([*emitters, *filter(None, (e.get_shape() for e in emitters))])
@@ -124,52 +122,25 @@ class Emitters:
         """Largest `infinite.contrast`; infinite unless all light comes from environments."""
         return max((contrast(emitter) for emitter in self.scene.emitters()), default=math.inf)
 
-    # -- guided emission --------------------------------------------------------------------
+    # -- hooks of guided emission -------------------------------------------------------------
 
-    @property
-    def table_count(self) -> int:
-        return sum(self.tables)
-
-    def placed(self, tables: EmissionTables | None = None) -> Emitters:
-        """Return a copy that has `cell`, guided by ``tables`` if given.
-
-        Raises ``UsageError`` for tables of other emitters.
-        """
+    def placed(self, guide: EmissionGuide | None = None, is_guided: Sequence[bool] = ()) -> Emitters:
+        """Return a copy that has `place`; ``guide`` guides the emitters where ``is_guided``."""
         other = copy(self)
-        other.side = side_of(self.table_count) if tables is None else tables.side
-        densities = None if tables is None else tables.densities()
-        if densities is not None and len(densities) != self.table_count:
-            raise UsageError(
-                f"decisions: emission has {len(densities)} tables, but the scene's emitters need "
-                f"{self.table_count}; use what a render of this scene has recorded"
-            )
-        first = []
-        for index, own in enumerate(self.tables):
-            before = sum(self.tables[:index])
-            used = own > 0 and (densities is None or bool((densities[before : before + own] != 1).any()))
-            first.append(1 + before if used else 0)
-        other.first = mi.UInt32(first)
-        dr.make_opaque(other.first)
-        guide = None if tables is None else EmissionGuide(tables, other.first)
+        other.has_places = True
         other.groups = tuple(
-            group.placed(guide if guide is not None and any(first[i] > 0 for i in own) else None)
+            group.placed(guide if guide is not None and any(is_guided[i] for i in own) else None)
             for group, own in zip(self.groups, self._of_groups, strict=True)
         )
         return other
 
-    def cell(self, index: mi.UInt32, p, d, cos, active: mi.Bool) -> Cell:
-        """Cells of emissions of the emitters ``index`` that pass ``p`` along ``d``.
-
-        ``cos`` with the geometric normal. Only for copies made by `placed`.
-        """
-        first = dr.gather(mi.UInt32, self.first, index, active)
+    def place(self, index: mi.UInt32, p, d, cos, side: int, active: mi.Bool) -> tuple[Place, Factor]:
+        """`Group.place` and `Group.factor` of emissions; only for copies made by `placed`."""
 
         def where(group: Group, mask: mi.Bool):
-            return group.place(index, p, d, mask), group.factor(index, p, d, cos, self.side, mask)
+            return group.place(index, p, d, mask), group.factor(index, p, d, cos, side, mask)
 
-        place, factor = self._ask(where, self._supporting("guidable"), index, active)
-        table = dr.select(first > 0, first - 1 + place.bin, 0)
-        return Cell(table * self.side**2 + cell_at(place.u, self.side), first > 0, factor)
+        return self._ask(where, self._supporting("guidable"), index, active)
 
     # -- selection and dispatch -------------------------------------------------------------
 
@@ -297,7 +268,7 @@ class Emitters:
         )
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
-        if self.side:  # only then: branches would carry it along
+        if self.has_places:  # only then: branches would carry it along
             direct.index = chosen.index
         if self.shape_errors.small:
             direct.met = rounding.met(chosen.emitter.get_shape())
@@ -313,12 +284,12 @@ class Emitters:
     def _index_of(self, emitter, active):
         return dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)
 
-    def hit_cell(self, si, previous, active) -> Cell:
-        """`cell` of the emitter point hit; see `hit_densities`."""
+    def emission_of_hit(self, si, previous, active):
+        """Emitter, point, direction and cosine of the emission from a hit to ``previous``."""
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))
         d = dr.select(si.is_valid(), dr.normalize(previous - si.p), mi.Vector3f(si.wi))
-        return self.cell(self._index_of(emitter, active), previous, d, dr.abs(dr.dot(si.n, d)), active)
+        return self._index_of(emitter, active), previous, d, dr.abs(dr.dot(si.n, d)), active
 
     def hit_densities(self, si, previous, active):
         """Densities of the light-side strategies at the emitter point hit.

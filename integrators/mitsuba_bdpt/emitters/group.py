@@ -12,8 +12,7 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import named
-from .emission_tables import EmissionGuide, Factor, Place
-from .records import Chosen, Direct, Emission, Hit
+from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ class Group:
 
     @classmethod
     def tables(cls, emitter) -> int:
-        """Number of tables that guide the emission of this emitter."""
+        """Number of squares of primary numbers of this emitter, see `place`; 0: not guidable."""
         return 0
 
     def placed(self, guide: EmissionGuide | None) -> Group:
@@ -88,14 +87,17 @@ class Group:
         return other
 
     def place(self, index: mi.UInt32, p, d, active) -> Place:
-        """Positions in their tables of emissions of ``index`` that pass ``p`` along ``d``.
+        """Primary numbers of emissions of ``index`` that pass ``p`` along ``d``.
 
         Only for copies made by `placed`.
         """
         raise NotImplementedError(f"{type(self).__name__} has no place")
 
     def factor(self, index: mi.UInt32, p, d, cos, side: int, active) -> Factor:
-        """Effect of tables on the density of such emissions; ``cos``: geometric normal's."""
+        """Effect of a guide on the density of such emissions; ``cos``: geometric normal's.
+
+        ``side``: cells per side of the guide's tables.
+        """
         return Factor.whole()
 
     # -- emission ---------------------------------------------------------------------------

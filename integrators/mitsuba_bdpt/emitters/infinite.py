@@ -12,10 +12,12 @@ from ..geometry import rays
 from ..geometry.to_world import check_rotation
 from ..host.introspection import own_parameters
 from .disks import AIMED, Disks, Guided
-from .emission_tables import SKY_BINS, Factor, Place, cell_at
 from .group import Context, Group, emitting_point, free_emission, weight_over
-from .records import Chosen, Direct, Emission, Hit
-from .tables import Mask, rows
+from .records import Chosen, Direct, Emission, Factor, Hit, Place
+from .tables import Mask, cell_at, rows
+
+# Bins per dimension of an environment's directions, each with a square of points on a disk.
+SKY_BINS = 4
 
 # Largest environment map (values) whose contrast is computed.
 _QUICKLY_READ = 1 << 20

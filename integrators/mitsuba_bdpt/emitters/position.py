@@ -11,10 +11,9 @@ from ..errors import UsageError
 from ..geometry import rays
 from ..geometry.to_world import check_angles
 from ..host.introspection import named, own_parameters
-from .emission_tables import Place
 from .group import Context, Group, emitting_point, free_emission, weight_over
 from .projectors import Projectors
-from .records import Chosen, Direct, Emission
+from .records import Chosen, Direct, Emission, Place
 from .tables import Mask, look_up, rows, table
 
 

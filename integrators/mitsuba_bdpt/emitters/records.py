@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -66,6 +67,51 @@ class Direct:
     emission_ratio: mi.Float
     met: mi.UInt32 | None = None
     index: mi.UInt32 | None = None
+
+
+@dataclass
+class Place:
+    """An emission's primary numbers ``u`` in the unit square, and the square's index ``bin``.
+
+    `group.Group.place` defines the squares of an emitter.
+    """
+
+    bin: mi.UInt32
+    u: mi.Point2f
+
+
+@dataclass
+class Factor:
+    """Effect on the density of emission of a guide with density r: ``kept`` + ``scaled`` r."""
+
+    scaled: mi.Float
+    kept: mi.Float
+
+    @staticmethod
+    def whole() -> Factor:
+        """The guide's density applies to all of the emission."""
+        return Factor(mi.Float(1), mi.Float(0))
+
+
+@dataclass
+class Cell:
+    """Cell of an emission: ``number`` in all tables, ``known`` if it has a table."""
+
+    number: mi.UInt32
+    known: mi.Bool
+    factor: Factor
+
+
+class EmissionGuide(Protocol):
+    """Densities over the squares of primary numbers, see `guided_emission.tables.Guide`."""
+
+    side: int
+
+    def is_guided(self, index: mi.UInt32, active) -> mi.Bool: ...
+
+    def density(self, index: mi.UInt32, place: Place, active) -> mi.Float: ...
+
+    def warp(self, index: mi.UInt32, which: mi.UInt32, u: mi.Point2f, active) -> tuple: ...
 
 
 @dataclass

@@ -12,6 +12,9 @@ import numpy as np
 
 Record = TypeVar("Record")
 
+# Largest float below 1.
+BELOW_ONE = 1 - 2**-24
+
 
 def rows(emitters, default, row) -> list:
     """``row(emitter)`` of each of ``emitters``, ``default`` where one is None."""
@@ -34,6 +37,12 @@ def table(records: list[Record]) -> Record:
     made = replace(records[0], **{name: column(name) for name in vars(records[0])})
     dr.make_opaque(made)
     return made
+
+
+def cell_at(u: mi.Point2f, side: int) -> mi.UInt32:
+    """Index of the cell at ``u`` in a square of ``side`` x ``side`` cells."""
+    at = mi.Point2u(dr.clip(u, 0, BELOW_ONE) * side)
+    return mi.UInt32(dr.minimum(at.y, side - 1) * side + dr.minimum(at.x, side - 1))
 
 
 def look_up(columns: Record, index: mi.UInt32, active: mi.Bool) -> Record:

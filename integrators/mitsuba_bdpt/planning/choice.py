@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..emitters.emission_tables import EmissionTables
-from ..transport.plan import GUIDED
+from ..transport.plan import GUIDED, EmissionTables
 from .configuration import WEIGHTINGS, Configuration, Decision
 from .even_sky import SKY_DIRECT
 from .moments import GROUPS, Moments

@@ -10,10 +10,10 @@ import json
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeGuard
 
-from ..emitters.emission_tables import EmissionTables
+from .. import components
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
-from ..transport.plan import GUIDED, JOINED, Plan
+from ..transport.plan import GUIDED, JOINED, EmissionTables, Plan
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def _read_decision(entry: Any) -> Decision:
         first_pass=first_pass,
         guided=guided,
         joined=joined,
-        emission=None if emission is None else EmissionTables.read(emission),
+        emission=None if emission is None else components.guided_emission.EmissionTables.read(emission),
         **numbers,
     )
 

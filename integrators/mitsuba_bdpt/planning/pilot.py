@@ -33,6 +33,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import components
 from ..sampling.points import Points
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
@@ -42,12 +43,25 @@ from ..transport.contribution import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.plan import Plan
-from . import emission, isolated, moments
+from . import isolated, moments
 from .configuration import WEIGHTINGS, Weighting
 from .even_sky import UNIFORM
-from .moments import FINE, GROUPS, PER_PIXEL, SAMPLE, SPLAT, SUMS, Isolated, Layout, Moments, tile_of
+from .moments import (
+    FINE,
+    GROUPS,
+    HEARD_TILES,
+    PER_PIXEL,
+    SAMPLE,
+    SPLAT,
+    SUMS,
+    Isolated,
+    Layout,
+    Moments,
+    tile_of,
+)
 
 if TYPE_CHECKING:
+    from ..guided_emission import Listener
     from ..sampling.points import Stream
     from ..sensors.records import CameraStart, Region
     from ..transport.contribution import Contribution
@@ -103,7 +117,7 @@ class Pilot:
         batch: Batch,
         rarest: float,
         media: bool = False,
-        listener: emission.Listener | None = None,
+        listener: Listener | None = None,
     ):
         self._listener = listener
         # Weight of a splat relative to a camera sample.
@@ -186,7 +200,9 @@ class Pilot:
             # Samples of a pixel are in one half.
             pair = (lane - self._first_net) // (NETS * NET)
             half = dr.select(lane < self._first_net, moments.group(lane), pair) % 2
-            self._listener.hear(c, position, half, dr.square(size), active & (size > 0))
+            tile = tile_of(self._region, position, HEARD_TILES)
+            square, active = dr.square(size), active & (size > 0)
+            self._listener.hear(c.shares, c.emission, tile, half, square, active)
 
     def evaluate(self, counts: mi.UInt64):
         """Evaluate the recorded kernel together with ``counts``."""
@@ -297,9 +313,9 @@ def measure(
     kernel.without_isolated = found is not None or (everything.guidable and not guiding)
     region, listener = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
-        kernel.emitters, kernel.tells_emission = kernel.emitters.placed(), True
-        cells = kernel.emitters.table_count * kernel.emitters.side**2
-        listener = emission.Listener(region, cells)
+        kernel.cells = components.guided_emission.Cells(prepared.emitters)
+        kernel.emitters = kernel.cells.emitters
+        listener = components.guided_emission.Listener(HEARD_TILES**2, kernel.cells.count)
     pixels = int(region.size.prod())
     stratified = settings.points == "sobol"
     nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0

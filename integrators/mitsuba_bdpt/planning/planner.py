@@ -5,25 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
-from ..emitters.emission_tables import EmissionTables, side_of
+from .. import components
 from ..errors import UsageError
 from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import LIGHT_PATHS, Settings
-from ..transport.plan import JOINED, Plan
-from . import budget, choice, emission, even_sky, pilot
+from ..transport.plan import JOINED, EmissionTables, Plan
+from . import budget, choice, even_sky, pilot
 from .candidates import candidates
 from .configuration import Decision, replayed
 from .explain import words
 from .findings import Findings
 from .moments import Moments
 from .possible import plan, unreachable_paths, why_not_joined
+
+if TYPE_CHECKING:
+    from ..guided_emission import Learnt
 
 # Samples per pixel after which a second pilot runs, then after four times as many, and so on.
 FIRST_REPEAT = 32
@@ -172,16 +175,17 @@ class Planner:
             table[0] = self._joined(table[0], samples)
             gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
+            unguided = table[0].candidate.emission is None
             left_out = (
                 *choice.left_out(table, gain, name),
                 *UNMEASURED * (self.full.guidable and not moments.isolated.size),
-                *emission.left_out(table[0].candidate, learnt),
+                *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
         return _Answer(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)
 
     def _aimed(
         self, table: list[choice.Prediction], moments: Moments, samples: int
-    ) -> tuple[list[choice.Prediction], emission.Learnt | None]:
+    ) -> tuple[list[choice.Prediction], Learnt | None]:
         """Add guided emission to ``table`` where it pays; also returns what was learnt."""
         self._with_tables = None
         if not moments.emission.size:
@@ -193,8 +197,9 @@ class Planner:
             return table, learnt
         tables, before = learnt.tables, self.plan.emission
         if before is not None:
-            left = emission.left_by(before, moments.emission)
-            tables = tables if emission.left_by(tables, moments.emission) < BETTER_TABLES * left else before
+            left_by = components.guided_emission.left_by
+            left = left_by(before, moments.emission)
+            tables = tables if left_by(tables, moments.emission) < BETTER_TABLES * left else before
         if not is_lit:
             found = self._measured(samples, tables)
             aimed = choice.choose(found, self._alternatives(samples))
@@ -221,12 +226,12 @@ class Planner:
     def _why_not_joined(self) -> str:
         return why_not_joined(self._prepared, self.full.merging)
 
-    def _learnt(self, moments: Moments, samples: int) -> emission.Learnt:
+    def _learnt(self, moments: Moments, samples: int) -> Learnt:
         """Fit tables of emission; the first pilot's are cached (20 ms under a sky)."""
-        emitters = self._prepared.emitters
+        counts, component = self._prepared.emitters.tables, components.guided_emission
 
-        def learn() -> emission.Learnt:
-            return emission.learn(moments.emission, side_of(emitters.table_count), emitters.tables)
+        def learn() -> Learnt:
+            return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
         if self.decided.pilots.asked > 1:
             return learn()

@@ -8,7 +8,7 @@ from enum import Enum
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.emission_tables import MOST_CELLS, SIDES, side_of
+from .. import components
 from ..emitters.emitters import Emitters
 from ..geometry.boxes import scene_box
 from ..host.introspection import world_matrix
@@ -103,15 +103,8 @@ def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[st
     """Level and reason why emission cannot be guided; None if it can."""
     if settings.guiding in ("photons", "never"):
         return "by hand", f"guiding={settings.guiding}"
-    if not emitters.table_count:
-        return (
-            "impossible",
-            "no emitter's directions can be guided: projectors and directionalarea have their own",
-        )
-    if not side_of(emitters.table_count):
-        most = MOST_CELLS // SIDES[-1] ** 2
-        return "impossible", f"{emitters.table_count} tables would be needed, and {most} are the most"
-    return None
+    why = components.why_absent("guided_emission") or components.guided_emission.why_not(emitters)
+    return ("impossible", why) if why else None
 
 
 def _defaults(settings: Settings) -> tuple[float, str]:

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..emitters.emission_tables import Cell
+from ..emitters.records import Cell
 from ..media.media import Space
 from . import spectra
 from .inputs import Kernel
@@ -115,7 +115,7 @@ class Contribution:
     ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`; ``position`` on the film in pixels, None
     for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
     the connected edge until `visibility.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
-    ``emission``: result of `Emitters.cell`, for pilots. ``towards``: direction in which light reaches the
+    ``emission``: of `Kernel.cells`, for pilots. ``towards``: direction in which light reaches the
     sensor, None for t >= 2 (`CameraStart`).
     """
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +14,9 @@ from ..sampling.points import Points
 from ..settings import MAX_STORED, Settings
 from . import mis
 from .plan import Plan
+
+if TYPE_CHECKING:
+    from ..guided_emission import Cells
 
 # Sizes of the lanes' local memory: irrelevant to the speed of CPUs; few sizes give few kernels.
 STORE_SIZES = (64, 256, MAX_STORED)
@@ -86,9 +90,8 @@ class Kernel:
     def __init__(self, prepared, plan: Plan, settings: Settings, heuristic: mis.Heuristic):
         u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
         self.scene, self.camera = prepared.scene, prepared.camera
-        self.emitters = (
-            prepared.emitters if plan.emission is None else prepared.emitters.placed(plan.emission)
-        )
+        tables = plan.emission
+        self.emitters = prepared.emitters if tables is None else tables.guided(prepared.emitters)
         self.plan, self.heuristic = plan, heuristic
         self.shape_errors = prepared.emitters.shape_errors
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
@@ -119,8 +122,8 @@ class Kernel:
         self.guide = None
         # Whether s = 0 skips paths on which it could be guided, see `photons.guiding_benefit`.
         self.without_isolated = False
-        # Whether contributions store their emission, see `Contribution.emission`.
-        self.tells_emission = False
+        # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
+        self.cells: Cells | None = None
 
     def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
         """The kernel for one batch with its ``points``.

@@ -91,7 +91,7 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from ..emitters.emission_tables import Cell
+from ..emitters.records import Cell
 from ..sampling.points import Points, Purpose
 from . import (
     contribution,
@@ -215,8 +215,8 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     plan = kernel.plan
     e = subpaths.emission(kernel, stream, shared)
     emitted = None
-    if kernel.tells_emission:
-        emitted = kernel.emitters.cell(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
+    if kernel.cells is not None:
+        emitted = kernel.cells.at(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
     counters = Counters()
 
     def splat(c):

@@ -3,14 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
-from ..emitters.emission_tables import EmissionTables
+from ..emitters.emitters import Emitters
 
 # Numbers of light subpaths with which a camera subpath can be connected.
 JOINED = (1, 4)
 
 # Numbers of guided samples per vertex among which a pilot chooses.
 GUIDED = (1, 4, 8)
+
+
+class EmissionTables(Protocol):
+    """Tables that guide emission, see `guided_emission`; ``left``: predicted share of squared errors."""
+
+    @property
+    def left(self) -> float: ...
+
+    def guided(self, emitters: Emitters) -> Emitters: ...
+
+    def record(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)

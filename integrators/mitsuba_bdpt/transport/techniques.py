@@ -77,7 +77,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
     weight, shares = h.weigh(kernel.kappa.hit, light_side, camera_side)
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
-    emission = emitters.hit_cell(z.si, z.previous, active) if kernel.tells_emission else None
+    emission = None if kernel.cells is None else kernel.cells.of_hit(z.si, z.previous, active)
     return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
 
 
@@ -131,9 +131,9 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     counted = Counters(shadow_s1=one(active))
     sight = Sight(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
     emission = None
-    if kernel.tells_emission:
+    if kernel.cells is not None:
         cos = dr.abs(dr.dot(e.anchor.n, e.d))
-        emission = kernel.emitters.cell(e.index, z.si.p, -e.d, cos, active)
+        emission = kernel.cells.at(e.index, z.si.p, -e.d, cos, active)
     ends = mi.UInt32(1), k
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
     return seen(kernel, c, sight)

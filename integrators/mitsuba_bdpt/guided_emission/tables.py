@@ -1,9 +1,9 @@
-"""Guided emission: tables of the densities of emitters' light subpaths.
+"""Tables of the densities of emitters' light subpaths.
 
 Emission maps two primary numbers to a direction (light from infinity: to a point on a disk). A table over
 their unit square has in each cell the density relative to unguided emission; its mean is 1.
-`group.Group.place` defines the square of an emitter. An environment has a table for each of `SKY_BINS`^2 bins
-of directions. The choice of the emitter and points on surfaces are not guided.
+`emitters.group.Group.place` defines the squares of an emitter. An environment has one for each of
+`infinite.SKY_BINS`^2 bins of directions. The choice of the emitter and points on surfaces are not guided.
 
 Every strategy looks up the cell of a path's emission; within rounding of a cell's edge one strategy may get
 the neighbour's density (1e-6 to 1e-4 of all paths).
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import base64
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,22 +21,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..emitters.emitters import Emitters
+from ..emitters.records import Cell, Place
+from ..emitters.tables import BELOW_ONE, cell_at
+from ..errors import UsageError
+
 # Candidate cells per side, and the most cells of all tables: 24 x 24 still fits an environment and a sun (17
 # tables).
 SIDES = (24, 16, 8, 4)
 MOST_CELLS = 9792
 
-# Bins per dimension of an environment's directions.
-SKY_BINS = 4
-
 # Densities are quantized to 1/16 of a power of two, so that the order of summation does not change them.
 _STEPS, _OFFSET = 16, 128
-
-# Share of a curved area light's directions sampled by the cosine instead of the table.
-PLAIN = 0.25
-
-# Largest float below 1.
-_BELOW_ONE = 1 - 2**-24
 
 
 @dataclass(frozen=True)
@@ -62,6 +59,20 @@ class EmissionTables:
         levels = np.frombuffer(_unpacked(self.levels), np.uint8).reshape(-1, self.side, self.side)
         values = np.exp2((levels.astype(float) - _OFFSET) / _STEPS)
         return values / values.mean(axis=(1, 2), keepdims=True)
+
+    def guided(self, emitters: Emitters) -> Emitters:
+        """Return a copy of ``emitters`` that these tables guide.
+
+        Raises ``UsageError`` for tables of other emitters.
+        """
+        densities = self.densities()
+        if len(densities) != sum(emitters.tables):
+            raise UsageError(
+                f"decisions: emission has {len(densities)} tables, but the scene's emitters need "
+                f"{sum(emitters.tables)}; use what a render of this scene has recorded"
+            )
+        first = _first_tables(emitters.tables, (densities != 1).any(axis=(1, 2)))
+        return emitters.placed(EmissionGuide(self, first), [number > 0 for number in first])
 
     def record(self) -> dict[str, int | float | str]:
         return asdict(self)
@@ -94,50 +105,60 @@ def side_of(tables: int) -> int:
     return next((side for side in SIDES if tables * side**2 <= MOST_CELLS), 0) if tables else 0
 
 
-@dataclass
-class Place:
-    """Table (``bin``) of an emission, and its point ``u`` of the unit square."""
-
-    bin: mi.UInt32
-    u: mi.Point2f
-
-
-@dataclass
-class Factor:
-    """Effect of a table's density r on emission: factor ``kept`` + ``scaled`` r."""
-
-    scaled: mi.Float
-    kept: mi.Float
-
-    @staticmethod
-    def whole() -> Factor:
-        """The table's density applies to all of the emission."""
-        return Factor(mi.Float(1), mi.Float(0))
+def why_not(emitters: Emitters) -> str:
+    """Why the emission of these ``emitters`` cannot be guided; empty if it can."""
+    tables = sum(emitters.tables)
+    if not tables:
+        return "no emitter's directions can be guided: projectors and directionalarea have their own"
+    if not side_of(tables):
+        return f"{tables} tables would be needed, and {MOST_CELLS // SIDES[-1] ** 2} are the most"
+    return ""
 
 
-@dataclass
-class Cell:
-    """Cell of an emission: ``number`` in all tables, ``known`` if it has a table."""
-
-    number: mi.UInt32
-    known: mi.Bool
-    factor: Factor
+def _first_tables(counts: Sequence[int], used: np.ndarray) -> list[int]:
+    """Index of each emitter's first table, from 1; 0 for emitters without, or with no ``used`` one."""
+    last = np.cumsum(counts).tolist()
+    pairs = zip(counts, last, strict=True)
+    return [1 + end - own if used[end - own : end].any() else 0 for own, end in pairs]
 
 
-def cell_at(u: mi.Point2f, side: int) -> mi.UInt32:
-    """Index of the cell at ``u`` in a table of ``side`` x ``side``."""
-    at = mi.Point2u(dr.clip(u, 0, _BELOW_ONE) * side)
-    return mi.UInt32(dr.minimum(at.y, side - 1) * side + dr.minimum(at.x, side - 1))
+class Cells:
+    """Numbers the cells of all tables of ``emitters``, for a pilot.
+
+    ``emitters``: the copy that it renders; ``count``: number of cells.
+    """
+
+    def __init__(self, emitters: Emitters):
+        self.emitters = emitters.placed()
+        tables = sum(emitters.tables)
+        self.side = side_of(tables)
+        self.count = tables * self.side**2
+        self._first = mi.UInt32(_first_tables(emitters.tables, np.ones(tables, bool)))
+        dr.make_opaque(self._first)
+
+    def at(self, index: mi.UInt32, p, d, cos, active: mi.Bool) -> Cell:
+        """Cells of emissions of the emitters ``index`` that pass ``p`` along ``d``.
+
+        ``cos`` with the geometric normal.
+        """
+        first = dr.gather(mi.UInt32, self._first, index, active)
+        place, factor = self.emitters.place(index, p, d, cos, self.side, active)
+        table = dr.select(first > 0, first - 1 + place.bin, 0)
+        return Cell(table * self.side**2 + cell_at(place.u, self.side), first > 0, factor)
+
+    def of_hit(self, si, previous, active: mi.Bool) -> Cell:
+        """Cell of the emission from the emitter point hit at ``si`` to ``previous``."""
+        return self.at(*self.emitters.emission_of_hit(si, previous, active))
 
 
 class EmissionGuide:
-    """`EmissionTables` that a kernel can index.
+    """`EmissionTables` that a kernel can index, an `emitters.records.EmissionGuide`.
 
-    ``first``: index of each emitter's first table, from 1; table 0 is uniform, for unguided emitters.
+    ``first``: see `_first_tables`; table 0 is uniform, for unguided emitters.
     """
 
-    def __init__(self, tables: EmissionTables, first: mi.UInt32):
-        self.side, self._first = tables.side, first
+    def __init__(self, tables: EmissionTables, first: list[int]):
+        self.side, self._first = tables.side, mi.UInt32(first)
         densities = np.concatenate([np.ones((1, self.side, self.side)), tables.densities()])
         rows = densities.mean(axis=2)
         within = np.cumsum(densities, axis=2) / (rows[:, :, None] * self.side)
@@ -146,7 +167,7 @@ class EmissionGuide:
         self._densities, self._within, self._below = (
             mi.Float(values.astype(np.float32).ravel().tolist()) for values in (densities, within, below)
         )
-        dr.make_opaque(self._densities, self._within, self._below)
+        dr.make_opaque(self._first, self._densities, self._within, self._below)
 
     def is_guided(self, index: mi.UInt32, active) -> mi.Bool:
         return dr.gather(mi.UInt32, self._first, index, active) > 0
@@ -187,5 +208,5 @@ def _found(sums: mi.Float, begin: mi.UInt32, side: int, u: mi.Float, active) -> 
         cells -= step
     low = dr.select(at > 0, dr.gather(mi.Float, sums, begin + dr.maximum(at, 1) - 1, active), 0)
     high = dr.gather(mi.Float, sums, begin + at, active)
-    inside = dr.clip((u - low) / (high - low), 0, _BELOW_ONE)
-    return at, dr.minimum((mi.Float(at) + inside) / side, _BELOW_ONE)
+    inside = dr.clip((u - low) / (high - low), 0, BELOW_ONE)
+    return at, dr.minimum((mi.Float(at) + inside) / side, BELOW_ONE)

@@ -12,10 +12,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-from mitsuba_bdpt.emitters.emission_tables import MOST_CELLS, SIDES, EmissionTables, cell_at, side_of
 from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.errors import UsageError
 from mitsuba_bdpt.geometry.flat import is_flat
+from mitsuba_bdpt.guided_emission.tables import MOST_CELLS, SIDES, Cells, EmissionTables, side_of
 from mitsuba_bdpt.host.jit import evaluated_mode
 from scipy import stats
 
@@ -24,8 +25,8 @@ COUNT, LEVEL = 200_000, 1e-4
 
 def random_tables(emitters, seed=1, side=0):
     """Tables whose densities are between 1/50 and 1 of the largest, up to their mean."""
-    side = side or side_of(emitters.table_count)
-    densities = np.random.default_rng(seed).random((emitters.table_count, side, side)) ** 4 + 0.02
+    side = side or side_of(sum(emitters.tables))
+    densities = np.random.default_rng(seed).random((sum(emitters.tables), side, side)) ** 4 + 0.02
     return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), 0.5)
 
 
@@ -72,7 +73,7 @@ def scene_of(name, **others):
 
 def test_every_emitter_is_looked_at():
     """Expected: all emitters that have tables are among those of this module."""
-    with_tables = {name for name in parts.EMITTERS if Emitters(scene_of(name)).table_count}
+    with_tables = {name for name in parts.EMITTERS if sum(Emitters(scene_of(name)).tables)}
     assert with_tables == set(guidable())
 
 
@@ -85,7 +86,7 @@ def test_light_leaves_as_without_tables(name):
     """
     emitters = Emitters(scene_of(name))
     bins, weights = [], []
-    for seed, made in ((11, emitters), (12, emitters.placed(random_tables(emitters)))):
+    for seed, made in ((11, emitters), (12, random_tables(emitters).guided(emitters))):
         e = emissions(made, name, seed)
         d = column(e.d)
         place = column(e.si.p) - np.array([[0.3], [0.5], [0.0]])
@@ -110,7 +111,7 @@ def test_all_strategies_state_one_density(name):
     rounding of the edge of a cell (fewer than 1e-3; a texture's or a sun's edges: 1e-2).
     """
     emitters = Emitters(scene_of(name))
-    guided = emitters.placed(random_tables(emitters))
+    guided = random_tables(emitters).guided(emitters)
     e = emissions(guided, name)
     far = e.si.p + e.d * 3
     stated = column(e.pdf_second)
@@ -118,9 +119,10 @@ def test_all_strategies_state_one_density(name):
     with evaluated_mode(name == "timed_sunsky"):
         direction = column(guided.direction_density(e, far, e.d, mi.Bool(True)))
     assert np.mean(np.abs(direction - stated)[made] > 1e-3 * stated[made]) < 1e-3
-    cell = guided.cell(e.index, far, e.d, e.cos, mi.Bool(True))
+    cells = Cells(emitters)
+    cell = cells.at(e.index, far, e.d, e.cos, mi.Bool(True))
     assert column(dr.select(cell.known, 1.0, 0.0)).all()
-    assert column(cell.number).max() < emitters.table_count * guided.side**2
+    assert column(cell.number).max() < cells.count
 
 
 DETAILS = {"small": 0.02, "middle": 2.0, "large": 4.0}
@@ -151,7 +153,7 @@ def test_details_beside_tables(size, more, only_sun):
     tables = random_tables(emitters)
     if only_sun:
         tables = without_sky(tables, emitters)
-    guided = emitters.placed(tables)
+    guided = tables.guided(emitters)
     e = emissions(guided)
     stated = column(e.pdf_second)
     asked = column(guided.direction_density(e, e.si.p + e.d, e.d, mi.Bool(True)))
@@ -177,12 +179,12 @@ def test_what_tables_change_of_a_density(name):
     scene = on_a_ground(DETAILS[name]) if name in DETAILS else scene_of(name)
     emitters = Emitters(scene)
     tables = random_tables(emitters)
-    guided, listening = emitters.placed(tables), emitters.placed()
+    guided, cells = tables.guided(emitters), Cells(emitters)
     e = emissions(emitters, name)
     far = e.si.p if emitters.at_infinity else e.si.p + e.d
     before, after = (column(x.direction_density(e, far, e.d, mi.Bool(True))) for x in (emitters, guided))
     cos = dr.dot(e.si.sh_frame.n, e.d)
-    cell = listening.cell(e.index, far, e.d, cos, mi.Bool(True))
+    cell = cells.at(e.index, far, e.d, cos, mi.Bool(True))
     r = tables.densities().ravel()[column(cell.number).astype(int)]
     expected = column(cell.factor.kept) + column(cell.factor.scaled) * r
     used = (before > 0) & (
@@ -210,7 +212,7 @@ def test_next_event_estimation_and_hits_state_the_same(name):
     scene = scene_of(name)
     emitters = Emitters(scene)
     tables = random_tables(emitters)
-    guided = emitters.placed(tables)
+    guided = tables.guided(emitters)
     at, direct = lit_from(name, guided)
     _, plain = lit_from(name, emitters)
     wide = len(np.array(at.p).T)
@@ -226,7 +228,7 @@ def test_next_event_estimation_and_hits_state_the_same(name):
     assert lit.sum() > 1000
     ratio = changed(direct.emission_ratio, plain.emission_ratio)
     cos = dr.abs(dr.dot(direct.anchor.n, direct.d))
-    cell = guided.cell(direct.index, at.p, -direct.d, cos, mi.Bool(True)).number
+    cell = Cells(emitters).at(direct.index, at.p, -direct.d, cos, mi.Bool(True)).number
     shape = scene.emitters()[0].get_shape()
     if shape is None or is_flat(shape):
         expected = tables.densities().ravel()[values(cell).astype(int)]
@@ -239,7 +241,7 @@ def test_next_event_estimation_and_hits_state_the_same(name):
     after, before = (x.hit_densities(hit, at.p, mi.Bool(True))[2] for x in (guided, emitters))
     off = np.abs(changed(after, before) - ratio) > 2e-3 * ratio
     assert off[seen].mean() < 2e-2
-    assert values(guided.hit_cell(hit, at.p, mi.Bool(True)).known)[seen].all()
+    assert values(Cells(emitters).of_hit(hit, at.p, mi.Bool(True)).known)[seen].all()
 
 
 @pytest.mark.parametrize("n", [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, -0.0], [0.6, 0.8, 0.0]])
@@ -253,12 +255,12 @@ def test_frames_do_not_depend_on_who_asks(n):
     sun = {"type": "directional", "direction": n}
     for light in ({"lamp": lamp}, {"sun": sun}):
         ball = {"type": "sphere", "radius": 2.0}
-        made = Emitters(mi.load_dict({"type": "scene", "ball": ball} | light)).placed()
+        cells = Cells(Emitters(mi.load_dict({"type": "scene", "ball": ball} | light)))
         towards = np.array([n] * 7) + np.vstack([np.zeros(3), 1e-7 * np.eye(3), -1e-7 * np.eye(3)])
         d = dr.normalize(mi.Vector3f(*(mi.Float(np.float32(v)) for v in towards.T)))
         if "lamp" in light:  # not the middle, where all cells meet
             d = dr.normalize(d + mi.Vector3f(0.21, -0.17, 0.11))
-        cell = made.cell(mi.UInt32(0), mi.Point3f(0.3, -0.4, 0.5), d, mi.Float(1), mi.Bool(True))
+        cell = cells.at(mi.UInt32(0), mi.Point3f(0.3, -0.4, 0.5), d, mi.Float(1), mi.Bool(True))
         assert len(set(np.array(cell.number).tolist())) == 1
 
 
@@ -293,7 +295,7 @@ def test_only_what_gains_is_looked_up():
     """
     scene = scene_of("constant", more=parts.EMITTERS["rectangle"]())
     emitters = Emitters(scene)
-    guided = emitters.placed(without_sky(random_tables(emitters), emitters))
+    guided = without_sky(random_tables(emitters), emitters).guided(emitters)
     groups = {type(group).__name__: group.guide for group in guided.groups}
     assert groups["InfiniteEmitters"] is None and groups["AreaEmitters"] is not None
 
@@ -306,7 +308,7 @@ def test_details_smaller_than_a_cell_keep_their_disk(radius, kept):
     sun = {"type": "directional", "direction": [0.1, 0.2, -1]}
     emitters = Emitters(mi.load_dict({"type": "scene", "ground": ground, "thing": thing, "sun": sun}))
     assert emitters.disks.details is not None
-    e = emissions(emitters.placed(random_tables(emitters)))
+    e = emissions(random_tables(emitters).guided(emitters))
     d = column(e.d)
     away = column(e.si.p) - np.array([[3], [2], [radius]])
     near = np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < 1.8 * radius
@@ -360,7 +362,7 @@ def test_tables_of_another_scene_are_refused():
     """Expected: an error that says how many tables this scene's emitters need."""
     emitters = Emitters(scene_of("constant"))
     with pytest.raises(UsageError, match="has 1 tables.* need 16"):
-        emitters.placed(EmissionTables.of(np.ones((1, 16, 16)), 0.5))
+        EmissionTables.of(np.ones((1, 16, 16)), 0.5).guided(emitters)
 
 
 @pytest.mark.parametrize("count", [0, 1, 17, 18, 38, 39, 153, 154, 612, 613])
@@ -381,7 +383,7 @@ def test_warped_numbers_are_distributed_as_the_tables_say(side):
     """
     emitters = Emitters(scene_of("rectangle"))
     tables = random_tables(emitters, side=side)
-    guided = emitters.placed(tables)
+    guided = tables.guided(emitters)
     n = 512
     x, y = np.meshgrid((np.arange(n) + 0.5) / n, (np.arange(n) + 0.5) / n)
     u = mi.Point2f(mi.Float(x.ravel().astype(np.float32)), mi.Float(y.ravel().astype(np.float32)))
@@ -402,7 +404,7 @@ def test_a_copy_leaves_the_emitters_alone():
     """Expected: emitters that tables were made for emit as before."""
     emitters = Emitters(scene_of("sphere"))
     before = column(emissions(emitters).pdf_second)
-    guided = emitters.placed(random_tables(emitters))
+    guided = random_tables(emitters).guided(emitters)
     assert (column(emissions(guided).pdf_second) != before).mean() > 0.9
     np.testing.assert_array_equal(column(emissions(emitters).pdf_second), before)
     assert replace(random_tables(emitters), left=0.7) != random_tables(emitters)

@@ -1,4 +1,4 @@
-"""Fits tables of guided emission, `emission_tables.EmissionTables`, to a pilot.
+"""Fits `EmissionTables` to a pilot.
 
 A contribution of weighted size v lies on a path whose emission is in a cell of the tables, whichever strategy
 sampled it. q is the share, in its sum of densities, of the strategies whose light subpath chooses that
@@ -23,11 +23,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.emission_tables import Cell, EmissionTables
-from ..sensors.records import Region
-from ..transport.contribution import Contribution
-from .configuration import Configuration
-from .moments import HEARD_TILES, tile_of
+from ..emitters.records import Cell
+from .tables import EmissionTables
 
 # Halves of a pilot, and classes of l / (1 - l), a factor of four apart.
 HALVES, CLASSES = 2, 8
@@ -61,40 +58,45 @@ _STEPS = 16
 
 
 class Listener:
-    """Accumulates emission statistics of a pilot in ``cells`` cells of all tables.
+    """Accumulates emission statistics of a pilot, per film tile and cell of the tables.
 
     Per cell: v^2 / D by class, then v^2 without tables, times l and whole (`BEFORE`).
     """
 
-    def __init__(self, region: Region, cells: int):
-        self._region, self.cells = region, cells
-        self._sums = dr.zeros(mi.Float64, HALVES * HEARD_TILES**2 * cells * COLUMNS)
+    def __init__(self, tiles: int, cells: int):
+        self._shape = HALVES, tiles, cells, COLUMNS
+        self._sums = dr.zeros(mi.Float64, int(np.prod(self._shape)))
         dr.make_opaque(self._sums)
 
     def hear(
-        self, c: Contribution, position: mi.Point2f, half: mi.UInt32, square: mi.Float64, active: mi.Bool
+        self,
+        shares: mi.Vector4f,
+        cell: Cell,
+        tile: mi.UInt32,
+        half: mi.UInt32,
+        square: mi.Float64,
+        active: mi.Bool,
     ):
-        """Accumulate a contribution with squared size ``square`` at a film ``position``.
+        """Accumulate a contribution with squared size ``square``.
 
-        Ignores paths that no light subpath can sample.
+        ``shares``: see `Contribution`. Ignores paths that no light subpath can sample.
         """
-        hit, direct, light, inner = c.shares  # pyright: ignore[reportGeneralTypeIssues]
-        cell: Cell = c.emission  # pyright: ignore[reportAssignmentType]
+        hit, direct, light, inner = shares  # pyright: ignore[reportGeneralTypeIssues]
         share = (light + inner) / (hit + direct + light + inner)
         active = active & cell.known & (share > 0)
         rest = 1 - share + share * cell.factor.kept
         scaled = share * cell.factor.scaled
         odds = dr.log2(scaled / rest) / 2 + CLASSES / 2
         kind = mi.UInt32(dr.clip(odds, 0, CLASSES - 1))
-        part = half * HEARD_TILES**2 + tile_of(self._region, position, HEARD_TILES)
-        place = (part * self.cells + cell.number) * COLUMNS
+        _, tiles, cells, _ = self._shape
+        place = ((half * tiles + tile) * cells + cell.number) * COLUMNS
         even, of_table = square / (rest + scaled), square * (scaled / (rest + scaled))
         for column, value in ((kind, even), (CLASSES, of_table), (CLASSES + 1, square)):
             dr.scatter_reduce(dr.ReduceOp.Add, self._sums, value, place + column, active)
 
     def evaluated(self) -> np.ndarray:
         """Emission statistics of shape (`HALVES`, tiles, cells, `COLUMNS`)."""
-        return np.array(self._sums).reshape(HALVES, HEARD_TILES**2, self.cells, COLUMNS)
+        return np.array(self._sums).reshape(self._shape)
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class Learnt:
 
 
 def learn(heard: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
-    """Fit tables to the emission statistics ``heard``, see `moments.Moments`.
+    """Fit tables to the emission statistics ``heard``, shape (`HALVES`, cells, `COLUMNS`).
 
     Tables have ``side`` x ``side`` cells; ``counts``: number of tables per emitter. Uses the first of `BLURS`
     that pays, if the last one pays.
@@ -153,10 +155,8 @@ def _worth_a_table(heard: np.ndarray, halves: list[np.ndarray], counts: Sequence
     return np.repeat([one > 0 and one >= PART * sum(own) for one in own], counts)
 
 
-def left_out(chosen: Configuration, learnt: Learnt | None) -> list[dict[str, str]]:
-    """Why ``chosen`` does not use ``learnt``, as in ``statistics["skipped"]``."""
-    if learnt is None or chosen.emission is not None:
-        return []
+def left_out(learnt: Learnt) -> list[dict[str, str]]:
+    """Why what was ``learnt`` is not used, as in ``statistics["skipped"]``."""
     why = f"in the pilot tables leave {learnt.left:.0%} of light subpaths' part of the squared error"
     why += (
         f", and less than {PAYS:.0%} would pay" if learnt.tables is None else "; path tracing alone is better"

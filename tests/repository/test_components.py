@@ -1,0 +1,147 @@
+"""Components: without the folder of one the package renders the rest as before, and says what is missing.
+
+Run as a script, this module is a process that renders with another copy of the package: see `_render`.
+"""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mitsuba as mi
+import mitsuba_bdpt
+import numpy as np
+import pytest
+import variants
+from mitsuba_bdpt.components import COMPONENTS
+
+TESTS = Path(__file__).resolve().parents[1]
+
+
+@dataclass(frozen=True)
+class Component:
+    """What is known of a component beside its line in the table.
+
+    ``never``: parameters of a render without it; ``asked``: parameters that ask for it; ``tests``: its own.
+    """
+
+    asked: dict
+    tests: tuple[str, ...]
+    never: dict = field(default_factory=dict)
+
+
+# A decision that names tables of guided emission.
+_TABLES = {"side": 4, "left": 0.5, "levels": "eJxjYGhgGAUEAAAAgIAB"}
+_DECISION = {
+    "pass": 0,
+    "light_paths": 1,
+    "connections": "one",
+    "emission": _TABLES,
+    "coefficients": {"t<=1": 1, "s=1": 1},
+    "cost": 1,
+    "variance": 1,
+    "mean": 1,
+}
+
+KNOWN = {
+    "guided_emission": Component(
+        never={"guiding": "photons"},
+        asked={"decisions": json.dumps([_DECISION])},
+        tests=("guided_emission", "images/test_guided_emission.py"),
+    ),
+}
+
+# Tests of the rest that a copy has to pass: densities, sums of weights, known answers of images.
+REST = ("emitters/test_endpoints.py", "transport/test_sharing.py", "images/test_known_answers.py")
+
+
+def without(name: str, folder: Path) -> Path:
+    """A copy of the package without the component: neither its folder nor its line. Returns its parent."""
+    package = Path(mitsuba_bdpt.__file__).parent
+    copy = folder / "integrators" / "mitsuba_bdpt"
+    shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.rmtree(copy.joinpath(*COMPONENTS[name].split(".")[1:]))
+    table = copy / "components.py"
+    lines, removed = re.subn(rf'^    "{name}": .*\n', "", table.read_text(), flags=re.MULTILINE)
+    assert removed == 1
+    table.write_text(lines)
+    return copy.parent
+
+
+def run(sources: Path, *arguments) -> str:
+    """Output of Python with these arguments and the package in ``sources``."""
+    paths = os.pathsep.join(map(str, (sources, TESTS / "support")))
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        env=os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"},
+        cwd=TESTS.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
+    return done.stdout
+
+
+def images(parameters: dict) -> dict[str, np.ndarray]:
+    """Images of all strategies, and of those that a pilot chooses."""
+    import scene_parts as parts  # once there is a variant
+
+    scene = parts.open_scene(lamp=parts.EMITTERS["rectangle"]())
+    loaded = mi.load_dict(scene, parallel=False, optimize=False)
+    made = {}
+    for skip, spp in (("none", 4), ("auto", 64)):
+        integrator = mi.load_dict({"type": "bdpt", "max_depth": 4, "skip": skip} | parameters)
+        made[skip] = np.array(integrator.render(loaded, seed=3, spp=spp))
+        assert skip == "none" or integrator.statistics["decisions"]
+    return made
+
+
+def _render(asked: dict, out: str):
+    """Render without the component, and ask for it; both results go to the file ``out``."""
+    mi.set_variant(variants.of("rgb"))
+    said = ""
+    try:
+        mi.load_dict({"type": "bdpt"} | asked)
+    except Exception as error:  # Mitsuba wraps what is raised
+        said = str(error)
+    np.savez(out, said=said, package=mitsuba_bdpt.__file__, **images({}))
+
+
+def test_every_component_is_known_here():
+    """Expected: those of the table."""
+    assert set(KNOWN) == set(COMPONENTS)
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_the_rest_renders_as_before(name, tmp_path):
+    """Expected: a copy without the component makes the image of a render that does not use it, up to the
+    order of atomic sums, with all strategies and as a pilot chooses; who asks for the component is told.
+    """
+    known, sources, out = KNOWN[name], without(name, tmp_path), tmp_path / "made.npz"
+    run(sources, __file__, json.dumps(known.asked), out)
+    found = np.load(out)
+    assert Path(str(found["package"])).is_relative_to(sources)
+    assert f"{name.replace('_', ' ')} is not part of this installation" in str(found["said"])
+    for skip, expected in images(known.never).items():
+        np.testing.assert_allclose(found[skip], expected, rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KNOWN)
+def test_the_rest_passes_its_tests(name, tmp_path):
+    """Expected: without the component all other tests are collected, and those of `REST` pass."""
+    sources = without(name, tmp_path)
+    pytest_of = ("-m", "pytest", "-q", "-p", "no:cacheprovider")
+    left_out = [f"--ignore={TESTS / path}" for path in KNOWN[name].tests]
+    run(sources, *pytest_of, "--collect-only", *left_out, TESTS)
+    passed = run(sources, *pytest_of, *(TESTS / path for path in REST))
+    assert "passed" in passed
+
+
+if __name__ == "__main__":
+    _render(json.loads(sys.argv[1]), sys.argv[2])
