@@ -31,7 +31,7 @@ external_toc_path = "docs/toc.yml"
 
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
-nb_execution_mode = "off"  # scripts and tests run the notebook
+nb_execution_mode = "off"  # make notebook and .ci/run run the notebook
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 default_role = "code"

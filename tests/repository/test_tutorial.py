@@ -63,6 +63,14 @@ def test_the_notebook_is_that_of_the_script():
     check_outputs(there)
 
 
+def test_every_check_runs_the_notebook():
+    """Rationale: the test that runs it is above the limit of `make costly`, which left it out. Expected: the
+    script that checks each change names this file.
+    """
+    script = (SCRIPT.parents[2] / ".ci" / "run").read_text()
+    assert f'pytest -m "" tests/repository/{Path(__file__).name}' in script
+
+
 STOPPED = """
     import mitsuba_bdpt
     import mitsuba as mi
