@@ -391,7 +391,7 @@ def test_splats_land_where_rays_started(name):
     start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
     reach = dr.minimum(start.ray.maxt, 20)
     p = start.ray.o + start.ray.d * (reach * mi.Float(0.02 + 0.96 * u[4]))
-    join = camera.join(p, lens, None)
+    join = camera.connect(p, lens, None)
     assert np.array(join.valid).mean() > 0.999  # float32 loses a few on the film's rim
     for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
         assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
@@ -416,7 +416,7 @@ def test_splats_do_not_depend_on_where_the_camera_stands(name):
         width, height = (int(x) for x in camera.region.size)
         index, lens = mi.UInt32((u[4] * width * height).astype(np.uint32)), mi.Point2f(u[2], u[3])
         start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
-        join = camera.join_direction(-start.ray.d, lens, None)
+        join = camera.connect_direction(-start.ray.d, lens, None)
         assert np.array(join.valid).mean() > 0.99  # float32 loses a few on the film's rim
         for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
             assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
@@ -459,7 +459,7 @@ def test_importance_integrates_to_one(name):
     to_world = sensor.world_transform()
     d = to_world @ mi.Vector3f(local)
     lens = mi.Point2f(0.3, 0.6)
-    join = camera.join(camera._lens_point(lens, None)[2] + 7 * d, lens, None)
+    join = camera.connect(camera._lens_point(lens, None)[2] + 7 * d, lens, None)
     values = np.where(np.array(join.valid), np.array(join.importance), 0) * 2 * np.pi * (1 - cos)
     error = values.std() / np.sqrt(n)
     assert error < 0.01

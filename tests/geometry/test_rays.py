@@ -272,8 +272,8 @@ def test_what_was_found_from_near_by_is_seen_from_afar(kind, small, tmp_path):
         counts &= dr.dot(d, si.n) > 0
     from_afar = rays.free_anchor(anchor.p + 300 * d)
     number = rounding.met(si.shape, si.instance)
-    sight, own = rays.sight(errors, from_afar, anchor, number, dr.zeros(mi.SurfaceInteraction3f, n))
-    blocked = counts & rays.occluded(scene, sight, counts, own)
+    shadow_ray, own = rays.shadow_ray(errors, from_afar, anchor, number, dr.zeros(mi.SurfaceInteraction3f, n))
+    blocked = counts & rays.occluded(scene, shadow_ray, counts, own)
     assert int(dr.count(counts)[0]) > 0.01 * n
     assert int(dr.count(blocked)[0]) <= (0 if kind in FLAT else 1e-4 * n)
 
@@ -709,8 +709,10 @@ def test_cylinders_in_groups_are_seen_from_afar(stretch):
     anchor = rays.surface_anchor(si, ray, errors)
     count = int(dr.count(outside)[0])
     assert count > 0.02 * n
-    sight, own = rays.sight(errors, rays.free_anchor(origin), anchor, rounding.met(si.shape, si.instance), si)
-    blocked = rays.occluded(scene, sight, outside, own)
+    shadow_ray, own = rays.shadow_ray(
+        errors, rays.free_anchor(origin), anchor, rounding.met(si.shape, si.instance), si
+    )
+    blocked = rays.occluded(scene, shadow_ray, outside, own)
     assert int(dr.count(outside & blocked)[0]) <= 1e-3 * count
     found = scene.ray_test(rays.spawn(anchor, si.n, ray), outside)
     assert int(dr.count(outside & found)[0]) <= 1e-3 * count
@@ -743,7 +745,9 @@ def test_backs_of_small_shapes_are_not_seen(kind, radius, flipped):
     origin = mi.Point3f(8, 0, 0) + _sphere(rng)
     n_ = mi.Normal3f(-outwards if flipped else outwards)
     end = rays.sampled_anchor(p, n_, errors.at(mi.ShapePtr(target)))
-    ray, own = rays.sight(errors, rays.free_anchor(origin), end, number, dr.zeros(mi.SurfaceInteraction3f))
+    ray, own = rays.shadow_ray(
+        errors, rays.free_anchor(origin), end, number, dr.zeros(mi.SurfaceInteraction3f)
+    )
     seen = ~rays.occluded(scene, ray, mi.Bool(True), own)
     cos = dr.dot(outwards, dr.normalize(origin - p))
     wrong = (dr.abs(cos) > 0.15) & (seen != (cos > 0))
@@ -770,7 +774,7 @@ def test_the_inside_of_small_tubes_is_seen_through_their_end(radius, flipped):
     errors, shape = rounding.ShapeErrors(scene), mi.ShapePtr(scene.shapes()[0])
     end = rays.sampled_anchor(p, mi.Normal3f(-outwards if flipped else outwards), errors.at(shape))
     like = dr.zeros(mi.SurfaceInteraction3f)
-    ray, own = rays.sight(errors, rays.free_anchor(origin), end, rounding.met(shape), like)
+    ray, own = rays.shadow_ray(errors, rays.free_anchor(origin), end, rounding.met(shape), like)
     seen = ~np.array(rays.occluded(scene, ray, mi.Bool(True), own))
     p, d = np.array(p, dtype=float), np.array(origin - p, dtype=float)
     inside = (np.array(outwards) * d).sum(0) < -0.05 * np.linalg.norm(d, axis=0)

@@ -576,7 +576,7 @@ def test_the_page_says_who_takes_part():
     sensors = {parts.plugin_of(make()): name for name, make in reversed(parts.SENSORS.items())}
     del sensors["own_fisheye"]
     for plugin, name in sensors.items():
-        camera, joined, _, area = found.pop(plugin)
+        camera, connectible, _, area = found.pop(plugin)
         part = parts.SENSOR_PARTS[name]
-        assert (camera, joined, area) == (False, not part.joined, not part.area), plugin
+        assert (camera, connectible, area) == (False, not part.connectible, not part.area), plugin
     assert set(found) == {"plugin of yours"}

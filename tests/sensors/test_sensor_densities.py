@@ -88,7 +88,7 @@ def test_a_join_is_the_ray_back(name):
     u_film = camera.region.to_uv(start.position)
     if "batch" in name:  # chooses the view, as the film position does
         u_film = mi.Point2f(u_film.x, 0)
-    join = camera.join(p, mi.Point2f(u[2], u[3]), u_film)
+    join = camera.connect(p, mi.Point2f(u[2], u[3]), u_film)
     valid = column(dr.select(join.valid, 1.0, 0.0)) > 0
     assert valid.mean() > 0.999
     near = column(start.pdf_w) > 1e-2  # off grazing directions, where rounding decides
@@ -112,7 +112,7 @@ def test_nothing_is_joined_beyond_the_far_plane(name):
         u_film = mi.Point2f(u_film.x, 0)
     for part, share in ((0.999, 1), (1.001, 0)):
         p = start.ray.o + start.ray.d * (start.ray.maxt * part)
-        join = camera.join(p, mi.Point2f(u[2], u[3]), u_film)
+        join = camera.connect(p, mi.Point2f(u[2], u[3]), u_film)
         # Film positions at the edge of the region, or of a view, may be rounded out of it.
         assert abs(column(dr.select(join.valid, 1.0, 0.0)).mean() - share) < 1e-3
 
@@ -141,7 +141,7 @@ def test_importance_integrates_to_the_weight(name):
         middle = mi.Point3f(0, 1.5, 3)
         p = middle + mi.warp.square_to_uniform_sphere(mi.Point2f(u[0], u[1])) * 3000
         measure = 4 * np.pi
-    join = camera.join(p, lens, choice)
+    join = camera.connect(p, lens, choice)
     values = np.where(column(dr.select(join.valid, 1.0, 0.0)) > 0, column(join.importance), 0) * measure
     error = values.std() / np.sqrt(COUNT)
     known = np.pi if "meter" in name else 1.0
@@ -180,7 +180,7 @@ def test_an_arrival_is_a_start_in_reverse(name):
     np.testing.assert_allclose(weight, column(start.weight)[keep], rtol=5e-3)
     np.testing.assert_allclose(column(arrival.pdf_w)[keep], column(start.pdf_w)[keep], rtol=5e-3)
     np.testing.assert_allclose(cos / both, column(start.arrival)[keep], rtol=5e-3)
-    join = camera.join(p, mi.Point2f(u[2], u[3]), camera.region.to_uv(start.position))
+    join = camera.connect(p, mi.Point2f(u[2], u[3]), camera.region.to_uv(start.position))
     ratio = column(join.arrival * join.dist2)[keep]
     np.testing.assert_allclose(ratio, cos / column(arrival.pdf_a)[keep], rtol=5e-3)
     if lens:

@@ -196,9 +196,9 @@ class Capture(Observer):
         dr.eval(self.walking.origin)
         if side.adjoint and self.plan.endpoints:
             u = techniques._sensor_points(bound, stream)
-            join = bound.camera.join(self.emission.si.p, *u)
+            join = bound.camera.connect(self.emission.si.p, *u)
             if not bound.camera.parallel:
-                distant = bound.camera.join_direction(self.emission.d, *u)
+                distant = bound.camera.connect_direction(self.emission.d, *u)
                 join = dr.select(self.emission.infinite, distant, join)
             self._keep_endpoint(1, 1, join)
 

@@ -1,6 +1,6 @@
 """Small scenes with participating media, by parts; each function makes entries of a scene's dictionary.
 
-Objects of one variant are of no use in another: everything is made when it is asked for.
+Objects of one variant are of no use in another: everything is made on demand.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ``EMITTERS`` and ``SENSORS`` are functions by name, each making one entry of a scene's dictionary;
 `takes_part` says which strategies a kind takes part in, as the documentation has it. The plugins in Python
-stand for those of users: classes that the package has never heard of.
+stand for those of users: classes that the package does not know.
 """
 
 from __future__ import annotations
@@ -427,11 +427,11 @@ class EmitterPart:
 
 @dataclass(frozen=True)
 class SensorPart:
-    """``joined``: points of the scene can be joined with the sensor (t = 1); ``area``: light subpaths can hit
-    it (t = 0); ``open``: it has many points, so that it sees lamps that cannot be hit; ``parallel``: all its
-    rays have one direction."""
+    """``connectible``: points of the scene can be connected to the sensor (t = 1); ``area``: light subpaths
+    can hit it (t = 0); ``open``: it has many points, so that it sees lamps that cannot be hit; ``parallel``:
+    all its rays have one direction."""
 
-    joined: bool = True
+    connectible: bool = True
     area: bool = False
     open: bool = False
     parallel: bool = False
@@ -459,14 +459,14 @@ SENSOR_PARTS = {
     "thinlens": SensorPart(area=True, open=True),
     "orthographic": SensorPart(parallel=True),
     "distant": SensorPart(parallel=True),
-    "distant, point": SensorPart(joined=False, parallel=True),
-    "distant, shape": SensorPart(joined=False, parallel=True),
-    "radiancemeter": SensorPart(joined=False, parallel=True),
+    "distant, point": SensorPart(connectible=False, parallel=True),
+    "distant, shape": SensorPart(connectible=False, parallel=True),
+    "radiancemeter": SensorPart(connectible=False, parallel=True),
     "irradiancemeter": SensorPart(area=True, open=True),
     "batch": SensorPart(),
     "batch of lenses": SensorPart(open=True),
-    "mixed batch": SensorPart(joined=False),
-    "own fisheye": SensorPart(joined=False),
+    "mixed batch": SensorPart(connectible=False),
+    "own fisheye": SensorPart(connectible=False),
 }
 
 
@@ -480,12 +480,12 @@ def takes_part(emitter, sensor, s, t) -> bool:
     if s == 0:
         return e.hit
     if s == 1 and t == 1:
-        if not (e.direct and e.traced and z.joined):
+        if not (e.direct and e.traced and z.connectible):
             return False
         return z.open if not e.hit else not (e.infinite and z.parallel)
     if s == 1:
         return e.direct
-    return e.traced and (z.area if t == 0 else z.joined if t == 1 else True)
+    return e.traced and (z.area if t == 0 else z.connectible if t == 1 else True)
 
 
 # -- scenes -----------------------------------------------------------------------------------

@@ -106,8 +106,8 @@ class SensorPoints:
     def __getattr__(self, name):
         return getattr(self._sensor, name)
 
-    def join(self, p, *u):
-        found = self._sensor.join(p, *u)
+    def connect(self, p, *u):
+        found = self._sensor.connect(p, *u)
         self._joined.append((self._numbers(p), self._numbers(found.p)))
         return found
 

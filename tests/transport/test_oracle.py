@@ -464,9 +464,9 @@ class Sensor:
             counted=mi.Point2f(0.5),
         )
 
-    def join(self, p, u_lens, u_film):
+    def connect(self, p, u_lens, u_film):
         w = self.world
-        return sensor_records.CameraJoin(
+        return sensor_records.CameraConnection(
             p=w.point(w.k),
             anchor=rays.free_anchor(w.point(w.k)),
             d=w.towards(w.k - 1, w.k),
@@ -479,7 +479,7 @@ class Sensor:
             valid=mi.Bool(True),
         )
 
-    def join_direction(self, d, u_lens, u_film):
+    def connect_direction(self, d, u_lens, u_film):
         join = self.join(None, u_lens, u_film)
         join.dist2 = mi.Float(1)
         return join
@@ -971,7 +971,7 @@ def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
     width, height = (int(x) for x in sensor.film().crop_size())
     index = mi.UInt32(u[2].x * (width * height - 1))
     start = camera.start(camera.region.pixel(index), u[0], u[1], like)
-    join = camera.join(start.p + start.ray.d * (0.5 + 5 * u[2].y), u[1], None)
+    join = camera.connect(start.p + start.ray.d * (0.5 + 5 * u[2].y), u[1], None)
     everything = mi.Bool(np.ones(4096, dtype=bool))
     inside = np.array(join.valid)
     assert inside.mean() > 0.999  # rounding may move a ray over the film's edge

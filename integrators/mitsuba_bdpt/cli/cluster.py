@@ -66,15 +66,15 @@ class Merged:
         if index >= self._next:
             self._waiting[index] = snapshot
         while self._next in self._waiting:
-            self._join(self._next)
+            self._add(self._next)
             self._next += 1
 
     def close(self) -> None:
         """Add the parts after a missing one, in order."""
         for index in sorted(self._waiting):
-            self._join(index)
+            self._add(index)
 
-    def _join(self, index: int) -> None:
+    def _add(self, index: int) -> None:
         part = self._waiting.pop(index)
         self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
 

@@ -124,7 +124,7 @@ class AreaEmitters(Group):
 
     @classmethod
     def of(cls, emitter) -> type[Group]:
-        return cls if _tells_its_points(emitter) else HitOnlyEmitters
+        return cls if _samples_points(emitter) else HitOnlyEmitters
 
     @classmethod
     def tables(cls, emitter) -> int:
@@ -399,12 +399,12 @@ def _radiance_over_density(emitter, ds, pdf_w, si, active):
 # -- which area lights there are --------------------------------------------------------------
 
 
-def _tells_its_points(emitter) -> bool:
+def _samples_points(emitter) -> bool:
     """Whether the shape samples points with a density and a known radiance."""
     shape = emitter.get_shape()
     if shape is None:
         raise UnsupportedError(
-            f"emitter {named(emitter)} is on a shape that Mitsuba does not tell (an ellipsoidsmesh); "
+            f"emitter {named(emitter)} is on a shape that Mitsuba does not name (an ellipsoidsmesh); "
             "use shape type ellipsoids, or a mesh"
         )
     if shape.shape_type() in _CURVES:

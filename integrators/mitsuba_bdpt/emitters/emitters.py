@@ -64,7 +64,7 @@ class Emitters:
         sampling_weight = mi.Float(weights)
         self._pmf, self._inverse = sampling_weight / dr.sum(sampling_weight), inverse_table(self._pointers)
         dr.schedule(self._pmf)  # one kernel with the groups' tables
-        context = Context(scene, facts, self._cannot_be_asked(registered))
+        context = Context(scene, facts, self._lacks_sample_position(registered))
         present = [group for group in GROUPS if group in types]
         self.groups = tuple(
             group([e if t is group else None for e, t in zip(emitters, types, strict=True)], context)
@@ -89,13 +89,13 @@ class Emitters:
         self.traced = any(t.supports_emission for t in types)
         self.connectible_to_sensor = any(t.connectible_to_sensor for t in types)
         self.connectible_nearby = any(t.connectible_to_sensor and not t.at_infinity for t in types)
-        joined = [h and t.connectible_to_sensor for h, t in zip(hittable, types, strict=True)]
+        connectible = [h and t.connectible_to_sensor for h, t in zip(hittable, types, strict=True)]
         self.unhittable_connectible = tuple(
             i
             for i, (h, t) in enumerate(zip(hittable, types, strict=True))
             if not h and t.connectible_to_sensor
         )
-        self.finite_hittable = any(j and not t.at_infinity for j, t in zip(joined, types, strict=True))
+        self.finite_hittable = any(c and not t.at_infinity for c, t in zip(connectible, types, strict=True))
         self.on_shapes = any(emitter.get_shape() is not None for emitter in emitters)
         self.beams = any(t.supports_emission and not t.connectible_to_sensor for t in types)
         self.at_infinity = any(t.at_infinity for t in types)
@@ -107,7 +107,7 @@ class Emitters:
             text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)
         ]
 
-    def _cannot_be_asked(self, registered: list[str]) -> bool:
+    def _lacks_sample_position(self, registered: list[str]) -> bool:
         """Whether `sample_position` fails: classes in the process may lack it."""
         if not any(map(is_third_party, registered)):
             return False
@@ -258,8 +258,8 @@ class Emitters:
         """Sample y_0 for the camera vertex ``si``; ``u`` in [0, 1)^2 also selects."""
         chosen, u_x = self._select(u.x, active)
         u = mi.Point2f(u_x, u.y)
-        asked = active if self._asks.all else self._asks.at(chosen.index, active)
-        ds, weight = chosen.emitter.sample_direction(si, u, asked)
+        sampled = active if self._asks.all else self._asks.at(chosen.index, active)
+        ds, weight = chosen.emitter.sample_direction(si, u, sampled)
         direct = self._ask(
             lambda group, mask: group.complete_direct(chosen, ds, weight, si, u, mask),
             self._supporting("supports_next_event"),

@@ -75,8 +75,8 @@ class Surfaces:
             ps = self._own_point(index, shared.time, u, active)
         else:
             mask = self.own.at(index, active)
-            asked = active & ~mask if self.own.any else active
-            ps, _ = chosen.emitter.sample_position(shared.time, u, asked)
+            sampled = active & ~mask if self.own.any else active
+            ps, _ = chosen.emitter.sample_position(shared.time, u, sampled)
             if self.own.any:
                 ps = dr.select(mask, self._own_point(index, shared.time, u, mask), ps)
         ps = self._upright(ps, index, active)

@@ -8,7 +8,7 @@ their rounding moves hits along the normal (`reaches`).
 
 Shadow rays end short of their target by its offset, not by a fraction of the distance, and by more if their
 own length errs more (`_before`). Towards spheres and cylinders they end earlier still; where these are so
-small that occluders in front would be missed, the ray tests what it meets first (`sight`).
+small that occluders in front would be missed, the ray tests what it meets first (`shadow_ray`).
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class Own:
     t: mi.Float
 
 
-def sight(
+def shadow_ray(
     shape_errors: ShapeErrors, a: Anchor, b: Anchor, number: mi.UInt32, shared
 ) -> tuple[mi.Ray3f, Own | None]:
     """Return the shadow ray from ``a`` to ``b``, and an `Own` for `occluded`.

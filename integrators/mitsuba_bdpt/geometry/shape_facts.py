@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..host.edits import State
 from ..host.introspection import all_shapes
-from ..host.notices import remembered
+from ..host.notices import cached
 from .rounding import ShapeErrors
 from .to_world import check_inverse
 
@@ -40,7 +40,7 @@ class ShapeFacts:
         shapes = all_shapes(scene)
         own = [(_number(s), s.class_name(), s.has_flipped_normals(), repr(s.bbox())) for s in shapes]
         key = State.of(shapes, deep=False), tuple(own)
-        return remembered(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
+        return cached(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
 
     def about(self, kind: str, shape: mi.Shape, find: Callable[[], Found]) -> Found:
         """Return the cached result of ``find()`` for a ``kind`` of fact and a ``shape``.

@@ -12,7 +12,7 @@ from pathlib import Path
 ROOT = Path("/")
 """Where the files of the system are."""
 
-_asked: list[float] = []
+_limit_set: list[float] = []
 """The limit of `set_limit`, if there is one."""
 
 
@@ -29,7 +29,7 @@ def set_limit(most: float | None) -> None:
 
     Not enforced: work that is known to need more raises an error before it begins.
     """
-    _asked[:] = [] if most is None else [most]
+    _limit_set[:] = [] if most is None else [most]
 
 
 def available() -> Available:
@@ -57,7 +57,7 @@ def peak() -> int | None:
 
 
 def _limits() -> Iterator[Available]:
-    for most in _asked:
+    for most in _limit_set:
         yield Available(most, "the limit set by --memory")
     if hasattr(os, "sysconf"):  # not on Windows
         yield Available(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), "the machine's memory")

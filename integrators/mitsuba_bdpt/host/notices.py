@@ -55,7 +55,7 @@ def _alone() -> int:
     return _references((mi.load_dict({"type": "box"}), {}))
 
 
-def remembered(
+def cached(
     scene: mi.Scene,
     sensor: mi.Sensor,
     kind: str,

@@ -98,10 +98,10 @@ def check_syntax(aovs: str):
 
 def feature_names(aovs: str) -> list[str]:
     """Return the names of the layers of the parameter ``aovs``."""
-    return [f"{name}.{part}" for name, kind in _asked(aovs) for part in _KINDS[kind][0]]
+    return [f"{name}.{part}" for name, kind in _named_kinds(aovs) for part in _KINDS[kind][0]]
 
 
-def _asked(aovs: str) -> list[tuple[str, str]]:
+def _named_kinds(aovs: str) -> list[tuple[str, str]]:
     """Return name and kind of each feature."""
     return [(name, kind) for name, _, kind in (pair.partition(":") for pair in pairs(aovs))]
 
@@ -119,11 +119,11 @@ class FeatureLayers:
     """
 
     def __init__(self, scene, sensor, aovs: str, spp: int, guides: bool = False):
-        asked = f"{aovs},{GUIDES}" if guides else aovs
+        features = f"{aovs},{GUIDES}" if guides else aovs
         self._scene, self._sensor = scene, sensor
-        self._kinds = [kind for _, kind in _asked(asked)]
+        self._kinds = [kind for _, kind in _named_kinds(features)]
         self.names, self.guides = feature_names(aovs), guides
-        self.count = len(feature_names(asked))
+        self.count = len(feature_names(features))
         has_normals = {"sh_normal", WORLD_NORMAL}.intersection(self._kinds)
         self._normals = MappedNormals(bsdfs(scene) if has_normals else [])
         self._region = Region(sensor.film())

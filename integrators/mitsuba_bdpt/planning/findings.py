@@ -8,7 +8,7 @@ from typing import TypeVar
 import mitsuba as mi
 
 from ..host.edits import State
-from ..host.notices import remembered
+from ..host.notices import cached
 from ..scene.prepared import PreparedScene
 
 Found = TypeVar("Found")
@@ -26,7 +26,7 @@ class Findings:
 
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
         """Return the result of ``look()`` and whether it was cached for this ``key``."""
-        return remembered(self._prepared.scene, self._sensor, kind, (self._scene_state(), key), look)
+        return cached(self._prepared.scene, self._sensor, kind, (self._scene_state(), key), look)
 
     def expire(self):
         """Read the parameters again before the next lookup: they may have been edited."""

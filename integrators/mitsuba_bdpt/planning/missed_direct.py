@@ -17,7 +17,7 @@ import numpy as np
 from ..geometry import rays
 from ..scene.prepared import PreparedScene
 from ..sensors import checks, kinds
-from ..sensors.records import CameraJoin, Sensor
+from ..sensors.records import CameraConnection, Sensor
 from ..settings import Settings
 from ..transport.plan import Plan
 from . import lost_light
@@ -104,16 +104,18 @@ def _arrives(prepared: PreparedScene, sensor: Sensor, emitter: mi.Emitter) -> bo
     seen_from = dr.zeros(mi.SurfaceInteraction3f, POINTS)
     ds, _ = emitter.sample_direction(seen_from, mi.Point2f(0.5))
     if infinite:
-        join = sensor.join_direction(-ds.d, u_lens, u_film)
+        join = sensor.connect_direction(-ds.d, u_lens, u_film)
     else:
-        join = sensor.join(ds.p, u_lens, u_film)
+        join = sensor.connect(ds.p, u_lens, u_film)
     seen_from.p, seen_from.time, seen_from.wavelengths = join.p, shared.time, shared.wavelengths
     ds, weight = emitter.sample_direction(seen_from, mi.Point2f(0.5))
     lit = join.valid & dr.any(mi.unpolarized_spectrum(weight) != 0)
     return bool(np.any(np.array(lit & ~_occluded(prepared, join, ds, infinite, shared))))
 
 
-def _occluded(prepared: PreparedScene, join: CameraJoin, ds: mi.DirectionSample3f, infinite: bool, shared):
+def _occluded(
+    prepared: PreparedScene, join: CameraConnection, ds: mi.DirectionSample3f, infinite: bool, shared
+):
     """Mask: a surface blocks the edge; with media False, as boundaries are surfaces."""
     if prepared.space is not None:
         return mi.Bool(False)

@@ -19,7 +19,7 @@ from ..geometry.boxes import is_finite, points_in, scene_box
 from ..geometry.mitsubas_choices import spread_points
 from ..host.edits import State
 from ..host.introspection import children, named
-from ..host.notices import remembered
+from ..host.notices import cached
 from ..media.media import random_directions, symmetric_frame
 
 _COUNT = 4096  # samples of a plugin
@@ -49,7 +49,7 @@ def check_plugins(scene: mi.Scene, sensor: mi.Sensor) -> None:
         for owner in users:
             _CHECKS[_base(owner)](owner, scene, media)
 
-    remembered(scene, sensor, "plugins", State.of(users), check, most=1)
+    cached(scene, sensor, "plugins", State.of(users), check, most=1)
 
 
 def _users_classes(base: str) -> bool:

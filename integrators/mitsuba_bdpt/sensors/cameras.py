@@ -21,7 +21,7 @@ import numpy as np
 from ..geometry import rays
 from ..host.introspection import number, own_parameters, world_matrix
 from .checks import inverse, rays_of
-from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
+from .records import CameraConnection, CameraStart, Sensor, SensorHit, view_at
 
 KINDS = ("PerspectiveCamera", "ThinLensCamera")
 
@@ -122,17 +122,17 @@ class Camera(Sensor):
             arrival=cos * view.lens_area() / pdf_w if self.area else mi.Float(0),
         )
 
-    def join(self, p, u_lens, u_film) -> CameraJoin:
+    def connect(self, p, u_lens, u_film) -> CameraConnection:
         which = self._lens_point(u_lens, u_film)
         _, view, z0, _ = which
         to_z0 = z0 - p
         dist2 = dr.squared_norm(to_z0)
         d = to_z0 * dr.rsqrt(dist2)
-        return self._join(which, p - z0, d, dist2, (view.near, view.far))
+        return self._connection(which, p - z0, d, dist2, (view.near, view.far))
 
-    def join_direction(self, d, u_lens, u_film) -> CameraJoin:
+    def connect_direction(self, d, u_lens, u_film) -> CameraConnection:
         which = self._lens_point(u_lens, u_film)
-        return self._join(which, -d, mi.Vector3f(d), mi.Float(1), (0, dr.inf))
+        return self._connection(which, -d, mi.Vector3f(d), mi.Float(1), (0, dr.inf))
 
     def _lens_point(self, u_lens, u_film):
         """View index, view, and a point of its lens in world and in camera coordinates."""
@@ -143,14 +143,14 @@ class Camera(Sensor):
         local = view.lens_point(u_lens) if self.lens else mi.Point3f(0)
         return index, view, _transform(view.to_world, local, 1), local
 
-    def _join(self, which, outward, d, dist2, clip) -> CameraJoin:
+    def _connection(self, which, outward, d, dist2, clip) -> CameraConnection:
         index, view, z0, lens = which
         position, depth, inside = self._project(index, view, outward, lens)
         within = (depth > 0) & (depth >= clip[0]) & (depth <= clip[1])
         cos = view.axis_cos(-d)
         on_near_plane = z0 - d * (view.near / cos)
         pdf_w = view.density(cos)
-        return CameraJoin(
+        return CameraConnection(
             p=mi.Point3f(z0),
             anchor=rays.free_anchor(on_near_plane),
             d=mi.Vector3f(d),

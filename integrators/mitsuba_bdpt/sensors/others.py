@@ -11,7 +11,7 @@ from ..geometry.quadrics import Sphere, sphere_normal
 from ..geometry.smooth_meshes import SmoothMeshes
 from ..host.introspection import number
 from .checks import inverse, rays_of
-from .records import CameraJoin, CameraStart, Sensor, SensorHit, view_at
+from .records import CameraConnection, CameraStart, Sensor, SensorHit, view_at
 
 
 class _Parallel(Sensor):
@@ -34,8 +34,8 @@ class _Parallel(Sensor):
             arrival=mi.Float(0),
         )
 
-    def _joining(self, z0, position, valid) -> CameraJoin:
-        return CameraJoin(
+    def _connection(self, z0, position, valid) -> CameraConnection:
+        return CameraConnection(
             p=mi.Point3f(z0),
             anchor=rays.free_anchor(z0),
             d=-self._axis,
@@ -71,12 +71,12 @@ class Orthographic(_Parallel):
     def _on_near_plane(self, uv):
         return self._origin + self._along[0] * uv.x + self._along[1] * uv.y
 
-    def join(self, p, u_lens, u_film) -> CameraJoin:
+    def connect(self, p, u_lens, u_film) -> CameraConnection:
         from_origin = p - self._origin
         x, y, depth = (dr.dot(row, from_origin) for row in self._rows)
         uv = mi.Point2f(x, y)
         valid = self.region.contains(uv) & (depth >= 0) & (depth <= self._reach)
-        return self._joining(self._on_near_plane(uv), self.region.to_position(uv), valid)
+        return self._connection(self._on_near_plane(uv), self.region.to_position(uv), valid)
 
 
 class Distant(_Parallel):
@@ -103,13 +103,13 @@ class Distant(_Parallel):
         o = self._origin + self._across[0] * disk.x + self._across[1] * disk.y
         return self._starting(o, mi.Float(dr.inf), shared)
 
-    def join(self, p, u_lens, u_film) -> CameraJoin:
+    def connect(self, p, u_lens, u_film) -> CameraConnection:
         from_origin = p - self._origin
         depth = dr.dot(from_origin, self._axis)
         aside = from_origin - self._axis * depth
         z0 = self._origin + aside
         valid = (depth >= 0) & (dr.squared_norm(aside) <= self._radius2)
-        return self._joining(z0, self.region.anywhere(u_film), valid)
+        return self._connection(z0, self.region.anywhere(u_film), valid)
 
 
 class _Face:
@@ -189,20 +189,20 @@ class IrradianceMeter(Sensor):
             arrival=dr.pi / self._density if self.area else mi.Float(0),  # cos / (density * cos / pi)
         )
 
-    def join(self, p, u_lens, u_film) -> CameraJoin:
+    def connect(self, p, u_lens, u_film) -> CameraConnection:
         z0, n, anchor = self._sample(u_film, self._like())
         to_z0 = z0 - p
         dist2 = dr.squared_norm(to_z0)
         d = to_z0 * dr.rsqrt(dist2)
-        return self._joining(z0, n, mi.Vector3f(d), dist2, anchor, u_film)
+        return self._connection(z0, n, mi.Vector3f(d), dist2, anchor, u_film)
 
-    def join_direction(self, d, u_lens, u_film) -> CameraJoin:
+    def connect_direction(self, d, u_lens, u_film) -> CameraConnection:
         z0, n, anchor = self._sample(u_film, self._like())
-        return self._joining(z0, n, mi.Vector3f(d), mi.Float(1), anchor, u_film)
+        return self._connection(z0, n, mi.Vector3f(d), mi.Float(1), anchor, u_film)
 
-    def _joining(self, z0, n, d, dist2, anchor, u_film) -> CameraJoin:
+    def _connection(self, z0, n, d, dist2, anchor, u_film) -> CameraConnection:
         cos = dr.dot(n, -d)
-        return CameraJoin(
+        return CameraConnection(
             p=z0,
             anchor=anchor,
             d=d,
@@ -223,7 +223,7 @@ class IrradianceMeter(Sensor):
         cos = dr.maximum(mi.Frame3f.cos_theta(si.wi), 0)
         return SensorHit(
             dist2=dr.squared_norm(si.p - walk.previous),
-            cos=cos,  # as in `start` and `join`, so that all strategies have the same weights
+            cos=cos,  # as in `start` and `connect`, so that all strategies have the same weights
             pdf_a=self._density,
             pdf_w=cos * dr.inv_pi,
             importance=self._density * cos / vertex.cos,

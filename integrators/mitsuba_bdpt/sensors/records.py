@@ -32,7 +32,7 @@ class CameraStart:
 
 
 @dataclass
-class CameraJoin:
+class CameraConnection:
     """A connection of a scene point with z_0.
 
     ``p`` of z_0; ``anchor`` end of the shadow ray (for cameras on the near plane); ``d`` unit direction from
@@ -62,8 +62,8 @@ class SensorHit:
     ``dist2`` of its last edge; ``cos`` at z_0; ``pdf_a`` density of z_0 (area measure) and ``pdf_w`` (solid
     angle) of the reverse direction in camera subpaths; ``importance`` W_e; ``position`` on the film in
     pixels; ``active``; ``surroundings``: ray from z_0 that must be unoccluded if the light comes from
-    infinity (None where the subpath's own ray has shown it), see `CameraJoin.reach`; ``near`` distance from
-    z_0 at which camera rays along its last edge start.
+    infinity (None where the subpath's own ray has shown it), see `CameraConnection.reach`; ``near`` distance
+    from z_0 at which camera rays along its last edge start.
     """
 
     dist2: mi.Float
@@ -162,12 +162,14 @@ class Sensor:
         """Like `start`, from the unit square, without ``position`` and ``counted``."""
         raise NotImplementedError
 
-    def join(self, p: mi.Point3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraJoin:
+    def connect(self, p: mi.Point3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraConnection:
         """Connect the scene point ``p`` with z_0, chosen by ``u_lens`` and ``u_film``."""
         raise NotImplementedError
 
-    def join_direction(self, d: mi.Vector3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraJoin:
-        """Like `join`, for light from infinity along ``d``; ``dist2`` is 1."""
+    def connect_direction(
+        self, d: mi.Vector3f, u_lens: mi.Point2f, u_film: mi.Point2f | None
+    ) -> CameraConnection:
+        """Like `connect`, for light from infinity along ``d``; ``dist2`` is 1."""
         raise NotImplementedError
 
     def hit(self, walk, vertex, distant) -> SensorHit:

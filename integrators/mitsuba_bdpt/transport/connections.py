@@ -24,7 +24,7 @@ from .contribution import (
 from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .sketches import Sketch, guess
-from .visibility import Sight, guessed, seen
+from .visibility import ShadowRay, guessed, seen
 from .walk import Vertex, is_lit, newest_coefficient, where_lit
 
 
@@ -86,8 +86,8 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
         lost += c.counted.non_finite
-        sight = _sight(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
-        visible = seen(kernel, c, sight)
+        shadow_ray = _shadow_ray(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
+        visible = seen(kernel, c, shadow_ray)
         total = add(_as_drawn(kernel, z, y, c), visible, total)
         crossed = crossed + Counters(**{name: getattr(visible.counted, name) for name in MEDIA})
         slot += 1
@@ -121,18 +121,18 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     end, own = drawn.end, None
     if kernel.shape_errors.small:
         y = read_light_vertex(kernel, path, drawn.end)
-        sight = _sight(kernel, z, y)
-        ray, own, end = sight.ray, sight.own, y.si.p
+        shadow_ray = _shadow_ray(kernel, z, y)
+        ray, own, end = shadow_ray.ray, shadow_ray.own, y.si.p
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     kernel.observer.drawn(end)
     if kernel.space is None:
         active &= ~rays.occluded(kernel.scene, ray, active, own)
         return dr.select(active, value / survival, 0), counted
-    sight = Sight(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
+    shadow_ray = ShadowRay(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
     estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
-    c = drop_non_finite(seen(kernel, c, sight))
+    c = drop_non_finite(seen(kernel, c, shadow_ray))
     return c.weighted(), counted + c.counted
 
 
@@ -251,11 +251,11 @@ def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Co
     return replace(c, value=c.value * guess)
 
 
-def _sight(kernel: Kernel, z: Vertex, y: StoredVertex) -> Sight:
+def _shadow_ray(kernel: Kernel, z: Vertex, y: StoredVertex) -> ShadowRay:
     """Shadow ray from ``z`` to the light vertex ``y``."""
     met = rounding.met(y.si.shape, y.si.instance)
-    ray, own = rays.sight(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
-    return Sight(ray, own, z.medium_towards(kernel, ray.d))
+    ray, own = rays.shadow_ray(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
+    return ShadowRay(ray, own, z.medium_towards(kernel, ray.d))
 
 
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:

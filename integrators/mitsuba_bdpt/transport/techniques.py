@@ -17,11 +17,11 @@ from ..geometry import polarization, rays
 from ..media import flight, transmittance
 from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
-from ..sensors.records import CameraJoin, SensorHit
+from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, spectra
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
-from .visibility import Sight, seen
+from .visibility import ShadowRay, seen
 from .walk import Vertex, Walk, is_lit, newest_coefficient, where_lit
 
 
@@ -126,28 +126,28 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     weight, shares = h.weigh(*sides)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
-    to_point, own = rays.sight(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
+    to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     counted = Counters(shadow_s1=one(active))
-    sight = Sight(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
+    shadow_ray = ShadowRay(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
     emission = None
     if kernel.cells is not None:
         cos = dr.abs(dr.dot(e.anchor.n, e.d))
         emission = kernel.cells.at(e.index, z.si.p, -e.d, cos, active)
     ends = mi.UInt32(1), k
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
-    return seen(kernel, c, sight)
+    return seen(kernel, c, shadow_ray)
 
 
 def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
     """(1,1): connect a sampled emitter point with the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
-    join = kernel.camera.join(emission.si.p, *u)
+    join = kernel.camera.connect(emission.si.p, *u)
     if kernel.camera.parallel:
         active &= ~emission.infinite  # measure zero
     else:
-        join = dr.select(emission.infinite, kernel.camera.join_direction(emission.d, *u), join)
+        join = dr.select(emission.infinite, kernel.camera.connect_direction(emission.d, *u), join)
     active &= join.valid & ~(emission.pdf_first == 0) & ~emission.beam
     if kernel.camera.delta:
         active &= ~emission.delta  # measure zero: `path` sees nothing either
@@ -179,16 +179,16 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
     ends = mi.UInt32(1), mi.UInt32(1)
     c = Contribution(value, weight, *ends, active, shares, "light", join.position, counted, sides)
     c = replace(c, towards=join.d)
-    return seen(kernel, c, Sight(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
+    return seen(kernel, c, ShadowRay(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
 
 
-def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraJoin, bsdf.Target]:
+def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
     """Sample a connection of the light vertex ``y`` with the sensor.
 
     Returns the result of `Sensor.join` and its `bsdf.Target`.
     """
     active = y.hit & y.connectible() & (y.edges <= kernel.last_splat)
-    join = kernel.camera.join(y.si.p, *_sensor_points(kernel, stream, y.event))
+    join = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))
     active &= join.valid
     if kernel.plan.hide_emitters:
         on_emitter = y.si.shape.emitter() != dr.zeros(mi.EmitterPtr)
@@ -219,9 +219,9 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, join.anchor, y.si)
-    sight = Sight(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
+    shadow_ray = ShadowRay(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=join.d)
-    return seen(kernel, c, sight.numbered(kernel, stream, y.event))
+    return seen(kernel, c, shadow_ray.numbered(kernel, stream, y.event))
 
 
 # Relative rounding error of distances.

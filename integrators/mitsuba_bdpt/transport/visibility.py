@@ -19,7 +19,7 @@ _GUESSED_DEPTH = 2.0
 
 
 @dataclass
-class Sight:
+class ShadowRay:
     """The shadow ``ray`` of a connection and its end (`rays.Own` or None).
 
     With media also the index of the ``medium`` in which the ray starts, and the first ``word`` of its random
@@ -32,19 +32,25 @@ class Sight:
     word: mi.UInt32 | None = None
     hidden: bool = False
 
-    def numbered(self, kernel: Kernel, stream: Stream, event: mi.UInt32, number=0) -> Sight:
+    def numbered(self, kernel: Kernel, stream: Stream, event: mi.UInt32, number=0) -> ShadowRay:
         """With random numbers of connection ``number`` at the vertex of ``event``."""
         if kernel.space is None or not kernel.space.media.grids:
             return replace(self, word=mi.UInt32(0))
         return replace(self, word=kernel.points.series(stream, Purpose.TRACKING, event, 1 + number))
 
 
-def seen(kernel: Kernel, c: Contribution, sight: Sight) -> Contribution:
+def seen(kernel: Kernel, c: Contribution, shadow_ray: ShadowRay) -> Contribution:
     """Deactivate ``c`` if blocked; in media apply transmittance, and T~ in the weight."""
     if kernel.space is None:
-        return replace(c, active=c.active & ~_blocked(kernel, sight, c.active))
+        return replace(c, active=c.active & ~_blocked(kernel, shadow_ray, c.active))
     crossing = transmittance.between(
-        kernel.space, sight.ray, sight.medium, c.active, sight.own, sight.word, sight.hidden
+        kernel.space,
+        shadow_ray.ray,
+        shadow_ray.medium,
+        c.active,
+        shadow_ray.own,
+        shadow_ray.word,
+        shadow_ray.hidden,
     )
     weight, shares = kernel.heuristic.weigh(*c.sides, crossing.tr)
     return replace(
@@ -57,10 +63,12 @@ def seen(kernel: Kernel, c: Contribution, sight: Sight) -> Contribution:
     )
 
 
-def _blocked(kernel: Kernel, sight: Sight, active):
-    if not sight.hidden:
-        return rays.occluded(kernel.scene, sight.ray, active, sight.own)
-    pi, _ = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, sight.ray, active, coherent=False)
+def _blocked(kernel: Kernel, shadow_ray: ShadowRay, active):
+    if not shadow_ray.hidden:
+        return rays.occluded(kernel.scene, shadow_ray.ray, active, shadow_ray.own)
+    pi, _ = rays.intersect_past_emitters(
+        kernel.scene, kernel.shape_errors, shadow_ray.ray, active, coherent=False
+    )
     return pi.is_valid()
 
 

@@ -18,7 +18,7 @@ from ..geometry import polarization, rays
 from ..host import renamed
 from ..media import flight
 from ..sampling.points import Purpose
-from ..sensors.records import CameraJoin
+from ..sensors.records import CameraConnection
 from . import bsdf, mis, scattering, spectra
 from .contribution import Counters
 from .inputs import Kernel, Shared
@@ -187,7 +187,7 @@ class Side:
     complete: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Float] | None = None
     alpha: bool = False
     parallel: bool = False
-    join: Callable[[Vertex], tuple[Direct | CameraJoin, bsdf.Target]] | None = None
+    join: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
     only_delta: bool = False
     guide: Callable[[Vertex, Walk, Any], Any] | None = None
